@@ -16,8 +16,8 @@ from camera.brown import NOT_TANGENTIAL
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError
 from camera.model import Camera, Pose
-from storage import write_whole
-from storage.bounded import read_bounded
+from redetect.storage import write_whole
+from redetect.storage.bounded import read_bounded
 
 CLASS_NAME = "SmRadialDistortedCamera"
 _LARGEST_FILE_BYTES = 1 << 20

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 from camera.options import Calibrate, Convert, Floor, Level
-from storage.command_line import Program
+from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "camera",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from storage.messages import OneLineError
+from redetect.storage.messages import OneLineError
 
 
 class CameraError(OneLineError, ValueError):

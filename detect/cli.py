@@ -27,8 +27,8 @@ from detect.options import All, Circles, Compare, Lines, Markers
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.viewing_options import Draw, Report, Tune, View
-from storage.command_line import Program
-from storage.exit_codes import EXIT_INTERRUPTED, exit_code_of
+from redetect.storage.command_line import Program
+from redetect.storage.exit_codes import EXIT_INTERRUPTED, exit_code_of
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 

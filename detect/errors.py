@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from storage.messages import OneLineError
+from redetect.storage.messages import OneLineError
 
 #: Exit code of a command of which some frames could not be worked on; the others were.
 EXIT_FRAMES_FAILED = 3

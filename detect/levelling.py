@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import CircleDetections
 from detect.seen import level_seen
-from landmarks import FrameTilt
+from redetect.landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
 

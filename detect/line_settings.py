@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from detect.errors import DetectError
-from storage.bounds import (
+from redetect.storage.bounds import (
     Bounds,
     LimitOr0,
     NotNegative,

@@ -28,7 +28,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.runs.progress import progress_bar
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 FloatArray = NDArray[np.float64]
 

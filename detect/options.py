@@ -27,7 +27,7 @@ from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.settings import CircleSettings, Levelling
 from detect.sources.options import SourceOptions
-from storage.bounds import NOT_NEGATIVE, demand
+from redetect.storage.bounds import NOT_NEGATIVE, demand
 
 
 @dataclass(frozen=True, kw_only=True)

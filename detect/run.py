@@ -26,7 +26,7 @@ from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import bounded_content, decode_gray
 from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
-from landmarks import Step, read_steps
+from redetect.landmarks import Step, read_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
     ------
     DetectError
         If there is no such folder, no image, no calibration, or more than one to choose from.
-    camera.CameraError, landmarks.LandmarkFileError
+    camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
     if not folder.is_dir():

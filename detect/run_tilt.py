@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from landmarks import FrameTilt
+from redetect.landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
-from landmarks import Frame
+from redetect.landmarks import Frame
 
 FloatArray = NDArray[np.float64]
 Tilt = tuple[float, float]
@@ -31,7 +31,8 @@ def image_positions(
     floor_xy : (..., 2) array_like
         Robot X and Y, metres.
     levelled_by : (float, float), optional
-        Pitch and roll (rad) that turned the positions level (`landmarks.Frame.levelled_by`).
+        Pitch and roll (rad) that turned the positions level
+        (`redetect.landmarks.Frame.levelled_by`).
     raised_m : float
         How much higher the camera is than calibrated, metres.
     """

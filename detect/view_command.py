@@ -22,9 +22,9 @@ from detect.runs.progress import print_failures, progress_bar
 from detect.seen import circle_on_floor, image_positions
 from detect.sources.opening import demand_recording, open_calibrated
 from detect.viewing_options import View
-from landmarks import Step, circle_arrays
-from landmarks.map_file import read_map, read_path
-from storage import OutputExistsError, write_whole
+from redetect.landmarks import Step, circle_arrays
+from redetect.landmarks.map_file import read_map, read_path
+from redetect.storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 

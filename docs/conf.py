@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT))
-from storage.version import __version__  # noqa: E402
+from redetect.storage.version import __version__  # noqa: E402
 
 project = "redetect"
 release = version = __version__
@@ -38,7 +38,7 @@ myst_heading_anchors = 4
 
 # --- API from docstrings -------------------------------------------------------------------------
 #: A page for each of these and of the packages in them.
-ROOMS = ("storage", "camera", "landmarks", "lut", "detect", "slam", "groundtruth")
+ROOMS = ("redetect", "camera", "lut", "detect")
 #: Compiled kernels are called through what is there; the command line tells of itself (`--help`).
 _NO_LIBRARY = (
     *("*kernels.py", "__init__.py", "__main__.py"),

@@ -27,8 +27,8 @@ import numpy as np
 from camera import Camera
 from lut.outlines import DiscShape, DiscTable, build_disc_table
 from lut.verticals import VerticalTable, build_vertical_table
-from storage import write_whole
-from storage.bounded import read_bounded, writable_by_others
+from redetect.storage import write_whole
+from redetect.storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
 TABLE_VERSION = 13

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from lut.errors import TableError
-from storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
 
 FloatArray = NDArray[np.float64]
 

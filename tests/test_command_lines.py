@@ -67,7 +67,7 @@ def test_an_example_with_a_flag_that_is_none_is_noticed(
 ) -> None:
     (words,) = examples_in("Example: slam map images/e --no-such-flag")
     with pytest.raises(SystemExit) as end:
-        import_module("slam.cli").parsed(words[1:])
+        import_module("redetect.slam.cli").parsed(words[1:])
     assert end.value.code == 2
     assert "no-such-flag" in capsys.readouterr().err
 

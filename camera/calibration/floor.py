@@ -20,8 +20,8 @@ from camera.calibration.projection import IDENTITY, intrinsics_of
 from camera.calibration.start import best_poses, board_poses
 from camera.errors import CalibrationError
 from camera.model import Camera, Pose
-from storage.bounded import read_bounded
-from storage.messages import excerpt
+from redetect.storage.bounded import read_bounded
+from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from camera.calibration.model import FREE_COEFFICIENTS, POLYNOMIAL, TANGENTIAL, free_span
 from camera.errors import CalibrationError
-from storage.bounds import ABOVE_0, demand, whole
+from redetect.storage.bounds import ABOVE_0, demand, whole
 
 
 class FreeLens(NamedTuple):

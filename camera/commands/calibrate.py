@@ -35,7 +35,7 @@ from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
 from camera.model import Camera
 from camera.options import Calibrate, Floor
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 

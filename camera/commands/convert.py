@@ -21,7 +21,7 @@ from camera.formats.plain_yaml import parse_yaml, read_content, text_of
 from camera.formats.ros import format_ros, parse_ros
 from camera.model import Camera
 from camera.options import Convert, Format
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 
 #: The models that each format has, the simplest first.
 MODELS: dict[str, tuple[Model, ...]] = {

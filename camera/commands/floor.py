@@ -7,7 +7,7 @@ from camera.camfile import read_camera, write_camera
 from camera.commands.calibrate import describe_pose, floor_points
 from camera.errors import CalibrationError
 from camera.options import Floor
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 
 def perform(options: Floor) -> int:

@@ -14,7 +14,7 @@ from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
 from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import shortest
-from storage.messages import excerpt, one_line
+from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100

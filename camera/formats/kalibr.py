@@ -9,7 +9,7 @@ from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, shortest, whole
-from storage.messages import excerpt, one_line
+from redetect.storage.messages import excerpt, one_line
 
 _MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
 _COEFFICIENTS = 4

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import ConversionError
-from storage.messages import excerpt
+from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 Model = Literal["radtan", "rational", "fisheye"]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
-from storage.messages import excerpt
+from redetect.storage.messages import excerpt
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _DISTORTION = (

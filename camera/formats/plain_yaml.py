@@ -12,8 +12,8 @@ import numpy as np
 import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
-from storage.bounded import read_bounded
-from storage.messages import excerpt, one_line
+from redetect.storage.bounded import read_bounded
+from redetect.storage.messages import excerpt, one_line
 
 _LARGEST_FILE_BYTES = 1 << 20
 _MOST_CAMERAS = 1000

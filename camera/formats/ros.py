@@ -9,7 +9,7 @@ from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.opencv import foreign
 from camera.formats.plain_yaml import first_of, numbers, parse_yaml, pinhole_matrix, shortest, whole
-from storage.messages import excerpt
+from redetect.storage.messages import excerpt
 
 #: Names of the models in ROS (sensor_msgs/distortion_models.h).
 ROS_NAMES: dict[Model, str] = {

@@ -16,9 +16,9 @@ from detect.errors import DetectError
 from detect.options import Compare
 from detect.run import camera_in
 from detect.seen import Sight
-from landmarks import read_frames
-from storage import write_whole
-from storage.exit_codes import EXIT_ERROR
+from redetect.landmarks import read_frames
+from redetect.storage import write_whole
+from redetect.storage.exit_codes import EXIT_ERROR
 
 
 def perform(command: Compare) -> int:

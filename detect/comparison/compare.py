@@ -38,7 +38,7 @@ from detect.comparison.result import (
 )
 from detect.seen import Sight
 from detect.sources.image_names import image_name
-from landmarks import CircleArrays, Frame, circle_arrays, read_frames, wrap_angle
+from redetect.landmarks import CircleArrays, Frame, circle_arrays, read_frames, wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def compare_runs(
 
     Raises
     ------
-    landmarks.LandmarkFileError
+    redetect.landmarks.LandmarkFileError
         If a file cannot be read.
     CompareError
         If an image has two frames in a file, or a covariance that is needed is not positive

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from detect.comparison.result import NormalisedError
-from landmarks import is_positive_definite, squared_mahalanobis
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 FloatArray = NDArray[np.float64]
 

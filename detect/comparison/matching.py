@@ -25,7 +25,7 @@ from detect.comparison.result import (
 )
 from detect.seen import Sight
 from detect.sources.image_names import image_name
-from landmarks import (
+from redetect.landmarks import (
     Association,
     CircleLandmark,
     Frame,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.flags import MaybeFloat
-from storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
+from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
 
 if TYPE_CHECKING:
     from detect.seen import Sight

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from landmarks import CircleLandmark, circle_arrays
+from redetect.landmarks import CircleLandmark, circle_arrays
 
 FloatArray = NDArray[np.float64]
 

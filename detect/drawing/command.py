@@ -21,7 +21,7 @@ from detect.run import Run, read_image
 from detect.runs.progress import print_failures, progress_bar
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Draw
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 
 
 def perform(options: Draw) -> int:

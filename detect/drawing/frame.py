@@ -28,7 +28,7 @@ from detect.drawing.strokes import (
 )
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
-from landmarks import LineLandmark, MarkerLandmark, circle_arrays
+from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
 
 FloatArray = NDArray[np.float64]
 

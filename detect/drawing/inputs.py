@@ -21,8 +21,8 @@ from detect.settings import CircleSettings
 from detect.sources.image_names import image_name
 from detect.tune.grid import parameter_value
 from detect.viewing_options import RowFiles
-from landmarks import Frame, FrameTilt, read_tilts
-from storage.messages import excerpt
+from redetect.landmarks import Frame, FrameTilt, read_tilts
+from redetect.storage.messages import excerpt
 
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is what precedes the first row; real ones are much shorter.
@@ -158,7 +158,7 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     """Find the files of a run's rows, and index them.
 
     Raises DetectError if one that is named does not exist, or there is none at all, and
-    landmarks.LandmarkFileError if one is malformed.
+    redetect.landmarks.LandmarkFileError if one is malformed.
     """
     detected: dict[str, Path] = {}
     usual = {

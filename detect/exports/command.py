@@ -16,8 +16,8 @@ from detect.exports.writers import (
     write_parquet,
 )
 from detect.sources.times import read_image_times
-from landmarks.columns import TableName
-from storage import OutputExistsError, write_whole
+from redetect.landmarks.columns import TableName
+from redetect.storage import OutputExistsError, write_whole
 
 # Which table a file of a kind has rows of, even where there are none.
 _TABLES: dict[str, TableName] = {

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
-from landmarks import FrameTilt, Landmark, Step, read_rows
-from landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
-from landmarks.tilts import numbered_tilts
+from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
+from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
+from redetect.landmarks.tilts import numbered_tilts
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

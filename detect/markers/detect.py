@@ -40,7 +40,7 @@ from detect.markers.quadrangle import (
     signed_area,
 )
 from detect.markers.settings import MarkerSettings
-from landmarks import MarkerCorner, MarkerLandmark
+from redetect.landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
-from storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, SHARE, Bounds, demand, whole
+from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, SHARE, Bounds, demand, whole
 
 Darkness = Literal["ratio", "difference"]
 CornerAlgorithm = Literal["A", "B"]

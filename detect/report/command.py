@@ -7,7 +7,7 @@ from detect.report.inputs import gather
 from detect.report.page import report_page
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 
 
 def perform(options: Report) -> int:

@@ -50,7 +50,7 @@ class ReportInputs:
 def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> ReportInputs:
     """Read and compare all rows of a run, and detect `time_frames` frames to measure the time.
 
-    Raises DetectError or landmarks.LandmarkFileError if a file is missing or malformed.
+    Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
     """
     files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)

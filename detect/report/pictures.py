@@ -17,7 +17,7 @@ from detect.report.inputs import ReportInputs
 from detect.report.parts import Part, image_part
 from detect.run import Run, RunFrame, read_image
 from detect.seen import circle_on_floor
-from landmarks import circle_arrays
+from redetect.landmarks import circle_arrays
 
 _JPEG_QUALITY = 88
 _MOST, _IN_A_ROW = 18, 6

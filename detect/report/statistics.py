@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from detect.comparison.compare import LEAST_SIGMA_RAD
 from detect.comparison.matching import match_frame
 from detect.comparison.result import DiscComparison, LineComparison
-from landmarks import is_positive_definite
+from redetect.landmarks import is_positive_definite
 
 FloatArray = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
-from landmarks import read_tilts
+from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12

@@ -23,8 +23,8 @@ from detect.lines import LineDetections, detect_lines
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.run import read_image
 from detect.runs.plan import FramePlan, FrameTask
-from landmarks import FrameTilt, tilt_as_written
 from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
+from redetect.landmarks import FrameTilt, tilt_as_written
 
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)

@@ -1,9 +1,9 @@
 """The journal of a run: the rows of each frame that is done, so that a run can be resumed.
 
-An append-only text file beside the results, locked while the run lasts (`storage.parts`). Each line
-has a digest, of its record and all before it, and the record in JSON: what made the rows, then one
-for each frame, and finally one that says that the results are written. Lines that do not fit their
-digest, and all that follow, are ignored.
+An append-only text file beside the results, locked while the run lasts (`redetect.storage.parts`).
+Each line has a digest, of its record and all before it, and the record in JSON: what made the rows,
+then one for each frame, and finally one that says that the results are written. Lines that do not
+fit their digest, and all that follow, are ignored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from detect import __version__
 from detect.run import RunFrame
 from detect.runs.outputs import Output
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
-from storage.parts import PartFile
+from redetect.storage.parts import PartFile
 
 #: Incremented with every change of the format of a journal or of the rows in it.
 _JOURNAL_VERSION = 6

@@ -12,7 +12,7 @@ import numpy as np
 from detect.discs.identity import MappedDisc
 from detect.errors import DetectError
 from detect.sources.image_names import image_name
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Frame,
     FrameTilt,
@@ -22,8 +22,8 @@ from landmarks import (
     parse_rows,
     read_rows,
 )
-from landmarks.map_file import read_map, read_path
-from storage.bounds import NOT_NEGATIVE, demand
+from redetect.landmarks.map_file import read_map, read_path
+from redetect.storage.bounds import NOT_NEGATIVE, demand
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -97,7 +97,8 @@ class FramesByImage:
     """The frames of a landmark file, by the name of their image; of equal names the last counts.
 
     The file is read once for the offset of each frame, and again there when a frame is requested:
-    its rows are not kept in memory. If it is malformed there is a `landmarks.LandmarkFileError`.
+    its rows are not kept in memory. If it is malformed there is a
+    `redetect.landmarks.LandmarkFileError`.
     """
 
     def __init__(self, path: Path) -> None:

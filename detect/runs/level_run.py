@@ -13,7 +13,13 @@ from detect.run_tilt import frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import RunSummary
 from detect.runs.rows import disc_numbers, landmark_rows
-from landmarks import FrameTilt, format_levelling, format_no_tilt, format_tilt, tilt_as_written
+from redetect.landmarks import (
+    FrameTilt,
+    format_levelling,
+    format_no_tilt,
+    format_tilt,
+    tilt_as_written,
+)
 
 #: Prefix, lines and tilt of a frame.
 _Tilted = tuple[str, int, FrameTilt | None]

@@ -19,7 +19,7 @@ from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.sources.times import TIMES_HEAD
-from landmarks import format_head
+from redetect.landmarks import format_head
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"

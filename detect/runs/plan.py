@@ -17,7 +17,7 @@ from detect.run import ImageRun, RunFrame
 from detect.runs.known import NOTHING, Known, KnownOfFrame
 from detect.settings import CircleSettings, Levelling
 from detect.sources.times import format_time
-from landmarks import format_no_tilt, format_record
+from redetect.landmarks import format_no_tilt, format_record
 
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt

@@ -40,7 +40,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.verticals.detections import carry_ids
 from detect.verticals.response import line_response
-from landmarks import (
+from redetect.landmarks import (
     format_levelling,
     format_no_tilt,
     format_outline_tilt,

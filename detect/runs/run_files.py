@@ -7,9 +7,9 @@ after them:
     journal fits program, settings, camera  ->  its frames are those of the run  ->  the journal is
     cut off after the last of them, and grows on
 
-When all frames are done, the results are written from the journal to parts (`storage.parts`) and
-brought to the disk; the journal says so; they take their places. A process killed in between leaves
-this last step to the next run.
+When all frames are done, the results are written from the journal to parts
+(`redetect.storage.parts`) and brought to the disk; the journal says so; they take their places. A
+process killed in between leaves this last step to the next run.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from detect.errors import DetectError
 from detect.runs.journal import Journal, made_by, task_digest
 from detect.runs.outputs import Output, is_log, log_text, outputs_of
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
-from storage import OutputExistsError
-from storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
+from redetect.storage import OutputExistsError
+from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 _log = logging.getLogger("redetect")
 

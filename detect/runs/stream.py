@@ -18,7 +18,7 @@ from detect.runs.dispatch import Workers, detect_chunks
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from detect.runs.run_files import RunFiles
 from detect.runs.workers import local_workers
-from storage import write_whole
+from redetect.storage import write_whole
 
 
 def detect_run(
@@ -47,7 +47,7 @@ def detect_run(
     ------
     lut.TableError
         If there can be no table for the camera.
-    storage.OutputExistsError
+    redetect.storage.OutputExistsError
         If an output exists and must not be replaced.
     WorkerError
         If there are no workers.

@@ -48,7 +48,7 @@ from detect.sources.poses import (
     carried,
     heading_rad,
 )
-from storage.messages import one_line
+from redetect.storage.messages import one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import DetectError, FrameError
-from storage.messages import OneLineError, excerpt, one_line
+from redetect.storage.messages import OneLineError, excerpt, one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import DetectError, FrameError
-from storage.inside import leads_out, link_out
-from storage.messages import excerpt
+from redetect.storage.inside import leads_out, link_out
+from redetect.storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 

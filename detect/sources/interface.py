@@ -11,7 +11,7 @@ from camera import Camera, read_camera
 from detect.errors import DetectError
 from detect.run import RunFrame
 from detect.sources.poses import PoseStream
-from landmarks import Step
+from redetect.landmarks import Step
 
 
 class Source(ABC):

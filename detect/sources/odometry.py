@@ -12,7 +12,7 @@ from detect.run import Frames, RunFrame
 from detect.sources.image_names import NameIndex, last_part
 from detect.sources.interface import Source
 from detect.sources.poses import PosesOverTime, PoseStream, TimedPose, step_between
-from landmarks import Step, read_steps
+from redetect.landmarks import Step, read_steps
 
 
 class FramesAlong:

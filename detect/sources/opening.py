@@ -41,7 +41,7 @@ def open_calibrated(
     ------
     DetectError
         If there is no such thing, it cannot be read, or there is no calibration.
-    camera.CameraError, landmarks.LandmarkFileError
+    camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
     run = _open(name, camera_path, options or SourceOptions(), posed=True)

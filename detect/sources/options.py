@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from detect.errors import DetectError
-from storage.bounds import NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 
 #: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
 Axes = Literal["robotics", "dataset"]

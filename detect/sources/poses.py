@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from detect.errors import DetectError
 from detect.sources.options import Axes
 from detect.sources.times import text_rows
-from landmarks import Step, wrap_angle
+from redetect.landmarks import Step, wrap_angle
 
 FloatArray = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from detect.tune.grid import combinations
 from detect.tune.run import Settings, tune_run
 from detect.tune.table import curve_picture, trial_records
 from detect.viewing_options import Tune
-from landmarks import LandmarkFileError, read_tilts
-from storage import OutputExistsError, write_whole
+from redetect.landmarks import LandmarkFileError, read_tilts
+from redetect.storage import OutputExistsError, write_whole
 
 
 def perform(options: Tune) -> int:

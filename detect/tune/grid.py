@@ -10,7 +10,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
-from storage.messages import excerpt
+from redetect.storage.messages import excerpt
 
 #: The value of each parameter that is varied.
 Combination = dict[str, Any]

@@ -19,7 +19,7 @@ from detect.runs.frame import tables_of
 from detect.runs.known import ByPrefix, Known
 from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
-from landmarks import Frame, FrameTilt, frames_of_rows, parse_rows
+from redetect.landmarks import Frame, FrameTilt, frames_of_rows, parse_rows
 
 Settings = CircleSettings | LineSettings
 

@@ -15,7 +15,7 @@ from detect.verticals.judgement import FATES, Judgement
 from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import TiltEstimate
 from detect.verticals.tracking import LineTracks
-from landmarks import LineLandmark, wrap_angle
+from redetect.landmarks import LineLandmark, wrap_angle
 
 FloatArray = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from camera import Camera
 from camera.calibration.images import calibration_images, read_grey
 from detect.sources.gray import decode_gray
 from detect.sources.video import VideoFile
-from groundtruth.errors import GroundTruthError
-from groundtruth.markers.boards_file import BoardImage, find_boards
-from groundtruth.markers.checkerboard import Checkerboard
-from storage.image_header import without_orientation
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.boards_file import BoardImage, find_boards
+from redetect.groundtruth.markers.checkerboard import Checkerboard
+from redetect.storage.image_header import without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6

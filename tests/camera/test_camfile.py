@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera import Camera, CameraError, format_camera, parse_camera, read_camera, write_camera
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 from tests.camera.strategies import cameras
 from tests.conftest import PUBLISHED_CAM
 

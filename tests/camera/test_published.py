@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from landmarks import CircleLandmark, read_frames
+from redetect.landmarks import CircleLandmark, read_frames
 
 # The report's printed rows of runs e and c, with the pixels that they come from.
 PRINTED_ROWS = [

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from landmarks import read_frames, read_steps
+from redetect.landmarks import read_frames, read_steps
 from tests.detect.conftest import SMALL_RUN_DISCS
 
 Captured = pytest.CaptureFixture[str]

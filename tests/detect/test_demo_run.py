@@ -17,7 +17,7 @@ from detect.runs.known import FramesByImage, Known
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 
 #: What the shipped rows were detected with, apart from what makes one disc one row.
 LIKE_SHIPPED = replace(CircleSettings(), polarity="light", far_limit=PUBLISHED.far_limit)

@@ -12,7 +12,7 @@ from camera import Camera, parse_camera
 from detect.circles import CircleDetections
 from detect.levelling import level_discs, levelled
 from detect.seen import level_seen
-from landmarks import FrameTilt
+from redetect.landmarks import FrameTilt
 from tests.conftest import PUBLISHED_CAM
 
 CAMERA = parse_camera(PUBLISHED_CAM)

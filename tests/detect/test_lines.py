@@ -27,8 +27,8 @@ from detect.lines import ACCEPTED, JOINED, beyond_doubt, detect_lines
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.verticals.response import line_response, strip_of
-from landmarks import Frame, Step
 from lut.verticals import build_vertical_table
+from redetect.landmarks import Frame, Step
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
 from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks
 from tests.reference.verticals import compensated_bearings, inclinations, plane_normals

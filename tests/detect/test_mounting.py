@@ -15,7 +15,7 @@ from camera.cli import main
 from detect.mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import LEAST_FRAMES, FrameTilts
 from detect.seen import image_positions, level_seen
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 HEIGHT_M = 1.5
 #: How pitch by outlines goes with the height: linear, and a little bent.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from camera import Camera, CameraError
 from detect.errors import DetectError, FrameError
 from detect.run import RunFrame, open_run, read_image
-from landmarks import LandmarkFileError, Step
+from redetect.landmarks import LandmarkFileError, Step
 
 ZEROS = (0.0,) * 9
 TEXTURE = np.random.default_rng(3).integers(0, 256, (288, 768)).astype(np.uint8)

@@ -21,8 +21,8 @@ from detect.circles import CircleDetections, refined_covariance
 from detect.discs.positions import refined_covariances
 from detect.levelling import levelled
 from detect.settings import CircleSettings
-from landmarks import FrameTilt
 from lut import DiscShape, cached_disc_table, cached_vertical_table
+from redetect.landmarks import FrameTilt
 from tests.conftest import PUBLISHED_CAM
 
 FLOOR_XY = np.array([[0.0, -1.0], [1.1, -2.0]])

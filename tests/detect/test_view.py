@@ -13,7 +13,7 @@ import pytest
 from camera import read_camera
 from detect.cli import main
 from detect.view_command import summed_steps
-from landmarks import Step, read_frames
+from redetect.landmarks import Step, read_frames
 from tests.detect.recordings import write_video
 from tests.detect.test_cli import assert_refused
 

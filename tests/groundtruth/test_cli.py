@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import write_camera
-from groundtruth.cli import main
-from groundtruth.commands.outputs import progress
-from groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
-from groundtruth.markers.calibration import (
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.commands.outputs import progress
+from redetect.groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
+from redetect.groundtruth.markers.calibration import (
     Network,
     Rig,
     read_network,
@@ -24,8 +24,12 @@ from groundtruth.markers.calibration import (
     write_network,
     write_rig,
 )
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from landmarks import Frame, Step, write_frames
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+from redetect.landmarks import Frame, Step, write_frames
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 from tests.groundtruth.markers.test_network import BOARDS, OFFSET, WORLD, shots
 
@@ -279,7 +283,7 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
         write_camera(lens(), folder / name / f"{name}.cam")
 
     def pose(matrix: FloatArray) -> dict[str, list[float]]:
-        from groundtruth.geometry.transforms import quaternion_xyzw
+        from redetect.groundtruth.geometry.transforms import quaternion_xyzw
 
         return {
             "translation_m": matrix[:3, 3].tolist(),
@@ -334,7 +338,7 @@ def test_a_log_gets_no_progress_bar(
 def test_help_needs_nothing_heavy() -> None:
     program = (
         "import sys\n"
-        "from groundtruth.cli import main\n"
+        "from redetect.groundtruth.cli import main\n"
         "try:\n    main(['poses', '--help'])\n"
         "except SystemExit as error:\n    assert error.code == 0\n"
         "heavy = {'numpy', 'scipy', 'cv2', 'pycolmap', 'matplotlib', 'numba'} & set(sys.modules)\n"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundtruth.cli import main
-from groundtruth.trajectories.streams import read_planar_poses
-from groundtruth.validation.scoring import compare_streams
-from landmarks import Frame, MarkerCorner, MarkerLandmark, write_frames
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.groundtruth.validation.scoring import compare_streams
+from redetect.landmarks import Frame, MarkerCorner, MarkerLandmark, write_frames
 
 
 @pytest.mark.long

@@ -22,7 +22,7 @@ FOR_ALL = {"errors", "json_file", "text_file"}
 
 
 def imported(module: Path) -> set[str]:
-    """Second parts of the names of the room's modules that a module imports, late ones too."""
+    """Third parts of the names of the room's modules that a module imports, late ones too."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(module.read_text())):
         if isinstance(node, ast.Import):
@@ -31,11 +31,11 @@ def imported(module: Path) -> set[str]:
             assert node.level == 0, f"{module}: relative import"
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
     parts = (name.split(".") for name in names)
-    return {part[1] for part in parts if part[0] == "groundtruth"}
+    return {part[2] for part in parts if part[:2] == ["redetect", "groundtruth"]}
 
 
 def test_arrows_point_downwards(project_root: Path) -> None:
-    room = project_root / "groundtruth"
+    room = project_root / "redetect" / "groundtruth"
     assert {path.parent.name for path in room.glob("*/__init__.py")} == set(BELOW)
     for package, below in BELOW.items():
         modules = sorted((room / package).glob("*.py"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     LandmarkError,
     circle_arrays,

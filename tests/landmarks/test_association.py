@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from landmarks import (
+from redetect.landmarks import (
     Association,
     associate,
     associate_positions,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks import LandmarkFileError
-from landmarks.map_file import (
+from redetect.landmarks import LandmarkFileError
+from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
@@ -18,7 +18,7 @@ from landmarks.map_file import (
     write_map,
     write_path,
 )
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 HEAD = "kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n"
 

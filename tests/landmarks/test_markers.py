@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from landmarks import (
+from redetect.landmarks import (
     Frame,
     LandmarkError,
     MarkerCorner,

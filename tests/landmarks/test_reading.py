@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Frame,
     LandmarkFileError,

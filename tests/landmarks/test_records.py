@@ -7,7 +7,7 @@ from dataclasses import astuple
 
 import pytest
 
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Frame,
     LandmarkError,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from landmarks import (
+from redetect.landmarks import (
     FrameTilt,
     LandmarkFileError,
     format_no_tilt,
@@ -17,7 +17,7 @@ from landmarks import (
     read_tilts,
     tilt_as_written,
 )
-from landmarks.tilts import numbered_tilts
+from redetect.landmarks.tilts import numbered_tilts
 
 ANGLE = st.floats(-0.2, 0.2)
 VARIANCE = st.floats(1e-9, 1e-3)

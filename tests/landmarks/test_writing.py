@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Record,
     Row,
@@ -24,7 +24,7 @@ from landmarks import (
     write_frames,
     write_rows,
 )
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 # The report's figures 7, 10 and 11, and a row of run c. Where the report's print has one blank
 # between columns, files have two before a positive number of a pose.

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.distortion import largest_distorted_radius
-from landmarks import read_frames
 from lut import (
     GROUP_COLUMNS,
     GROUP_SAMPLES,
@@ -27,6 +26,7 @@ from lut import (
     floor_positions,
     ring,
 )
+from redetect.landmarks import read_frames
 from tests.camera.strategies import cameras
 
 IntArray = NDArray[np.int64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.filters.frames import FrameRows
-from slam.recording import CircleRows, LineRows
+from redetect.slam.filters.frames import FrameRows
+from redetect.slam.recording import CircleRows, LineRows
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import chain_steps, relative_pose
-from slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks import CircleLandmark, LineLandmark, read_frames, read_rows
-from slam.cli import main
-from slam.noise import with_relative_noise
-from slam.recording import read_recording
+from redetect.landmarks import CircleLandmark, LineLandmark, read_frames, read_rows
+from redetect.slam.cli import main
+from redetect.slam.noise import with_relative_noise
+from redetect.slam.recording import read_recording
 
 
 def _without_ids(text: bytes) -> bytes:

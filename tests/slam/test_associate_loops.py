@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.association.loop_closing import (
+from redetect.slam.association.loop_closing import (
     closed_path,
     in_order,
     merge_labels,
@@ -16,8 +16,8 @@ from slam.association.loop_closing import (
     pairs_in_place,
     seen_together,
 )
-from slam.association.loop_path import first_sight, intersect_bearings, solve_path
-from slam.association.loops import (
+from redetect.slam.association.loop_path import first_sight, intersect_bearings, solve_path
+from redetect.slam.association.loops import (
     LoopSettings,
     Match,
     Stretch,
@@ -27,10 +27,10 @@ from slam.association.loops import (
     mutual_pairs,
     stretches_of,
 )
-from slam.association.loops_kernels import best_motion
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import chain_steps, relative_pose, rotation
-from slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.association.loops_kernels import best_motion
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from landmarks import wrap_angle
-from slam.association.frame_to_frame import LocalSettings, Method, associate_locally
-from slam.association.local_map import LocalMap, moved, tilt_jacobian
-from slam.association.run import AssociateSettings, associate_run
-from slam.association.score import score_association
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import chain_steps, relative_pose
-from slam.recording import CircleRows, LineRows, Recording
+from redetect.landmarks import wrap_angle
+from redetect.slam.association.frame_to_frame import LocalSettings, Method, associate_locally
+from redetect.slam.association.local_map import LocalMap, moved, tilt_jacobian
+from redetect.slam.association.run import AssociateSettings, associate_run
+from redetect.slam.association.score import score_association
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = (0.02, -0.08)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks import read_frames
-from slam.cli import main
-from slam.mapping.audit import audit_run
-from slam.models.measurement import disc_in_map, disc_in_robot
-from slam.recording import LineRows, Recording, read_recording
+from redetect.landmarks import read_frames
+from redetect.slam.cli import main
+from redetect.slam.mapping.audit import audit_run
+from redetect.slam.models.measurement import disc_in_map, disc_in_robot
+from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.small_run import SmallRun, small_run
 
 IntArray = NDArray[np.int64]

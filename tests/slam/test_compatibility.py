@@ -11,8 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from slam.association.compatibility import chi_squared_gates, joint_compatible, nearest_compatible
-from slam.errors import SlamError
+from redetect.slam.association.compatibility import (
+    chi_squared_gates,
+    joint_compatible,
+    nearest_compatible,
+)
+from redetect.slam.errors import SlamError
 
 FloatArray = NDArray[np.float64]
 Case = tuple[FloatArray, FloatArray, FloatArray]

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import savemat
 
-from landmarks import wrap_angle
-from landmarks.map_file import read_map, read_path
-from slam.cli import main
-from slam.formats.victoria_park import trees_of
-from slam.models.measurement import disc_of_range_and_bearing
-from slam.models.motion import chain_steps
-from slam.recording import read_recording
+from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import read_map, read_path
+from redetect.slam.cli import main
+from redetect.slam.formats.victoria_park import trees_of
+from redetect.slam.models.measurement import disc_of_range_and_bearing
+from redetect.slam.models.motion import chain_steps
+from redetect.slam.recording import read_recording
 
 FloatArray = NDArray[np.float64]
 RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01

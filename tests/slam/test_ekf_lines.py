@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.errors import SlamError
-from slam.filters.association import Associator
-from slam.filters.delayed_lines import start_line, triangulate
-from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from slam.filters.views import MOST_KEPT_POSES
-from slam.models.measurement import (
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.association import Associator
+from redetect.slam.filters.delayed_lines import start_line, triangulate
+from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.filters.views import MOST_KEPT_POSES
+from redetect.slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_map,
     disc_jacobians,
 )
-from slam.models.motion import move
-from slam.recording import LineRows, Recording
+from redetect.slam.models.motion import move
+from redetect.slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NO_DISCS, bearings_of, spd
 
 FloatArray = NDArray[np.float64]
@@ -143,7 +143,7 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
     assert run.count.lines == len(rows)
     # Pose and two lines come before the last, and several kept poses.
     assert max(ekf.line_slots.values()) >= 3 + 4 + 9
-    from slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from redetect.slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
 
     poses, places = chain_steps(recording.steps), lines.copy()
     unknowns = 3 * steps + 6

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.formats.axes import (
+from redetect.slam.formats.axes import (
     Axes,
     covariance_from_dataset,
     covariance_to_dataset,
     from_dataset,
     to_dataset,
 )
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import move
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import move
 
 FloatArray = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks import CircleLandmark, Frame, format_frame, read_frames
-from landmarks.map_file import (
+from redetect.landmarks import CircleLandmark, Frame, format_frame, read_frames
+from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
@@ -19,11 +19,11 @@ from landmarks.map_file import (
     write_map,
     write_path,
 )
-from slam.cli import main
-from slam.formats.axes import covariance_from_dataset, from_dataset
-from slam.formats.g2o_reading import read_g2o
-from slam.models.motion import chain_steps
-from slam.recording import read_recording
+from redetect.slam.cli import main
+from redetect.slam.formats.axes import covariance_from_dataset, from_dataset
+from redetect.slam.formats.g2o_reading import read_g2o
+from redetect.slam.models.motion import chain_steps
+from redetect.slam.recording import read_recording
 
 DEMO = Path(__file__).parents[2] / "images" / "e"
 Capture = pytest.CaptureFixture[str]

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import read_camera
-from landmarks import wrap_angle
-from slam.formats.axes import Axes, from_dataset
-from slam.formats.tables import write_bearings, write_discs, write_odometry
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import chain_steps, relative_pose, rotation
-from slam.recording import Recording, read_recording
+from redetect.landmarks import wrap_angle
+from redetect.slam.formats.axes import Axes, from_dataset
+from redetect.slam.formats.tables import write_bearings, write_discs, write_odometry
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.slam.recording import Recording, read_recording
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e"

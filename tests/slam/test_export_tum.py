@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from landmarks import wrap_angle
-from landmarks.map_file import Path2D
-from slam.errors import SlamError
-from slam.formats.axes import Axes
-from slam.formats.tum import read_tum, write_tum
-from storage import OutputExistsError
+from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.axes import Axes
+from redetect.slam.formats.tum import read_tum, write_tum
+from redetect.storage import OutputExistsError
 
 numbers = st.floats(-1e6, 1e6)
 angles = st.floats(-20.0, 20.0)

@@ -9,10 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks, read_map, read_path
-from slam.cli import main
-from slam.errors import SlamError
-from slam.filters.report import map_distance, path_distance
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    Landmarks,
+    Path2D,
+    no_landmarks,
+    read_map,
+    read_path,
+)
+from redetect.slam.cli import main
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.report import map_distance, path_distance
 
 STEP = "STEP a.{k} 0.0 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
 DISC = "LANDMARK_C {x} -2 0.9 0.002 0.0001 0.003 {id}\n"

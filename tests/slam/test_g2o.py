@@ -12,20 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
-from slam.errors import SlamError
-from slam.formats.axes import Axes
-from slam.formats.g2o import (
+from redetect.landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.axes import Axes
+from redetect.slam.formats.g2o import (
     RunGraph,
     end_covariance,
     first_disc_vertex,
     start_covariance,
     write_g2o,
 )
-from slam.formats.g2o_frames import frames_of_graph, graph_of_frames
-from slam.formats.g2o_reading import read_g2o
-from slam.models.measurement import disc_in_robot
-from slam.models.motion import relative_pose, rotation
+from redetect.slam.formats.g2o_frames import frames_of_graph, graph_of_frames
+from redetect.slam.formats.g2o_reading import read_g2o
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.motion import relative_pose, rotation
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks import read_frames, wrap_angle
-from slam.formats.axes import from_dataset
-from slam.formats.g2o import RunGraph, write_g2o
-from slam.formats.g2o_frames import graph_of_frames
-from slam.formats.tables import write_odometry
-from slam.models.measurement import disc_in_robot
-from slam.models.motion import relative_pose
-from slam.recording import read_recording
+from redetect.landmarks import read_frames, wrap_angle
+from redetect.slam.formats.axes import from_dataset
+from redetect.slam.formats.g2o import RunGraph, write_g2o
+from redetect.slam.formats.g2o_frames import graph_of_frames
+from redetect.slam.formats.tables import write_odometry
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.motion import relative_pose
+from redetect.slam.recording import read_recording
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.mapping.graph import Estimate, graph_of_recording, with_lines
-from slam.mapping.graph_terms import Loss, Weighting
-from slam.mapping.initial_lines import place_lines, triangulate, well_placed
-from slam.mapping.run_map import map_run
-from slam.models.measurement import bearing_of_vertical
-from slam.recording import LineRows
+from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
+from redetect.slam.mapping.graph_terms import Loss, Weighting
+from redetect.slam.mapping.initial_lines import place_lines, triangulate, well_placed
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.models.measurement import bearing_of_vertical
+from redetect.slam.recording import LineRows
 from tests.slam.small_run import small_run
 
 FloatArray = NDArray[np.float64]

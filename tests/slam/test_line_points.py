@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks import wrap_angle
-from slam.association.line_points import PointSettings, find_points, lines_by_points, rays_of
-from slam.association.line_points_kernels import Rays
-from slam.association.score import score_association
-from slam.errors import SlamError
-from slam.models.measurement import bearing_of_vertical
-from slam.models.motion import chain_steps
-from slam.recording import CircleRows, LineRows, Recording
+from redetect.landmarks import wrap_angle
+from redetect.slam.association.line_points import (
+    PointSettings,
+    find_points,
+    lines_by_points,
+    rays_of,
+)
+from redetect.slam.association.line_points_kernels import Rays
+from redetect.slam.association.score import score_association
+from redetect.slam.errors import SlamError
+from redetect.slam.models.measurement import bearing_of_vertical
+from redetect.slam.models.motion import chain_steps
+from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = (0.02, -0.08)

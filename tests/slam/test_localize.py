@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks import wrap_angle
-from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from slam.errors import SlamError
-from slam.filters.association import Associator
-from slam.filters.frames import frames_of
-from slam.filters.localizer import Localizer, MapErrors, run_localizer
-from slam.models.measurement import (
+from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.association import Associator
+from redetect.slam.filters.frames import frames_of
+from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
+from redetect.slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_robot,
     disc_jacobians,
 )
-from slam.models.motion import move, move_jacobians
-from slam.recording import CircleRows, LineRows, Recording, read_recording
+from redetect.slam.models.motion import move, move_jacobians
+from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
 
 FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])
@@ -309,9 +309,9 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
-    from slam.commands.filter_input import camera_xy_of
-    from slam.filters.ekf_slam import EkfSlam, run_ekf
-    from slam.models.motion import relative_pose
+    from redetect.slam.commands.filter_input import camera_xy_of
+    from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+    from redetect.slam.models.motion import relative_pose
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)

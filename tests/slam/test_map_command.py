@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks.map_file import read_map, read_path
-from slam.cli import main
-from slam.models.measurement import disc_in_robot
-from slam.models.motion import relative_pose
+from redetect.landmarks.map_file import read_map, read_path
+from redetect.slam.cli import main
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.motion import relative_pose
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_the_joint_covariance_of_too_many_landmarks_is_not_written(
     output = demo_run.parent / "many"
     assert main(["map", str(demo_run), "-o", str(output)]) == 0
     assert (output / "map_covariance.npy").is_file()
-    monkeypatch.setattr("slam.commands.map.MOST_LANDMARKS_TOGETHER", 30)
+    monkeypatch.setattr("redetect.slam.commands.map.MOST_LANDMARKS_TOGETHER", 30)
     assert main(["map", str(demo_run), "-o", str(output), "--force"]) == 0
     assert "more than 30 landmarks: no map_covariance.npy" in capsys.readouterr().out
     assert not (output / "map_covariance.npy").exists()

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from slam.commands.run_camera import camera_of_run
-from slam.errors import SlamError
-from slam.mapping.covariance_file import (
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.covariance_file import (
     covariance_file,
     joint_covariance,
     read_joint_covariance,
     write_joint_covariance,
 )
-from slam.mapping.graph_terms import Weighting, linearise
-from slam.mapping.run_map import map_run
-from slam.mapping.solve import normal_equations
-from slam.recording import read_recording
-from storage import OutputExistsError
+from redetect.slam.mapping.graph_terms import Weighting, linearise
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.mapping.solve import normal_equations
+from redetect.slam.recording import read_recording
+from redetect.storage import OutputExistsError
 
 
 @pytest.mark.parametrize("calibrate", [False, True])

@@ -10,18 +10,18 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from landmarks import read_frames
-from slam.errors import SlamError
-from slam.mapping.graph import first_sight, graph_of_recording
-from slam.mapping.graph_terms import Weighting
-from slam.mapping.initial_lines import place_lines
-from slam.mapping.run_map import MappedRun, map_run
-from slam.mapping.solve import solve
-from slam.mapping.solve_gtsam import solve_gtsam
-from slam.models.motion import move
-from slam.models.mounted_discs import rotation_exp
-from slam.models.mounting import directions_of_rows, rows_through_mounting
-from slam.recording import LineRows, Recording, read_recording, recording_of_frames
+from redetect.landmarks import read_frames
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.graph import first_sight, graph_of_recording
+from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.initial_lines import place_lines
+from redetect.slam.mapping.run_map import MappedRun, map_run
+from redetect.slam.mapping.solve import solve
+from redetect.slam.mapping.solve_gtsam import solve_gtsam
+from redetect.slam.models.motion import move
+from redetect.slam.models.mounted_discs import rotation_exp
+from redetect.slam.models.mounting import directions_of_rows, rows_through_mounting
+from redetect.slam.recording import LineRows, Recording, read_recording, recording_of_frames
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 

@@ -9,8 +9,8 @@ import pytest
 from scipy import sparse
 
 from camera import Camera
-from slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from slam.mapping.graph_terms import (
+from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
+from redetect.slam.mapping.graph_terms import (
     Loss,
     RowErrors,
     Weighting,
@@ -19,13 +19,13 @@ from slam.mapping.graph_terms import (
     linearise,
     robust,
 )
-from slam.mapping.marginal_kernels import filled_pattern
-from slam.mapping.marginals import inverse_blocks, marginals
-from slam.mapping.solve import moved, solve
-from slam.models.measurement import bearing_of_vertical
-from slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
-from slam.models.mounting import mounting_change, rows_as_recorded
-from slam.recording import LineRows
+from redetect.slam.mapping.marginal_kernels import filled_pattern
+from redetect.slam.mapping.marginals import inverse_blocks, marginals
+from redetect.slam.mapping.solve import moved, solve
+from redetect.slam.models.measurement import bearing_of_vertical
+from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
+from redetect.slam.models.mounting import mounting_change, rows_as_recorded
+from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, small_run
 
 

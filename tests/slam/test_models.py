@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks import wrap_angle
-from slam.models.measurement import (
+from redetect.landmarks import wrap_angle
+from redetect.slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_map,
     disc_in_robot,
     disc_jacobians,
 )
-from slam.models.motion import (
+from redetect.slam.models.motion import (
     chain_steps,
     move,
     move_jacobians,

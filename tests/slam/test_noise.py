@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from landmarks import CircleLandmark, LineLandmark, Row, Step, read_frames, read_rows
-from slam.cli import main
-from slam.errors import SlamError
-from slam.noise import AddedNoise, noisy_rows
+from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, read_frames, read_rows
+from redetect.slam.cli import main
+from redetect.slam.errors import SlamError
+from redetect.slam.noise import AddedNoise, noisy_rows
 
 STEP = Step("a.0", 0.01, -0.2, 0.05, 2e-5, 1e-7, 3e-5, 4e-5, 5e-8, 3e-4)
 DISC = CircleLandmark(0.5, -2.0, 0.9, 0.002, 0.0003, 0.003, (7,))

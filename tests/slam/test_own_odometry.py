@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.cli import main as detect
-from landmarks.map_file import read_path
-from slam.cli import main as slam
-from slam.formats.axes import from_dataset
-from slam.models.motion import chain_steps, relative_pose
-from slam.models.odometry_noise import OdometryNoise
+from redetect.landmarks.map_file import read_path
+from redetect.slam.cli import main as slam
+from redetect.slam.formats.axes import from_dataset
+from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.models.odometry_noise import OdometryNoise
 from tests.detect.recordings import Ros, Said
 
 FloatArray = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""``python -m slam`` is the command."""
+"""``python -m redetect.slam`` is the command."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ def test_the_room_is_started_as_a_module(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["slam", "--help"])
     with pytest.raises(SystemExit) as ended:
-        run_module("slam", run_name="__main__")
+        run_module("redetect.slam", run_name="__main__")
     assert ended.value.code == 0
     assert "usage: slam" in capsys.readouterr().out

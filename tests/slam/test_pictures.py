@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from slam.errors import SlamError
-from slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
-from storage import OutputExistsError
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.slam.errors import SlamError
+from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
+from redetect.storage import OutputExistsError
 
 FloatArray = NDArray[np.float64]
 

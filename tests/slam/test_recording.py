@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from landmarks import LandmarkFileError
-from slam.errors import SlamError
-from slam.models.odometry_noise import OdometryNoise
-from slam.recording import read_recording
+from redetect.landmarks import LandmarkFileError
+from redetect.slam.errors import SlamError
+from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.recording import read_recording
 
 STEP = "STEP a.{k} 0.1 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
 DISC = "LANDMARK_C 0.5 -2 0.9 0.002 0.0001 0.003 {id}\n"

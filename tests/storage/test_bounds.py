@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-ROOMS = ("camera", "detect", "groundtruth", "landmarks", "lut", "slam")
+ROOMS = ("camera", "detect", "lut", "redetect")
 
 #: Dataclasses with a default for every field that are no settings: results, and flags that the
 #: commands hand on to settings.

@@ -13,10 +13,10 @@ from camera import Camera, CameraError
 from camera.calibration.images import read_grey
 from detect.errors import FrameError
 from detect.sources.gray import decode_gray
-from groundtruth.errors import GroundTruthError
-from groundtruth.markers.boards_file import BoardImage, find_boards
-from groundtruth.markers.checkerboard import Checkerboard
-from storage.image_header import MOST_PIXELS, claimed_size
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.boards_file import BoardImage, find_boards
+from redetect.groundtruth.markers.checkerboard import Checkerboard
+from redetect.storage.image_header import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
 CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))

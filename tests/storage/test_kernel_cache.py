@@ -27,7 +27,7 @@ PROGRAM = """
 import sys
 from functools import cache
 from detect.announcing import on_compilation
-from storage.exit_codes import exit_code_of
+from redetect.storage.exit_codes import exit_code_of
 from kernels import of
 
 on_compilation(cache(lambda: print("compiles")))

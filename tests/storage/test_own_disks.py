@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from storage import write_whole
+from redetect.storage import write_whole
 from tests.storage.own_disks import fill, on_linkless_disk, on_small_disk
 
 OLD = b"what was there before\n"

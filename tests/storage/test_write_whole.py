@@ -12,7 +12,7 @@ from threading import Barrier
 
 import pytest
 
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 
 
 def names(folder: Path) -> list[str]:

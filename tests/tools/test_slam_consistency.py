@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.filters.frames import FilterRun
+from redetect.slam.filters.frames import FilterRun
 from tools.slam_evaluation.consistency import assess, band, localized, mapped
 from tools.slam_evaluation.simulated_runs import CAMERA_XY, Scenario, SimulatedRun, simulate
 
@@ -24,8 +24,8 @@ def test_band_is_that_of_chi_squared() -> None:
 
 
 def test_rows_have_the_errors_that_they_state() -> None:
-    from slam.models.measurement import bearing_of_vertical, disc_in_robot
-    from slam.models.motion import relative_pose
+    from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+    from redetect.slam.models.motion import relative_pose
 
     run = simulate(Scenario(steps=400, lines=20), 3)
     rows = run.recording.circles

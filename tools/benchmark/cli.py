@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from storage.exit_codes import exit_code_of
+from redetect.storage.exit_codes import exit_code_of
 from tools.benchmark.suite import Settings
 
 _FILE_WIDTH = 110
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _carry_out(command: Benchmark) -> int:
     from rich.console import Console
 
-    from storage import OutputExistsError, write_whole
+    from redetect.storage import OutputExistsError, write_whole
     from tools.benchmark.plot import plot_png
     from tools.benchmark.report import format_headline, format_markdown, result_tables, spliced
     from tools.benchmark.result import format_json

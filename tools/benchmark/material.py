@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from detect.run import Run
-from landmarks import Frame, write_frames
+from redetect.landmarks import Frame, write_frames
 from tools.benchmark.errors import BenchmarkError
 
 _JPEG_QUALITY = 90

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 
 _INK, _OWN, _OTHER = "#444444", "#1f4e9c", "#e67e22"
 

@@ -17,7 +17,7 @@ from tyro.conf import Positional
 
 from camera import read_camera
 from camera.boards.board import Board
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 from tools.camera_evaluation.rendering import board_poses, rays_of, render_board
 
 #: The board in the hand, and the one that lies on the floor: squares of 4 cm and 12 cm.

@@ -18,9 +18,9 @@ from camera import read_camera
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
-from landmarks import FrameTilt
-from storage import write_whole
-from storage.exit_codes import exit_code_of
+from redetect.landmarks import FrameTilt
+from redetect.storage import write_whole
+from redetect.storage.exit_codes import exit_code_of
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
@@ -421,7 +421,7 @@ def _buildings(command: Buildings) -> int:
 
 
 def _rendered_lines(command: RenderedLines) -> int:
-    from landmarks import read_tilts
+    from redetect.landmarks import read_tilts
 
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "detected.lines"
@@ -443,7 +443,7 @@ def _rendered_lines(command: RenderedLines) -> int:
 def _tilt(command: Tilt) -> int:
     from detect.comparison.compare import compare_runs
     from detect.comparison.result import CompareOptions
-    from landmarks import read_tilts
+    from redetect.landmarks import read_tilts
 
     options = CompareOptions(gate_m=0.3)
     with tempfile.TemporaryDirectory() as folder:

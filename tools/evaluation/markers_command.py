@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import tyro
 
-from storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_whole
 from tools.evaluation.markers import Offence, offences, score_frames, search_photographs
 from tools.evaluation.markers_detectors import OURS, PEERS, known_to_opencv
 from tools.evaluation.markers_report import bins_lines, counts_lines, statistics_picture

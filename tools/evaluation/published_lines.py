@@ -12,8 +12,8 @@ from camera import Camera, read_camera
 from detect.line_settings import PUBLISHED, LineSettings
 from detect.lines import LineDetections, detect_lines
 from detect.sources.gray import decode_gray
-from landmarks import LineLandmark, parse_record
 from lut.verticals import build_vertical_table
+from redetect.landmarks import LineLandmark, parse_record
 
 
 @dataclass(frozen=True)

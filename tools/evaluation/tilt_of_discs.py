@@ -13,8 +13,8 @@ from scipy.optimize import least_squares
 from camera import Camera
 from detect.seen import image_positions
 from detect.sources.image_names import image_name
-from landmarks import Frame, read_frames, read_tilts
-from landmarks.map_file import read_map, read_path
+from redetect.landmarks import Frame, read_frames, read_tilts
+from redetect.landmarks.map_file import read_map, read_path
 
 FloatArray = NDArray[np.float64]
 

@@ -29,8 +29,8 @@ from detect.sources.gray import (
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
-from storage.image_header import claimed_size
-from storage.parts import left_part
+from redetect.storage.image_header import claimed_size
+from redetect.storage.parts import left_part
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import CAMERA_TEXT, NUMBERS
 

@@ -8,17 +8,21 @@ import struct
 import numpy as np
 
 from camera import CameraError
-from groundtruth.clocks.clock import read_clock
-from groundtruth.clocks.ptpd import read_ptpd
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.building import read_building
-from groundtruth.lasers.scanners import read_robot, read_scanners
-from groundtruth.lasers.scans import read_scans
-from groundtruth.markers.boards_file import read_boards
-from groundtruth.markers.calibration import read_network, read_rig
-from groundtruth.trajectories.streams import read_planar_poses, read_rows_of_numbers, read_times
-from groundtruth.validation.fiducials import Survey, read_distances, read_survey
-from groundtruth.validation.relative_errors import read_relations
+from redetect.groundtruth.clocks.clock import read_clock
+from redetect.groundtruth.clocks.ptpd import read_ptpd
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.building import read_building
+from redetect.groundtruth.lasers.scanners import read_robot, read_scanners
+from redetect.groundtruth.lasers.scans import read_scans
+from redetect.groundtruth.markers.boards_file import read_boards
+from redetect.groundtruth.markers.calibration import read_network, read_rig
+from redetect.groundtruth.trajectories.streams import (
+    read_planar_poses,
+    read_rows_of_numbers,
+    read_times,
+)
+from redetect.groundtruth.validation.fiducials import Survey, read_distances, read_survey
+from redetect.groundtruth.validation.relative_errors import read_relations
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import CAMERA_TEXT, JSON_WORDS, NUMBERS
 

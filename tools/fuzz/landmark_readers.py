@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from landmarks import LandmarkError, frames_of_rows, read_rows
-from landmarks.map_file import read_map, read_path
-from landmarks.tilts import read_tilts
-from slam.errors import SlamError
-from slam.formats.g2o_reading import read_g2o
-from slam.formats.tum import read_tum
-from slam.mapping.covariance_file import covariance_file, read_joint_covariance
+from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
+from redetect.landmarks.map_file import read_map, read_path
+from redetect.landmarks.tilts import read_tilts
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.g2o_reading import read_g2o
+from redetect.slam.formats.tum import read_tum
+from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from tools.fuzz.reader import Reader
 from tools.fuzz.words import NUMBERS
 
 
 def _landmarks(path: Path) -> object:
     """Frames of a file; what was accepted is given back byte by byte, and its records too."""
-    from landmarks import parse_rows
-    from landmarks.writing import format_record
+    from redetect.landmarks import parse_rows
+    from redetect.landmarks.writing import format_record
 
     rows = list(read_rows(path))
     assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"

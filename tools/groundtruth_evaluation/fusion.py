@@ -20,10 +20,10 @@ import tyro
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.cli import main as groundtruth
-from groundtruth.clocks.clock import ClockSegment, read_clock
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from groundtruth.validation.scoring import compare_streams
+from redetect.groundtruth.cli import main as groundtruth
+from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
+from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.validation.scoring import compare_streams
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
 

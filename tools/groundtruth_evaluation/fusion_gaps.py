@@ -18,10 +18,10 @@ import tyro
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.fusion.fuse import Fusion, fuse
-from groundtruth.fusion.settings import FuseSettings
-from groundtruth.trajectories.streams import PlanarPoses
-from landmarks import wrap_angle
+from redetect.groundtruth.fusion.fuse import Fusion, fuse
+from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
 from tools.simulator.laser.route import Route
 from tools.simulator.laser.settings import DrivingLimits, WheelErrors
 from tools.simulator.laser.wheels import measured_path

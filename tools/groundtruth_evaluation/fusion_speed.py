@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
-from groundtruth.fusion.fuse import fuse
-from groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.fusion.fuse import fuse
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ import tyro
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.geometry.plane import between
-from groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
-from landmarks import wrap_angle
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.plane import between
+from redetect.groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 

@@ -22,14 +22,14 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.blocks import combined_poses
-from groundtruth.lasers.scanners import Scanner, read_scanners
-from groundtruth.lasers.session import load_session
-from groundtruth.lasers.suspects import track_robot, track_without_suspects
-from groundtruth.lasers.tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
-from groundtruth.trajectories.streams import read_planar_poses
-from landmarks import wrap_angle
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
+from redetect.groundtruth.lasers.session import load_session
+from redetect.groundtruth.lasers.suspects import track_robot, track_without_suspects
+from redetect.groundtruth.lasers.tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -193,8 +193,8 @@ def _calibration(session: Path, options: LaserSessions) -> tuple[Path, dict[str,
     exact = session / "scanners.truth.json"
     if options.scanners == "true":
         return exact, {"scanner_mm": 0.0, "scanner_deg": 0.0, "scanner_nees": 0.0}
-    from groundtruth.commands.lasers import perform as align
-    from groundtruth.commands.options import Lasers
+    from redetect.groundtruth.commands.lasers import perform as align
+    from redetect.groundtruth.commands.options import Lasers
 
     output = session / "aligned.json"
     with redirect_stdout(io.StringIO()):

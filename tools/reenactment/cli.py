@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from storage.exit_codes import exit_code_of
+from redetect.storage.exit_codes import exit_code_of
 
 if TYPE_CHECKING:
     from tools.reenactment.prepare import Quality
@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
 def prepare(command: Prepare) -> int:
     """Read a run, fit its world and write it; the table goes to stdout as it grows."""
     from camera import read_camera
-    from landmarks import read_frames
-    from storage import OutputExistsError
+    from redetect.landmarks import read_frames
+    from redetect.storage import OutputExistsError
     from tools.reenactment.prepare import stages, world_of_stage
     from tools.reenactment.recording import (
         RecordingError,

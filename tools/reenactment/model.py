@@ -1,6 +1,6 @@
 """Odometry's part of what a run's rows and steps are explained by.
 
-What a tilted, differently mounted camera makes of discs is `slam.models.mounted_discs`.
+What a tilted, differently mounted camera makes of discs is `redetect.slam.models.mounted_discs`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.models.mounted_discs import (
+from redetect.slam.models.mounted_discs import (
     Geometry,
     PixelJacobians,
     predict_pixels,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from landmarks import Frame, circle_arrays, is_positive_definite
+from redetect.landmarks import Frame, circle_arrays, is_positive_definite
 from tools.reenactment.model import chain_odometry
 
 FloatArray = NDArray[np.float64]
@@ -65,7 +65,7 @@ def recording_of_frames(camera: Camera, frames: Iterable[Frame]) -> Recording:
     camera : Camera
         As calibrated: the one that put the rows on the floor.
     frames : iterable of Frame
-        E.g. from `landmarks.read_frames`.
+        E.g. from `redetect.landmarks.read_frames`.
 
     Raises
     ------

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage import write_whole
+from redetect.storage import write_whole
 
 FloatArray = NDArray[np.float64]
 

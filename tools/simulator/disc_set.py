@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, parse_camera, read_camera
-from storage import write_whole
+from redetect.storage import write_whole
 from tools.simulator.observation import BORDER_PX, FAR_LIMIT_M
 from tools.simulator.plan import PUBLISHED_CAMERA
 from tools.simulator.scene import FloatArray

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from landmarks import CircleLandmark, LineLandmark
+from redetect.landmarks import CircleLandmark, LineLandmark
 from tools.simulator.construction import UprightEdge
 from tools.simulator.poses import world_from_robot, world_to_robot
 from tools.simulator.quality import disc_quality

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from landmarks import Step
+from redetect.landmarks import Step
 from tools.simulator.poses import relative_pose
 from tools.simulator.scene import FloatArray
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
-from landmarks import Frame, read_frames, write_frames
-from storage import write_whole
+from redetect.landmarks import Frame, read_frames, write_frames
+from redetect.storage import write_whole
 from tools.reenactment.world import World, read_world
 from tools.simulator.construction import (
     CEILING_M,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, write_camera
-from landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
-from storage import write_whole
+from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
+from redetect.storage import write_whole
 from tools.simulator.observation import (
     SeenDisc,
     SeenEdge,
@@ -173,7 +173,7 @@ def write_run(
 
     Raises
     ------
-    storage.OutputExistsError
+    redetect.storage.OutputExistsError
         If a file exists and `overwrite` is false.
     """
     plan = plan_run(settings)

@@ -17,13 +17,13 @@ from typing import Annotated, Any, Literal, Optional
 import tyro
 from tyro.conf import Positional, arg
 
-from slam.association.frame_to_frame import LocalSettings
-from slam.association.run import AssociateSettings, associate_run
-from slam.commands.associate import score_run
-from slam.commands.filter_input import camera_xy_of
-from slam.noise import with_relative_noise
-from slam.recording import read_recording
-from storage import write_whole
+from redetect.slam.association.frame_to_frame import LocalSettings
+from redetect.slam.association.run import AssociateSettings, associate_run
+from redetect.slam.commands.associate import score_run
+from redetect.slam.commands.filter_input import camera_xy_of
+from redetect.slam.noise import with_relative_noise
+from redetect.slam.recording import read_recording
+from redetect.storage import write_whole
 
 COLUMNS = (
     *("run", "noise", "method", "kind", "level", "precision", "recall", "rows right"),

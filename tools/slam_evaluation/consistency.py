@@ -13,10 +13,10 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from landmarks import wrap_angle
-from slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from slam.filters.frames import FilterRun
-from slam.filters.localizer import Localizer, MapErrors, run_localizer
+from redetect.landmarks import wrap_angle
+from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from redetect.slam.filters.frames import FilterRun
+from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
 from tools.slam_evaluation.simulated_runs import (
     CAMERA_XY,
     Scenario,

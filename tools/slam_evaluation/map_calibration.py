@@ -15,13 +15,13 @@ import tyro
 from numpy.typing import NDArray
 
 from camera import Camera
-from slam.commands.run_camera import camera_of_run
-from slam.mapping.graph_terms import RowErrors, Weighting
-from slam.mapping.run_map import map_run
-from slam.models.measurement import disc_in_robot
-from slam.models.mounted_discs import rotation_exp
-from slam.models.mounting import rows_through_mounting
-from slam.recording import Recording, read_recording
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.mapping.graph_terms import RowErrors, Weighting
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.mounted_discs import rotation_exp
+from redetect.slam.models.mounting import rows_through_mounting
+from redetect.slam.recording import Recording, read_recording
 from tools.slam_evaluation.map_study import with_right_odometry
 from tools.slam_evaluation.map_truth import Truth, path_distance, read_truth
 

@@ -14,10 +14,10 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from slam.commands.run_camera import camera_of_run
-from slam.mapping.graph_terms import Weighting, errors
-from slam.mapping.run_map import MappedRun, map_run
-from slam.recording import Recording, read_recording
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.mapping.graph_terms import Weighting, errors
+from redetect.slam.mapping.run_map import MappedRun, map_run
+from redetect.slam.recording import Recording, read_recording
 
 #: What the published covariance of a row has whatever the row's place (m).
 PUBLISHED_FLOOR_M = 0.04

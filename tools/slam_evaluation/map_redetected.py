@@ -16,11 +16,11 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from landmarks import squared_mahalanobis
-from slam.errors import SlamError
-from slam.mapping.run_map import MappedRun, map_run
-from slam.models.measurement import disc_in_robot
-from slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
+from redetect.landmarks import squared_mahalanobis
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.run_map import MappedRun, map_run
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
 from tools.slam_evaluation.map_truth import Truth, path_distance, read_truth
 
 FloatArray = NDArray[np.float64]

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
-from slam.mapping.graph_terms import Weighting, cost
-from slam.mapping.solve import solve
-from slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
-from slam.recording import read_recording
+from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
+from redetect.slam.mapping.graph_terms import Weighting, cost
+from redetect.slam.mapping.solve import solve
+from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
+from redetect.slam.recording import read_recording
 
 #: A run that GTSAM takes from odometry: what it is, and how many of its steps lead how far.
 Outcome = tuple[float, int]

@@ -15,10 +15,10 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from slam.mapping.chi_squared import ChiSquared
-from slam.mapping.run_map import MappedRun, map_run
-from slam.models.motion import relative_pose
-from slam.recording import Recording, read_recording
+from redetect.slam.mapping.chi_squared import ChiSquared
+from redetect.slam.mapping.run_map import MappedRun, map_run
+from redetect.slam.models.motion import relative_pose
+from redetect.slam.recording import Recording, read_recording
 from tools.simulator.odometry import step_covariance
 from tools.slam_evaluation.map_truth import Distance, Truth, distance, path_distance, read_truth
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.mapping.run_map import MappedRun
-from slam.models.measurement import disc_in_robot
-from slam.models.motion import relative_pose
+from redetect.slam.mapping.run_map import MappedRun
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.motion import relative_pose
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

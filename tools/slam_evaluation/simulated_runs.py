@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from slam.models.measurement import bearing_of_vertical, disc_in_robot
-from slam.models.motion import chain_steps
-from slam.recording import CircleRows, LineRows, Recording
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps
+from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

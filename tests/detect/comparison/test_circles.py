@@ -16,7 +16,7 @@ from detect.comparison.compare import Beside, compare_frames, compare_runs
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, DiscComparison, unmet_demands
 from detect.sources.image_names import image_name
-from landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
+from redetect.landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
 from tests.detect.comparison.formatting import format_text
 
 STANDARD = CompareOptions()

@@ -19,7 +19,7 @@ from detect.comparison.report import format_json
 from detect.comparison.result import CompareOptions, DiscComparison
 from detect.levelling import levelled
 from detect.seen import Sight, image_positions, level_seen
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Frame,
     FrameTilt,
@@ -29,7 +29,7 @@ from landmarks import (
     read_frames,
     write_frames,
 )
-from storage import write_whole
+from redetect.storage import write_whole
 from tests.detect.comparison.formatting import format_text
 
 FloatArray = NDArray[np.float64]

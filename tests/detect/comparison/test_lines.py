@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from detect.comparison.compare import compare_line_frames
 from detect.comparison.report import format_json
 from detect.comparison.result import CompareError, CompareOptions, LineComparison, unmet_demands
-from landmarks import (
+from redetect.landmarks import (
     CircleLandmark,
     Frame,
     Landmark,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detect.discs.identity import MappedDisc, ids_of_map, ids_of_rows, matched
-from landmarks import CircleLandmark
+from redetect.landmarks import CircleLandmark
 
 #: Two standard deviations of which 99.9 % of two-dimensional errors are nearer.
 GATE = math.sqrt(2.0 * math.log(1000.0))

@@ -18,7 +18,14 @@ from detect.errors import DetectError
 from detect.run import open_images
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
-from landmarks import CircleLandmark, Frame, FrameTilt, LineLandmark, Step, circle_landmarks
+from redetect.landmarks import (
+    CircleLandmark,
+    Frame,
+    FrameTilt,
+    LineLandmark,
+    Step,
+    circle_landmarks,
+)
 from tests.detect.drawing.test_detections import changed
 from tests.detect.test_cli import assert_refused
 

@@ -12,8 +12,8 @@ from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows
 from detect.seen import Sight
 from detect.settings import CircleSettings
-from landmarks import Frame, Step, circle_landmarks
 from lut import ring
+from redetect.landmarks import Frame, Step, circle_landmarks
 
 SETTINGS = CircleSettings()
 

@@ -11,8 +11,8 @@ import pytest
 
 from detect.cli import main
 from detect.exports.writers import FRAME_ID, message_definitions, topic_of
-from landmarks import Frame, Landmark, Step, read_frames, read_tilts
-from landmarks.columns import TABLES, TableName, values_of
+from redetect.landmarks import Frame, Landmark, Step, read_frames, read_tilts
+from redetect.landmarks.columns import TABLES, TableName, values_of
 
 Captured = pytest.CaptureFixture[str]
 
@@ -275,7 +275,7 @@ def test_the_demo_run_reads_back(project_root: Path, tmp_path: Path) -> None:
     assert main(["export", str(source), "-o", str(tmp_path / "e.csv")]) == 0
     steps = read_csv(tmp_path / "e.steps.csv", "steps")
     landmarks: list[list[Landmark]] = [[] for _ in steps]
-    from landmarks import CircleLandmark
+    from redetect.landmarks import CircleLandmark
 
     for frame, _, _, *values in read_csv(tmp_path / "e.csv", "circles"):
         landmarks[frame].append(CircleLandmark(*values))

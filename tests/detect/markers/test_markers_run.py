@@ -14,7 +14,7 @@ from detect.markers.settings import MarkerSettings
 from detect.run import Run, open_images
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
 POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

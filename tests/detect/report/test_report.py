@@ -20,7 +20,7 @@ from detect.line_settings import PUBLISHED as PUBLISHED_LINES
 from detect.report.statistics import binned, disc_rates, line_rates, whitened
 from detect.run import camera_in
 from detect.seen import Sight
-from landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
+from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
 from tests.detect.test_cli import assert_refused
 
 Captured = pytest.CaptureFixture[str]

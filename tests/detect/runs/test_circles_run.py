@@ -17,9 +17,9 @@ from detect.run import Run, open_run
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings
-from landmarks import read_frames, read_rows, read_steps
 from lut import TableError
-from storage import OutputExistsError
+from redetect.landmarks import read_frames, read_rows, read_steps
+from redetect.storage import OutputExistsError
 from tests.detect.conftest import SMALL_RUN_DISCS
 
 

@@ -18,7 +18,7 @@ from detect.errors import WorkerError
 from detect.run import RunFrame
 from detect.runs.dispatch import Chunk, Workers, detect_chunks
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
-from landmarks import Step
+from redetect.landmarks import Step
 
 
 def tasks(count: int) -> Iterator[FrameTask]:

@@ -19,8 +19,8 @@ from camera import Camera
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
 from detect.sources.gray import bounded_content, demand_bounded
-from landmarks import Step
-from storage.image_header import MOST_PIXELS, claimed_size
+from redetect.landmarks import Step
+from redetect.storage.image_header import MOST_PIXELS, claimed_size
 
 TEXTURE = np.random.default_rng(3).integers(0, 256, (48, 96)).astype(np.uint8)
 SIDE = 60_000
@@ -126,7 +126,7 @@ import re, sys
 from pathlib import Path
 from detect.errors import FrameError
 from detect.run import RunFrame, read_image
-from landmarks import Step
+from redetect.landmarks import Step
 import cv2
 
 def peak_kib():

@@ -18,8 +18,8 @@ from detect.runs.known import KnownOfFrame
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
 from detect.runs.rows import rows_of_frames
 from detect.settings import PUBLISHED
-from landmarks import FrameTilt
-from storage.parts import left_part, new_part
+from redetect.landmarks import FrameTilt
+from redetect.storage.parts import left_part, new_part
 
 FRAMES = 12
 

@@ -14,7 +14,7 @@ from camera import Camera
 from detect.cli import main
 from detect.errors import FrameError
 from detect.run import open_run, read_image
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 
 STEP = "STEP {} 0 0 0 1e-6 0 1e-6 0 0 1e-6\n"
 

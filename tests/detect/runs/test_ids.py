@@ -10,7 +10,7 @@ import pytest
 
 from detect.cli import main
 from detect.runs.known import MapByImage
-from landmarks import CircleLandmark, LandmarkFileError, read_frames
+from redetect.landmarks import CircleLandmark, LandmarkFileError, read_frames
 
 FRAMES = 30
 
@@ -54,7 +54,7 @@ def test_ids_of_rows_and_of_a_map(
     assert len(own.keys() & in_view.keys()) > 0.9 * len(in_view)
     assert own.keys() <= in_view.keys()
 
-    from slam.cli import main as slam
+    from redetect.slam.cli import main as slam
 
     assert slam(["map", str(first / "detected.circles"), "-o", str(first / "map")]) == 0
     target = ["-o", str(second / "detected.circles" if command == "circles" else second)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from detect.runs.known import FramesByImage, Known
-from landmarks import LandmarkFileError, read_frames
+from redetect.landmarks import LandmarkFileError, read_frames
 
 LINES = """\
 # IDs by hand

@@ -16,7 +16,7 @@ from detect.run_tilt import LEAST_FRAMES
 from detect.runs.level_run import level_run
 from detect.runs.plan import RunSummary
 from detect.seen import level_seen
-from landmarks.reading import frames_of_rows, parse_rows
+from redetect.landmarks.reading import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
 STEP = "STEP {} 0.0 0.0 0.0 1e-6 0.0 1e-6 0.0 0.0 1e-6\n"

@@ -17,7 +17,7 @@ from detect.run import open_run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.verticals.detections import carry_ids
-from landmarks import LineLandmark, read_frames, read_tilts
+from redetect.landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.line_scene import pinhole
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from detect.errors import FrameError
 from detect.runs.rows import disc_numbers, landmark_rows
-from landmarks import CircleLandmark, LineLandmark, circle_landmarks, format_record
+from redetect.landmarks import CircleLandmark, LineLandmark, circle_landmarks, format_record
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 IDS = st.lists(st.integers(-1, 10**6), max_size=3).map(tuple)

@@ -18,7 +18,7 @@ from detect.runs.plan import KEPT_FAILURES, FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
-from landmarks import read_frames, read_tilts
+from redetect.landmarks import read_frames, read_tilts
 
 LIGHT = CircleSettings(polarity="light")
 FRAMES = 7

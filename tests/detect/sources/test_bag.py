@@ -24,8 +24,8 @@ from detect.sources.bag_messages import pixels_of_message
 from detect.sources.gray import gray_of_pixels
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from groundtruth.trajectories.streams import read_times
-from landmarks import Frame, Step, format_frame, read_frames, read_steps
+from redetect.groundtruth.trajectories.streams import read_times
+from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 
 Captured = pytest.CaptureFixture[str]

@@ -22,7 +22,7 @@ from detect.run import Run
 from detect.sources.bag import pose_in_dataset, rotation_of
 from detect.sources.opening import open_calibrated, open_source
 from detect.sources.options import SourceOptions
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said
 
 OPTICAL = "front_optical"

@@ -19,8 +19,8 @@ from detect.run import read_image
 from detect.sources import live
 from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
-from groundtruth.trajectories.streams import read_times
-from landmarks import read_frames
+from redetect.groundtruth.trajectories.streams import read_times
+from redetect.landmarks import read_frames
 from tests.detect.recordings import write_video
 
 

@@ -17,8 +17,8 @@ from detect.sources.opening import open_source
 from detect.sources.options import SourceOptions
 from detect.sources.poses import TimedPose, pose_between, step_between, tick_poses, tum_poses
 from detect.sources.times import format_time, read_image_times
-from groundtruth.trajectories.streams import read_times
-from landmarks import read_frames
+from redetect.groundtruth.trajectories.streams import read_times
+from redetect.landmarks import read_frames
 
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 

@@ -16,8 +16,8 @@ from detect.errors import DetectError
 from detect.run import Run, read_image
 from detect.sources.opening import open_calibrated, open_source
 from detect.sources.options import SourceOptions
-from groundtruth.trajectories.streams import read_times
-from landmarks import read_frames
+from redetect.groundtruth.trajectories.streams import read_times
+from redetect.landmarks import read_frames
 from tests.detect.recordings import write_video
 
 Captured = pytest.CaptureFixture[str]

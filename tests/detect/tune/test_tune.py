@@ -30,7 +30,7 @@ from detect.settings import CircleSettings
 from detect.tune.grid import combinations, parameter_values
 from detect.tune.run import Trial, tune_run
 from detect.tune.table import curve_picture, f1_score, knee, pareto_front, trial_records
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.test_cli import assert_refused
 

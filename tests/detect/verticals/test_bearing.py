@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from camera import Camera
 from detect.verticals.joining import chain_neighbours, join_mixtures
 from detect.verticals.tilt import TiltEstimate, level_matrix
-from landmarks import LineLandmark, parse_record
+from redetect.landmarks import LineLandmark, parse_record
 from tests.reference.verticals import (
     close_groups,
     compensated_bearings,

@@ -12,15 +12,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundtruth.cli import main
-from groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document, read_clock
-from groundtruth.clocks.headings import HeadingIntegral, heading_noise, segments_between_gaps
-from groundtruth.clocks.ptpd import read_ptpd
-from groundtruth.clocks.sync import SyncSettings, synchronise
-from groundtruth.clocks.wandering import Wandering, estimate_wandering
-from groundtruth.errors import GroundTruthError, StreamError
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from landmarks import wrap_angle
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document, read_clock
+from redetect.groundtruth.clocks.headings import (
+    HeadingIntegral,
+    heading_noise,
+    segments_between_gaps,
+)
+from redetect.groundtruth.clocks.ptpd import read_ptpd
+from redetect.groundtruth.clocks.sync import SyncSettings, synchronise
+from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.clocks.simulated import Clocks, headings_only, joined, simulate
 
 SEGMENT = ClockSegment(

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.fusion.fuse import FuseSettings
-from groundtruth.trajectories.interpolation import interpolate_poses
-from groundtruth.trajectories.streams import PlanarPoses
-from landmarks import wrap_angle
+from redetect.groundtruth.fusion.fuse import FuseSettings
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 LASER_COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 2e-5], [0.0, 2e-5, 1e-4]])

@@ -10,16 +10,20 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from groundtruth.cli import main
-from groundtruth.errors import GroundTruthError
-from groundtruth.fusion.fuse import FuseSettings, fuse
-from groundtruth.fusion.learning import noise_of
-from groundtruth.fusion.movement import movement_problem
-from groundtruth.geometry.plane import log_motion
-from groundtruth.geometry.transforms import exp_se3
-from groundtruth.trajectories.interpolation import interpolate_poses
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from landmarks import wrap_angle
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.learning import noise_of
+from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.geometry.plane import log_motion
+from redetect.groundtruth.geometry.transforms import exp_se3
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import (
     LASER_COVARIANCE,
     chain,

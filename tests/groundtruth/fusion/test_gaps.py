@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from groundtruth.fusion.fuse import FuseSettings, fuse
-from groundtruth.geometry.plane import between
-from groundtruth.trajectories.interpolation import interpolate_poses
-from groundtruth.trajectories.streams import PlanarPoses
-from landmarks import wrap_angle
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.geometry.plane import between
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import (
     LASER_COVARIANCE,
     chain,

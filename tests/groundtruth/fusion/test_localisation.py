@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.cli import main
-from groundtruth.clocks.sync import synchronise
-from groundtruth.errors import GroundTruthError
-from groundtruth.fusion.fuse import FuseSettings, fuse
-from groundtruth.fusion.leave_out import leave_out
-from groundtruth.trajectories.alignment import moved_poses
-from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
-from landmarks import wrap_angle
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.clocks.sync import synchronise
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.leave_out import leave_out
+from redetect.groundtruth.trajectories.alignment import moved_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import drive, measure
 
 FloatArray = NDArray[np.float64]

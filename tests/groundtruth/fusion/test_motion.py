@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from groundtruth.fusion.motion_kernels import STATE, arc_integrals, move
-from groundtruth.fusion.movement import movement_problem
-from groundtruth.fusion.settings import FuseSettings
-from groundtruth.geometry.plane import between, compose, log_motion
-from groundtruth.geometry.transforms import exp_se3
-from groundtruth.trajectories.streams import PlanarPoses
-from landmarks import wrap_angle
+from redetect.groundtruth.fusion.motion_kernels import STATE, arc_integrals, move
+from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.geometry.plane import between, compose, log_motion
+from redetect.groundtruth.geometry.transforms import exp_se3
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 

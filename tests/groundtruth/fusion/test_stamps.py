@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.fusion.fuse import FuseSettings, fuse
-from groundtruth.fusion.movement import movement_problem
-from groundtruth.trajectories.interpolation import interpolate_poses
-from groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from tests.groundtruth.fusion.drives import LASER_COVARIANCE, drive, measure, normalised_error
 
 FloatArray = NDArray[np.float64]

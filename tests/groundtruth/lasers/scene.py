@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.geometry.plane import apply
-from groundtruth.lasers.scanners import Robot, Scanner, write_robot, write_scanners
-from groundtruth.lasers.scans import Scans, write_scans
+from redetect.groundtruth.geometry.plane import apply
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, write_robot, write_scanners
+from redetect.groundtruth.lasers.scans import Scans, write_scans
 
 FloatArray = NDArray[np.float64]
 

@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.commands.lasers import perform
-from groundtruth.commands.options import Lasers
-from groundtruth.errors import GroundTruthError
-from groundtruth.geometry.plane import between
-from groundtruth.lasers.alignment import STEPS, AlignmentSettings, align_scanners, still_scan
-from groundtruth.lasers.building import Building, write_building
-from groundtruth.lasers.scanners import Scanner, read_scanners
-from groundtruth.lasers.scans import Scans, write_scans
-from landmarks import wrap_angle
+from redetect.groundtruth.commands.lasers import perform
+from redetect.groundtruth.commands.options import Lasers
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.plane import between
+from redetect.groundtruth.lasers.alignment import (
+    STEPS,
+    AlignmentSettings,
+    align_scanners,
+    still_scan,
+)
+from redetect.groundtruth.lasers.building import Building, write_building
+from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
+from redetect.groundtruth.lasers.scans import Scans, write_scans
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     ROOM,

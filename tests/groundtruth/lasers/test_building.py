@@ -12,8 +12,8 @@ from ezdxf.filemanagement import new
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.building import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.building import (
     CURVE_TOLERANCE_M,
     Building,
     find_building,
@@ -21,7 +21,7 @@ from groundtruth.lasers.building import (
     write_building,
     write_drawing,
 )
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 
@@ -139,7 +139,7 @@ def test_a_block_within_itself_is_refused(tmp_path: Path) -> None:
 
 
 def test_blocks_that_multiply_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("groundtruth.lasers.building.MOST_SEGMENTS", 500)
+    monkeypatch.setattr("redetect.groundtruth.lasers.building.MOST_SEGMENTS", 500)
     document = drawing()
     for level in range(6):
         block = document.blocks.new(f"l{level}")
@@ -157,7 +157,7 @@ def test_blocks_that_multiply_are_refused(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_circle_as_large_as_the_world_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundtruth.lasers.building.MOST_SEGMENTS", 500)
+    monkeypatch.setattr("redetect.groundtruth.lasers.building.MOST_SEGMENTS", 500)
     document = drawing(INSUNITS=6)
     document.modelspace().add_circle((0, 0), 1e5)
     document.saveas(tmp_path / "b.dxf")

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.geometry.plane import apply, between, compose, composed_covariance, invert
-from groundtruth.lasers.icp import IcpSettings, icp_to_segments, trimmed_variance
-from groundtruth.lasers.icp_kernels import (
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.plane import apply, between, compose, composed_covariance, invert
+from redetect.groundtruth.lasers.icp import IcpSettings, icp_to_segments, trimmed_variance
+from redetect.groundtruth.lasers.icp_kernels import (
     moved,
     nearest_on_segments,
     nearest_points,
     rigid_fit,
     solve3,
 )
-from groundtruth.lasers.icp_scan_kernels import scan_normals
-from groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
-from landmarks import wrap_angle
+from redetect.groundtruth.lasers.icp_scan_kernels import scan_normals
+from redetect.groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import ROOM, cast
 
 FloatArray = NDArray[np.float64]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,

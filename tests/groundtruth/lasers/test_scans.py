@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from groundtruth.errors import GroundTruthError, StreamError
-from groundtruth.lasers.scanners import (
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
     read_robot,
@@ -25,8 +25,8 @@ from groundtruth.lasers.scanners import (
     write_robot,
     write_scanners,
 )
-from groundtruth.lasers.scans import Scans, find_scans, read_scans, write_scans
-from storage import OutputExistsError
+from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans, write_scans
+from redetect.storage import OutputExistsError
 
 
 def sick(name: str = "fixed0", **changes: Any) -> Scanner:
@@ -378,7 +378,7 @@ def test_archives_that_lie_are_refused(tmp_path: Path) -> None:
 def test_a_packed_giant_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundtruth.lasers.scans._LARGEST_FILE_BYTES", 1 << 16)
+    monkeypatch.setattr("redetect.groundtruth.lasers.scans._LARGEST_FILE_BYTES", 1 << 16)
     giant = npy(np.zeros((1 << 10, 100), np.uint16))
     path = archive(tmp_path / "a.scans.npz", times_s=npy(np.zeros(1 << 10)), ranges_mm=giant)
     assert path.stat().st_size < 1 << 12

@@ -10,22 +10,35 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.commands.laser import perform
-from groundtruth.commands.options import Laser
-from groundtruth.errors import GroundTruthError
-from groundtruth.geometry.plane import compose, invert
-from groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
-from groundtruth.lasers.background import learn_background
-from groundtruth.lasers.blocks import combined_poses
-from groundtruth.lasers.scanners import Robot, Scanner
-from groundtruth.lasers.scans import Scans
-from groundtruth.lasers.sets import ScannerTables, ScanSets, scanner_tables, sets_of_scans
-from groundtruth.lasers.settings import LaserSettings
-from groundtruth.lasers.suspects import track_robot, track_without_suspects
-from groundtruth.lasers.tracking import COASTING, LOST, OK, REACQUIRED, UNDETERMINED, UNRESOLVED
-from groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, fit_outline, new_points
-from groundtruth.trajectories.streams import read_planar_poses
-from landmarks import wrap_angle
+from redetect.groundtruth.commands.laser import perform
+from redetect.groundtruth.commands.options import Laser
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.plane import compose, invert
+from redetect.groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.background import learn_background
+from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
+from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets, scanner_tables, sets_of_scans
+from redetect.groundtruth.lasers.settings import LaserSettings
+from redetect.groundtruth.lasers.suspects import track_robot, track_without_suspects
+from redetect.groundtruth.lasers.tracking import (
+    COASTING,
+    LOST,
+    OK,
+    REACQUIRED,
+    UNDETERMINED,
+    UNRESOLVED,
+)
+from redetect.groundtruth.lasers.tracking_kernels import (
+    Beams,
+    Seen,
+    explain_set,
+    fit_outline,
+    new_points,
+)
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,

@@ -6,13 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from groundtruth.geometry.transforms import apply, exp_se3, inverse, planar_transform, transform
-from groundtruth.markers.calibration import Rig
-from groundtruth.markers.chain import ChainPoints, project_chain
-from groundtruth.markers.floor import Floor
-from groundtruth.markers.refinement import PoseProblem
-from groundtruth.markers.session import MarkerFrame
-from landmarks import MarkerCorner, MarkerLandmark
+from redetect.groundtruth.geometry.transforms import (
+    apply,
+    exp_se3,
+    inverse,
+    planar_transform,
+    transform,
+)
+from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.markers.chain import ChainPoints, project_chain
+from redetect.groundtruth.markers.floor import Floor
+from redetect.groundtruth.markers.refinement import PoseProblem
+from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
 

@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from groundtruth.errors import GeometryError
-from groundtruth.geometry.transforms import exp_se3, inverse, log_se3
-from groundtruth.markers.adjustment import adjust_bundle
-from groundtruth.markers.bundle import (
+from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.geometry.transforms import exp_se3, inverse, log_se3
+from redetect.groundtruth.markers.adjustment import adjust_bundle
+from redetect.groundtruth.markers.bundle import (
     Bundle,
     PosePrior,
     Whiteners,
     whitened_derivatives,
     whitened_residuals,
 )
-from groundtruth.markers.chain import ChainPoints
-from groundtruth.markers.normal_equations import NormalEquations, normal_equations
+from redetect.groundtruth.markers.chain import ChainPoints
+from redetect.groundtruth.markers.normal_equations import NormalEquations, normal_equations
 from tests.groundtruth.markers.scene import (
     box_rig,
     hall_cameras,

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import write_camera
-from groundtruth.errors import GroundTruthError
-from groundtruth.markers.calibration import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.calibration import (
     Network,
     Rig,
     read_network,

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from camera import Camera, write_camera
-from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.geometry.transforms import apply, exp_se3, inverse, log_se3, transform
-from groundtruth.markers.boards_file import read_boards
-from groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
-from groundtruth.markers.network_estimation import (
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.transforms import apply, exp_se3, inverse, log_se3, transform
+from redetect.groundtruth.markers.boards_file import read_boards
+from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
+from redetect.groundtruth.markers.network_estimation import (
     BoardView,
     DoubleBoard,
     NetworkEstimate,
     estimate_network,
     hand_eye,
 )
-from groundtruth.markers.settings import NetworkSettings
+from redetect.groundtruth.markers.settings import NetworkSettings
 from tests.groundtruth.markers.scene import hall_cameras, lens
 
 FloatArray = NDArray[np.float64]

@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.geometry.transforms import inverse, log_se3, planar_transform, rotation_angle
-from groundtruth.markers.chain import ChainPoints
-from groundtruth.markers.floor import Floor
-from groundtruth.markers.pnp import SOLVERS
-from groundtruth.markers.poses import estimate_pose
-from groundtruth.markers.refinement import PoseProblem
-from groundtruth.markers.settings import PoseSettings, Solver
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.transforms import (
+    inverse,
+    log_se3,
+    planar_transform,
+    rotation_angle,
+)
+from redetect.groundtruth.markers.chain import ChainPoints
+from redetect.groundtruth.markers.floor import Floor
+from redetect.groundtruth.markers.pnp import SOLVERS
+from redetect.groundtruth.markers.poses import estimate_pose
+from redetect.groundtruth.markers.refinement import PoseProblem
+from redetect.groundtruth.markers.settings import PoseSettings, Solver
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, pose_problem, robot_pose
 
 FloatArray = NDArray[np.float64]

@@ -7,19 +7,23 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.errors import GeometryError
-from groundtruth.geometry.covariance import (
+from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.geometry.covariance import (
     composed_covariance,
     inverse_covariance,
     planar_covariance,
     planar_jacobian,
 )
-from groundtruth.geometry.transforms import exp_se3, heading, inverse, log_se3, roll_pitch
-from groundtruth.markers.chain import ChainPoints, project_chain, project_chain_with_jacobians
-from groundtruth.markers.floor import Floor, floor_residuals
-from groundtruth.markers.pnp import SOLVERS, solve_camera, solve_robot
-from groundtruth.markers.refinement import predicted_errors, refine_pose
-from groundtruth.markers.settings import Solver
+from redetect.groundtruth.geometry.transforms import exp_se3, heading, inverse, log_se3, roll_pitch
+from redetect.groundtruth.markers.chain import (
+    ChainPoints,
+    project_chain,
+    project_chain_with_jacobians,
+)
+from redetect.groundtruth.markers.floor import Floor, floor_residuals
+from redetect.groundtruth.markers.pnp import SOLVERS, solve_camera, solve_robot
+from redetect.groundtruth.markers.refinement import predicted_errors, refine_pose
+from redetect.groundtruth.markers.settings import Solver
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, lens, pose_problem, robot_pose
 
 FloatArray = NDArray[np.float64]

@@ -9,23 +9,23 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.geometry.covariance import mean_pose
-from groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
-from groundtruth.markers.calibration import Rig
-from groundtruth.markers.pairs import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.covariance import mean_pose
+from redetect.groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
+from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     chained_poses,
     pair_consensus,
     pair_estimates,
     spanning_tree,
 )
-from groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
-from groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
-from groundtruth.markers.rig_picture import draw_rig
-from groundtruth.markers.session import MarkerFrame
-from groundtruth.markers.settings import RigSettings
-from groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
+from redetect.groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
+from redetect.groundtruth.markers.rig_picture import draw_rig
+from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.markers.settings import RigSettings
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from tests.groundtruth.markers.scene import (
     box_rig,
     frames_of,

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.geometry.transforms import inverse, planar_transform, rotation_angle
-from groundtruth.markers.calibration import Network
-from groundtruth.markers.session import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.transforms import inverse, planar_transform, rotation_angle
+from redetect.groundtruth.markers.calibration import Network
+from redetect.groundtruth.markers.session import (
     MarkerFrame,
     chain_points,
     find_runs,
@@ -21,9 +21,9 @@ from groundtruth.markers.session import (
     read_marker_frames,
     rig_views,
 )
-from groundtruth.markers.settings import PoseSettings
-from groundtruth.markers.track import report_entry, track_robot
-from landmarks import MarkerCorner
+from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.markers.track import report_entry, track_robot
+from redetect.landmarks import MarkerCorner
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 
 NETWORK = Network(

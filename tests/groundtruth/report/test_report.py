@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundtruth.cli import main
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.building import Building, write_building
-from groundtruth.report.inputs import Interval, gather
-from groundtruth.report.page import report_page
-from groundtruth.report.parts import Section, figure, page, picture, table
-from groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
-from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
-from groundtruth.validation.scoring import compare_streams
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.building import Building, write_building
+from redetect.groundtruth.report.inputs import Interval, gather
+from redetect.groundtruth.report.page import report_page
+from redetect.groundtruth.report.parts import Section, figure, page, picture, table
+from redetect.groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
+from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from redetect.groundtruth.validation.scoring import compare_streams
 
 HOSTILE = "\"><script>alert(1)</script><img src=x onerror=alert(2)>\x00\ud800 </style> & 'onload="
 NAMES = """html head meta title style body a header nav ul li main section h1 h2 p div table caption

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundtruth.errors import GroundTruthError, StreamError
-from groundtruth.geometry.transforms import exp_se3, transform_from_quaternion
-from groundtruth.trajectories.streams import (
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.geometry.transforms import exp_se3, transform_from_quaternion
+from redetect.groundtruth.trajectories.streams import (
     RAWSEEDS_ROUNDING,
     PlanarPoses,
     format_planar_poses,
@@ -21,7 +21,7 @@ from groundtruth.trajectories.streams import (
     read_times,
     write_planar_poses,
 )
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
 

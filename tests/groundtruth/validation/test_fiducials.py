@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundtruth.errors import GroundTruthError, StreamError
-from groundtruth.validation.fiducials import (
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.validation.fiducials import (
     Distance,
     Survey,
     read_distances,

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundtruth.cli import main
-from groundtruth.errors import GroundTruthError, StreamError
-from groundtruth.trajectories.alignment import planar_alignment
-from groundtruth.trajectories.interpolation import matched_streams
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from groundtruth.validation.relative_errors import (
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.trajectories.alignment import planar_alignment
+from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.validation.relative_errors import (
     Relations,
     read_relations,
     relative_score,
     score_relations,
     score_steps,
 )
-from groundtruth.validation.scoring import score_poses
+from redetect.groundtruth.validation.scoring import score_poses
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.trajectories.alignment import align_poses
-from groundtruth.trajectories.interpolation import interpolate_poses
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from groundtruth.validation.scoring import compare_streams, score_poses
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories.alignment import align_poses
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.validation.scoring import compare_streams, score_poses
 
 
 def poses_of(times: list[float], rows: list[list[float]]) -> PlanarPoses:

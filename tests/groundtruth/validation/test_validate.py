@@ -11,15 +11,24 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.cli import main
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.building import Building, write_building
-from groundtruth.lasers.scanners import Robot, Scanner, write_robot
-from groundtruth.lasers.scans import Scans, write_scans
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses, write_planar_poses
-from groundtruth.validation.fiducials import Distance, Survey, write_distances, write_survey
-from groundtruth.validation.reference_poses import poses_from_distances
-from groundtruth.validation.validate import figures_of, pose_errors, reference_poses
+from redetect.groundtruth.cli import main
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.building import Building, write_building
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, write_robot
+from redetect.groundtruth.lasers.scans import Scans, write_scans
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+from redetect.groundtruth.validation.fiducials import (
+    Distance,
+    Survey,
+    write_distances,
+    write_survey,
+)
+from redetect.groundtruth.validation.reference_poses import poses_from_distances
+from redetect.groundtruth.validation.validate import figures_of, pose_errors, reference_poses
 
 FloatArray = NDArray[np.float64]
 

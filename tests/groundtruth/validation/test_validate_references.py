@@ -11,23 +11,23 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from groundtruth.errors import GeometryError, GroundTruthError
-from groundtruth.lasers.scanners import Scanner
-from groundtruth.lasers.scans import Scans
-from groundtruth.validation.fiducials import Distance, Survey
-from groundtruth.validation.reference_poses import (
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.validation.fiducials import Distance, Survey
+from redetect.groundtruth.validation.reference_poses import (
     DistancePose,
     DistanceSettings,
     distance_residuals,
     poses_from_distances,
 )
-from groundtruth.validation.reference_poses_scans import (
+from redetect.groundtruth.validation.reference_poses_scans import (
     Onboard,
     RefineSettings,
     refine_pose,
     still_points,
 )
-from landmarks import wrap_angle
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 

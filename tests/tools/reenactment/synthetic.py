@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from landmarks import Frame, Step, circle_landmarks
+from redetect.landmarks import Frame, Step, circle_landmarks
 from tools.reenactment.model import Geometry, odometry_residuals
 
 FloatArray = NDArray[np.float64]

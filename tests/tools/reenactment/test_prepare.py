@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from camera import Camera, write_camera
-from landmarks import read_frames, write_frames
+from redetect.landmarks import read_frames, write_frames
 from tests.tools.reenactment.synthetic import make_run, rows_of_frame
 from tools.reenactment.cli import main
 from tools.reenactment.model import Geometry

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from landmarks import CircleLandmark, Frame, Step
+from redetect.landmarks import CircleLandmark, Frame, Step
 from tests.tools.reenactment.synthetic import make_run
 from tools.reenactment.recording import (
     RecordingError,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage import OutputExistsError
+from redetect.storage import OutputExistsError
 from tools.reenactment.world import World, WorldError, read_world, write_world
 
 

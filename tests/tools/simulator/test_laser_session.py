@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundtruth.lasers.building import read_building
-from groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
-from groundtruth.lasers.scans import find_scans, read_scans
-from groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from groundtruth.validation.fiducials import read_distances, read_survey
-from landmarks import wrap_angle
+from redetect.groundtruth.lasers.building import read_building
+from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
+from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.validation.fiducials import read_distances, read_survey
+from redetect.landmarks import wrap_angle
 from tools.simulator.cli import main
 from tools.simulator.laser.measuring import compose
 from tools.simulator.laser.people import Passer, legs_of

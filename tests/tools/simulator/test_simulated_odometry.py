@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from landmarks import Step, parse_record
+from redetect.landmarks import Step, parse_record
 from tools.simulator.drive import DriveStyle, drive, robot_tilt
 from tools.simulator.odometry import joined_steps, measured_steps, step_covariance, step_record
 from tools.simulator.poses import relative_pose
@@ -37,7 +37,7 @@ def test_covariance_is_that_of_the_printed_steps(row: str) -> None:
 def test_covariance_is_that_of_all_shipped_steps(shared_data: object) -> None:
     from pathlib import Path
 
-    from landmarks import read_frames
+    from redetect.landmarks import read_frames
 
     steps = [f.step for f in read_frames(Path(str(shared_data)) / "dlr" / "map.circles")]
     found = step_covariance([[s.dx, s.dy, s.dphi] for s in steps])

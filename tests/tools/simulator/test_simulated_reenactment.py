@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera, write_camera
-from landmarks import CircleLandmark, Frame, read_frames, write_frames
+from redetect.landmarks import CircleLandmark, Frame, read_frames, write_frames
 from tools.reenactment.world import World, write_world
 from tools.simulator.odometry import step_record
 from tools.simulator.poses import relative_pose, with_mounting, world_to_robot

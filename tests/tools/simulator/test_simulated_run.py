@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from camera import Camera, read_camera
-from landmarks import read_frames
+from redetect.landmarks import read_frames
 from tools.simulator.cli import main
 from tools.simulator.demo import DEMO
 from tools.simulator.observation import published_covariance

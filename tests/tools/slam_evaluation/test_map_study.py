@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.commands.run_camera import camera_of_run
-from slam.mapping.run_map import map_run
-from slam.models.measurement import disc_in_robot
-from slam.models.mounted_discs import rotation_exp
-from slam.models.mounting import directions_of_rows, rows_through_mounting
-from slam.recording import UNKNOWN_ID, read_recording
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.mounted_discs import rotation_exp
+from redetect.slam.models.mounting import directions_of_rows, rows_through_mounting
+from redetect.slam.recording import UNKNOWN_ID, read_recording
 from tools.simulator.cli import main as simulate
 from tools.slam_evaluation.__main__ import main as evaluate
 from tools.slam_evaluation.map_calibration import miswritten

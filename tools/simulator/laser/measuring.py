@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.lasers.scanners import Scanner
-from groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.lasers.scans import Scans
 from tools.simulator.laser.kernels import cast_on_discs, cast_on_robot, cast_on_walls
 from tools.simulator.laser.settings import ReadingErrors
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.json_file import read_json
-from groundtruth.lasers.building import read_building
-from groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
-from groundtruth.lasers.scans import find_scans, read_scans
-from groundtruth.trajectories.streams import read_planar_poses
-from groundtruth.validation.fiducials import read_survey
-from storage import write_whole
+from redetect.groundtruth.json_file import read_json
+from redetect.groundtruth.lasers.building import read_building
+from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
+from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.groundtruth.validation.fiducials import read_survey
+from redetect.storage import write_whole
 from tools.simulator.laser.measuring import compose
 
 FloatArray = NDArray[np.float64]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.errors import GroundTruthError
-from groundtruth.lasers.scanners import Robot, Scanner
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from tools.simulator.laser.clock import RobotClock
 from tools.simulator.laser.people import Passer, crossing, strolling
 from tools.simulator.laser.route import Curve, Route, Stop

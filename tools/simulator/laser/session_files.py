@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.json_file import write_json
-from groundtruth.lasers.building import Building, write_building, write_drawing
-from groundtruth.lasers.scanners import Scanner, write_robot, write_scanners
-from groundtruth.lasers.scans import Scans, write_scans
-from groundtruth.trajectories.streams import write_planar_poses
-from groundtruth.validation.fiducials import write_distances, write_survey
-from storage import write_whole
+from redetect.groundtruth.json_file import write_json
+from redetect.groundtruth.lasers.building import Building, write_building, write_drawing
+from redetect.groundtruth.lasers.scanners import Scanner, write_robot, write_scanners
+from redetect.groundtruth.lasers.scans import Scans, write_scans
+from redetect.groundtruth.trajectories.streams import write_planar_poses
+from redetect.groundtruth.validation.fiducials import write_distances, write_survey
+from redetect.storage import write_whole
 from tools.simulator.laser.clock import ptpd_lines
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.people import Passer, legs_of
@@ -71,9 +71,9 @@ def write_session(
 
     Raises
     ------
-    storage.OutputExistsError
+    redetect.storage.OutputExistsError
         If a file exists and `overwrite` is false.
-    groundtruth.errors.GroundTruthError
+    redetect.groundtruth.errors.GroundTruthError
         If no way through the room was found.
     """
     plan = plan_session(settings, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GroundTruthError
 
 FIXED_SCANNERS = 4
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from groundtruth.trajectories.streams import PlanarPoses
-from groundtruth.validation.fiducials import Distance, Survey
-from landmarks import wrap_angle
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.validation.fiducials import Distance, Survey
+from redetect.landmarks import wrap_angle
 from tools.simulator.laser.measuring import compose
 from tools.simulator.laser.session import SessionPlan
 from tools.simulator.laser.site import FIDUCIALS, ROOM_M

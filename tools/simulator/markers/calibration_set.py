@@ -17,8 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from groundtruth.geometry.transforms import apply, inverse, planar_transform, quaternion_xyzw
-from groundtruth.json_file import write_json
+from redetect.groundtruth.geometry.transforms import (
+    apply,
+    inverse,
+    planar_transform,
+    quaternion_xyzw,
+)
+from redetect.groundtruth.json_file import write_json
 from tools.simulator.markers.clutter import checkerboard
 from tools.simulator.markers.errors import CalibrationErrors
 from tools.simulator.markers.imaging import Imaging, grey_image

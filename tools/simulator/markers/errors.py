@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera import Camera
-from groundtruth.geometry.transforms import exp_se3
-from groundtruth.markers.calibration import Network, Rig
+from redetect.groundtruth.geometry.transforms import exp_se3
+from redetect.groundtruth.markers.calibration import Network, Rig
 from tools.simulator.markers.surface import FloatArray
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from detect.markers.dictionaries import marker_dictionary
-from groundtruth.geometry.transforms import planar_transform
-from groundtruth.markers.calibration import Rig
+from redetect.groundtruth.geometry.transforms import planar_transform
+from redetect.groundtruth.markers.calibration import Rig
 from tools.simulator.markers.clutter import blotches
 from tools.simulator.markers.prints import marker_surface
 from tools.simulator.markers.surface import (

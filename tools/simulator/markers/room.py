@@ -11,7 +11,7 @@ import numpy as np
 
 from camera import Camera
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
-from groundtruth.geometry.transforms import planar_transform, transform
+from redetect.groundtruth.geometry.transforms import planar_transform, transform
 from tools.simulator.markers.clutter import blotches, near_marker, thing
 from tools.simulator.markers.robot import facing_pose
 from tools.simulator.markers.surface import (

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from camera import format_camera, write_camera
-from storage import write_whole
+from redetect.storage import write_whole
 from tools.simulator.markers.sampling import (
     SampleFrame,
     SampleSettings,
@@ -52,7 +52,7 @@ def write_samples(
 
     Raises
     ------
-    storage.OutputExistsError
+    redetect.storage.OutputExistsError
         If a file exists and `overwrite` is false.
     """
     import cv2

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from groundtruth.geometry.transforms import apply, inverse, planar_transform
-from groundtruth.markers.calibration import Network, Rig
+from redetect.groundtruth.geometry.transforms import apply, inverse, planar_transform
+from redetect.groundtruth.markers.calibration import Network, Rig
 from tools.simulator.markers.clutter import Grey
 from tools.simulator.markers.imaging import Imaging, grey_image, uneven_light
 from tools.simulator.markers.prints import BLACK, WHITE

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from camera import Camera, format_camera, write_camera
-from groundtruth.markers.calibration import write_network, write_rig
-from groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
-from storage import write_whole
+from redetect.groundtruth.markers.calibration import write_network, write_rig
+from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from redetect.storage import write_whole
 from tools.simulator.markers.errors import CalibrationErrors, disturbed_network, disturbed_rig
 from tools.simulator.markers.session import (
     SessionPlan,
@@ -95,7 +95,7 @@ def write_session(
 
     Raises
     ------
-    storage.OutputExistsError
+    redetect.storage.OutputExistsError
         If a file exists and `overwrite` is false.
     """
     plan = plan_session(settings)

@@ -1,0 +1,1 @@
+"""Landmarks from robot images: discs on the floor and verticals, with covariances."""

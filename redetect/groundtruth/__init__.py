@@ -1,0 +1,20 @@
+"""Where the robot really was: markers, lasers, clocks, their fusion and its validation.
+
+Each package imports only from those named here; `errors` and the readers of files serve all:
+
+- `geometry`: rigid motions in space and in the plane, covariances of poses.
+- `trajectories`: poses over time, their files, and poses at other times: `geometry`.
+- `markers`: poses from square markers, rigs and networks of cameras: `geometry`, `trajectories`.
+- `lasers`: scanners, scans, matching, alignment, tracking: `geometry`, `trajectories`.
+- `fusion`: odometry and measured poses together: `geometry`, `trajectories`.
+- `clocks`: the robot's clock against the ground truth's: `fusion`, `trajectories`.
+- `validation`: errors against a truth and at reference poses: `clocks`, `lasers` and before.
+- `report`: a session on one page: `validation` and before.
+- `commands`: files and messages round all of these; `cli` hands over to them.
+
+Frames: the *robot* has x forward, y left, z up; the *world* z up, and the robot's heading theta is
+its x axis' angle in the world, counter-clockwise; *cameras* and *markers* as in `camera` and
+`landmarks`. A transform `a_from_b` takes points of frame b to frame a. Metres, radians, seconds.
+"""
+
+from redetect.storage.version import __version__ as __version__

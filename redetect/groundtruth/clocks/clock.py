@@ -1,0 +1,221 @@
+"""Model of the robot's clock relative to the ground truth's: a straight line per segment.
+
+Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``, `time` being the
+ground truth's; between segments the offset is interpolated, before the first and after the last
+their lines are extrapolated.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.json_file import read_json_value
+
+FloatArray = NDArray[np.float64]
+Status = Literal["ok", "no turns", "jump", "at a bound"]
+
+_MOST_SEGMENTS = 100_000
+_LARGEST_RATE_ERROR = 0.5
+_LARGEST_NUMBER = 1e15
+
+
+@dataclass(frozen=True)
+class ClockSegment:
+    """The two clocks over one segment of the ground truth.
+
+    Attributes
+    ----------
+    from_s, to_s : float
+        The segment, on the ground truth's clock.
+    reference_s : float
+        Where in it the offset holds, on the ground truth's clock.
+    offset_s : float
+        Robot time minus ground truth time there.
+    rate : float
+        Seconds of the robot's clock per second of the ground truth's.
+    angle_rad : float
+        Heading of the ground truth minus heading of the odometry.
+    sigma_offset_s, sigma_rate, sigma_angle_rad : float
+        Standard deviations; infinite where the segment does not determine the value.
+    turned_rad : float
+        Sum of the absolute values of the robot's turns.
+    status : str
+        `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
+        `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at
+        the limit of the search range.
+    note : str
+        Details of the status.
+    """
+
+    from_s: float
+    to_s: float
+    reference_s: float
+    offset_s: float
+    rate: float
+    angle_rad: float
+    sigma_offset_s: float
+    sigma_rate: float
+    sigma_angle_rad: float
+    turned_rad: float
+    status: Status
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ClockModel:
+    """The robot's clock against the ground truth's over a session.
+
+    Attributes
+    ----------
+    segments : tuple of ClockSegment
+        In order; at least one whose offset is determined.
+    """
+
+    segments: tuple[ClockSegment, ...]
+
+    def __post_init__(self) -> None:
+        if not self.segments:
+            raise GroundTruthError("a clock without segments: expected at least one")
+
+    def robot_times(self, times_s: ArrayLike) -> FloatArray:
+        """Robot times of times on the ground truth's clock.
+
+        Parameters
+        ----------
+        times_s : (N,) array_like
+
+        Returns
+        -------
+        (N,) float64
+        """
+        knots, offsets = self._knots()
+        times = np.asarray(times_s, dtype=np.float64)
+        offset = np.interp(times, knots, offsets)
+        first, last = self.segments[0], self.segments[-1]
+        early, late = times < knots[0], times > knots[-1]
+        offset[early] += (first.rate - 1.0) * (times[early] - knots[0])
+        offset[late] += (last.rate - 1.0) * (times[late] - knots[-1])
+        return np.asarray(times + offset)
+
+    def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
+        """Times on the ground truth's clock of robot times: the inverse of `robot_times`.
+
+        Parameters
+        ----------
+        robot_times_s : (N,) array_like
+
+        Returns
+        -------
+        (N,) float64
+
+        Raises
+        ------
+        GroundTruthError
+            If the clock stops or runs backward between two segments (it was set back): then a robot
+            time has no unique ground truth time.
+        """
+        knots, offsets = self._knots()
+        robot = knots + offsets
+        backward = np.flatnonzero(np.diff(robot) <= 0.0)
+        if backward.size:
+            i = int(backward[0])
+            raise GroundTruthError(
+                f"the robot's clock goes back between {knots[i]:.3f} s and {knots[i + 1]:.3f} s: "
+                "its times are ambiguous there"
+            )
+        times = np.asarray(robot_times_s, dtype=np.float64)
+        result = np.interp(times, robot, knots)
+        first, last = self.segments[0], self.segments[-1]
+        early, late = times < robot[0], times > robot[-1]
+        result[early] = knots[0] + (times[early] - robot[0]) / first.rate
+        result[late] = knots[-1] + (times[late] - robot[-1]) / last.rate
+        return np.asarray(result)
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        """The segments' ends and the offsets there."""
+        knots, offsets = [], []
+        for segment in self.segments:
+            for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9)):
+                knots.append(time)
+                offsets.append(
+                    segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s)
+                )
+        return np.array(knots), np.array(offsets)
+
+
+def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
+    """Segments as written in a clock file: infinite deviations are null."""
+    return [
+        {
+            name: None if isinstance(value, float) and math.isinf(value) else value
+            for name, value in asdict(segment).items()
+        }
+        for segment in segments
+    ]
+
+
+def read_clock(path: str | os.PathLike[str]) -> ClockModel:
+    """Read a clock file that `groundtruth sync` wrote.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    ClockModel
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read or a value is missing or impossible; the message names it.
+    """
+    place = Path(path)
+    document = read_json_value(place)
+    rows = document.get("segments") if isinstance(document, dict) else None
+    if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SEGMENTS:
+        raise GroundTruthError(f"{place}: no list of segments: expected what `sync` writes")
+    segments = tuple(_segment(place, k, row) for k, row in enumerate(rows, 1))
+    for k, (before, after) in enumerate(pairwise(segments), 2):
+        if after.from_s < before.to_s:
+            raise GroundTruthError(f"{place}: segment {k} begins before segment {k - 1} ends")
+    return ClockModel(segments)
+
+
+def _segment(place: Path, number: int, row: Any) -> ClockSegment:
+    if not isinstance(row, dict):
+        raise GroundTruthError(f"{place}: segment {number} is no object")
+    values: dict[str, float] = {}
+    names = [name for name in ClockSegment.__dataclass_fields__ if name not in ("status", "note")]
+    for name in names:
+        value = row.get(name)
+        if value is None and name.startswith("sigma_"):
+            value = math.inf
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise GroundTruthError(f"{place}: segment {number}: {name} is not a number")
+        endless = value == math.inf and name.startswith("sigma_")
+        # NaN fails this; a whole number may fit no double.
+        if not (endless or abs(value) <= _LARGEST_NUMBER):
+            raise GroundTruthError(f"{place}: segment {number}: {name} is not finite")
+        values[name] = float(value)
+    if not abs(values["rate"] - 1.0) < _LARGEST_RATE_ERROR:
+        raise GroundTruthError(
+            f"{place}: segment {number}: rate is {values['rate']:g}: expected nearly 1"
+        )
+    if values["to_s"] < values["from_s"]:
+        raise GroundTruthError(f"{place}: segment {number}: it ends before it begins")
+    status = row.get("status")
+    if status not in ("ok", "no turns", "jump", "at a bound"):
+        raise GroundTruthError(f"{place}: segment {number}: its status is unknown")
+    note = row.get("note", "")
+    return ClockSegment(**values, status=status, note=note if isinstance(note, str) else "")

@@ -1,0 +1,386 @@
+"""The robot's clock from headings: time offset, drift and angle offset, segment by segment.
+
+The headings of odometry and ground truth are those of one robot; the offset and the rate between
+their clocks minimise the squared difference, with the angle between their axes eliminated in closed
+form (RAWSEEDS D2.1 part 2). The search is global and derivative-free and depends on no initial
+value. Odometry's heading drifts, so that a plain sum of squares would explain drift by a time
+offset. A second search around the first result therefore whitens the residuals, from which the
+noise of the samples and the rate of the random walk are estimated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, direct, minimize
+
+from redetect.groundtruth.clocks.clock import ClockSegment, Status
+from redetect.groundtruth.clocks.heading_pair import HeadingPair, pair_headings, without_turns
+from redetect.groundtruth.clocks.headings import continuous_headings, segments_between_gaps
+from redetect.groundtruth.clocks.jump import find_jump
+from redetect.groundtruth.clocks.line import on_one_line
+from redetect.groundtruth.clocks.refinement import refine_by_movement
+from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
+from redetect.landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
+_MOST_COARSE_SAMPLES = 400
+_OUTLIER_SIGMAS = 6.0
+_COARSE_SIGMA_RAD = 0.02
+# A segment determines the offset, or the drift, if its deviation is below this share of the search
+# bound: the deviation of a uniform distribution between the bounds is .58 of the bound.
+_LEAST_DETERMINED = 0.1
+_MOST_JUMPS = 3
+_JUMP_SIGMAS = 3.5
+_LEAST_JUMP_S = 0.004
+_LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
+_FEWEST_SAMPLES = 20
+# Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
+_MUCH_LESS_CERTAIN = 4.0
+
+
+@dataclass(frozen=True)
+class SyncSettings:
+    """Bounds of the search.
+
+    Parameters
+    ----------
+    largest_offset_s : float
+        Of the time offset, either way (s).
+    largest_drift : float
+        The clocks' rates differ by at most this share.
+    segment_gap_s : float
+        A longer pause in the ground truth begins a new segment (s).
+    use_movement : bool
+        Refine the estimate by headings with the whole movement if the ground truth has covariances.
+
+    Raises
+    ------
+    GroundTruthError
+        If one is not finite or not positive, or the drift is half or more.
+    """
+
+    largest_offset_s: float = 1.0
+    largest_drift: float = 0.01
+    segment_gap_s: float = 5.0
+    use_movement: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("largest_offset_s", "largest_drift", "segment_gap_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise GroundTruthError(f"{name} is {value}: expected above 0")
+        if self.largest_drift >= 0.5:
+            raise GroundTruthError(f"largest_drift is {self.largest_drift}: expected below 0.5")
+
+
+def synchronise(
+    odometry: PlanarPoses, groundtruth: PlanarPoses, settings: SyncSettings | None = None
+) -> tuple[ClockSegment, ...]:
+    """Align the odometry's clock with the ground truth's, per segment of the ground truth.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        The robot's own poses on its own clock; only headings and times are used.
+    groundtruth : PlanarPoses
+        Poses on the ground truth's clock. Of several of one time, in either, the last counts.
+    settings : SyncSettings, optional
+
+    Returns
+    -------
+    tuple of ClockSegment
+        In order. Segments without enough turns have the status `no turns`, infinite deviations and
+        an offset interpolated from the others (0 if no segment determines one). A segment in which
+        the clock was set is split there: its parts have the status `jump`. If one straight line
+        through the session agrees with all segments, they get that line's values.
+
+    Raises
+    ------
+    GroundTruthError
+        If a stream has fewer than 20 poses, or they do not overlap.
+    """
+    bounds = settings or SyncSettings()
+    odometry, groundtruth = last_of_each_time(odometry), last_of_each_time(groundtruth)
+    for name, poses in (("odometry", odometry), ("ground truth", groundtruth)):
+        if len(poses) < _FEWEST_SAMPLES:
+            raise GroundTruthError(
+                f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
+            )
+    by_headings: list[ClockSegment] = []
+    by_movement: list[ClockSegment] = []
+    limits = (bounds.largest_offset_s, bounds.largest_drift)
+    for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
+        covariances = groundtruth.covariances
+        segment = PlanarPoses(
+            groundtruth.times_s[part],
+            groundtruth.poses[part],
+            covariances[part] if covariances is not None and bounds.use_movement else None,
+        )
+        own = _segment(odometry, segment, bounds, _MOST_JUMPS)
+        refined = refine_by_movement(own, odometry, segment, limits)
+        if len(refined) > 1 and not _differ(refined):
+            # Headings suggested a jump of the clock that the whole movement does not confirm.
+            own = _segment(odometry, segment, bounds, 0)
+            refined = refine_by_movement(own, odometry, segment, limits)
+        by_headings.extend(own)
+        by_movement.extend(refined)
+    if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in by_headings):
+        raise GroundTruthError(
+            f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
+            f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
+            f"overlap within {bounds.largest_offset_s:g} s"
+        )
+    best, alone = on_one_line(by_movement), on_one_line(by_headings)
+    if _uncertainty(best) > _MUCH_LESS_CERTAIN * _uncertainty(alone):
+        best = alone
+    return tuple(_told_by_the_others(best))
+
+
+def _uncertainty(segments: list[ClockSegment]) -> float:
+    """Variances of the offsets at the ends of the segments that are determined, summed up (s^2)."""
+    return sum(
+        segment.sigma_offset_s**2
+        + (0.5 * segment.sigma_rate * (segment.to_s - segment.from_s)) ** 2
+        for segment in segments
+        if segment.status != "no turns"
+    )
+
+
+def _segment(
+    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, jumps_left: int
+) -> list[ClockSegment]:
+    """One segment's clock; several parts where the clock was set within it."""
+    pair = pair_headings(
+        odometry,
+        segment,
+        largest_offset_s=bounds.largest_offset_s,
+        largest_drift=bounds.largest_drift,
+        fewest=_FEWEST_SAMPLES,
+    )
+    turned = float(np.sum(np.abs(np.diff(_smoothed(continuous_headings(segment))))))
+    if pair is None:
+        return [_untold(segment, 0.0, "no odometry")]
+    offset, drift = _search(pair, bounds)
+    pair = pair.kept(_inliers(pair, offset, drift))
+    if len(pair.times_s) < _FEWEST_SAMPLES:
+        return [_untold(segment, turned, "the headings have nothing in common")]
+    for _ in range(2):
+        wandering = estimate_wandering(
+            pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
+        )
+        offset, drift = _refine(pair, wandering, (offset, drift), bounds)
+    covariance = _covariance(pair, wandering, offset, drift)
+    note = ""
+    if not math.sqrt(covariance[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
+        alone = _covariance(pair, wandering, offset, drift, with_drift=False)
+        if not math.sqrt(alone[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
+            return [_untold(segment, turned, "turns too little to determine the offset")]
+    if not math.sqrt(covariance[1, 1]) < _LEAST_DETERMINED * bounds.largest_drift:
+        note = "too short to determine the drift: assumed to be 0"
+        drift = 0.0
+        offset, drift = _refine(pair, wandering, (offset, drift), bounds, with_drift=False)
+        covariance = _covariance(pair, wandering, offset, drift, with_drift=False)
+        # Only at the reference time is the offset independent of the unknown drift.
+        covariance[1, 1] = bounds.largest_drift**2 / 3.0
+    elif jumps_left > 0:
+        place = find_jump(pair, offset, drift)
+        if place is not None:
+            parts = []
+            for which in (segment.times_s < place, segment.times_s >= place):
+                part = PlanarPoses(segment.times_s[which], segment.poses[which])
+                if len(part) >= _FEWEST_SAMPLES:
+                    parts += _segment(odometry, part, bounds, jumps_left - 1)
+            if _differ(parts):
+                return [
+                    replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
+                    if part.status == "ok"
+                    else part
+                    for part in parts
+                ]
+    status: Status = "ok"
+    if abs(offset) > 0.999 * bounds.largest_offset_s or abs(drift) > 0.999 * bounds.largest_drift:
+        status = "at a bound"
+    level, level_sigma = wandering.level(
+        without_turns(pair.differences(offset, drift), keep_mean=True)
+    )
+    return [
+        ClockSegment(
+            from_s=float(segment.times_s[0]),
+            to_s=float(segment.times_s[-1]),
+            reference_s=pair.reference_s,
+            offset_s=offset,
+            rate=1.0 + drift,
+            angle_rad=float(wrap_angle(np.array(level))),
+            sigma_offset_s=math.sqrt(covariance[0, 0]),
+            sigma_rate=math.sqrt(covariance[1, 1]),
+            sigma_angle_rad=level_sigma,
+            turned_rad=turned,
+            status=status,
+            note=note,
+        )
+    ]
+
+
+def _differ(parts: list[ClockSegment]) -> bool:
+    """Whether the clock is determined before and after a jump, and differs there."""
+    determined = [part for part in parts if part.status != "no turns"]
+    for before, after in pairwise(determined):
+        place = 0.5 * (before.to_s + after.from_s)
+        offsets, variances = [], []
+        for part in (before, after):
+            away = place - part.reference_s
+            offsets.append(part.offset_s + (part.rate - 1.0) * away)
+            # A clock's drift is far smaller than the search bounds, which are used if it is open.
+            rate_sigma = min(part.sigma_rate, _LARGEST_DRIFT_OF_A_QUARTZ)
+            variances.append(part.sigma_offset_s**2 + (rate_sigma * away) ** 2)
+        jump = abs(offsets[1] - offsets[0])
+        if jump > _LEAST_JUMP_S and jump > _JUMP_SIGMAS * math.sqrt(sum(variances)):
+            return True
+    return False
+
+
+def _smoothed(headings: FloatArray) -> FloatArray:
+    """Headings without their noise, coarsely: means of ten."""
+    count = max(len(headings) // 10, 1)
+    return np.array([part.mean() for part in np.array_split(headings, count)])
+
+
+def _sum_of_squares(pair: HeadingPair, offset_s: float, drift: float) -> float:
+    """Squared differences after the best angle and the best of the systematic errors."""
+    level = without_turns(pair.differences(offset_s, drift))
+    level -= level.mean()
+    shapes = pair.systematic
+    # The systematic errors are weighted against a coarse guess of the noise.
+    information = shapes.T @ shapes + _COARSE_SIGMA_RAD**2 * np.eye(shapes.shape[1])
+    along = shapes.T @ level
+    return float((level @ level - along @ np.linalg.solve(information, along)) / len(level))
+
+
+def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:
+    """Global least squares: offset and drift, the angle eliminated."""
+    stride = max(1, len(pair.times_s) // _MOST_COARSE_SAMPLES)
+    coarse = pair.kept(np.arange(len(pair.times_s)) % stride == 0)
+    box = Bounds([-1.0, -1.0], [1.0, 1.0])
+    scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
+    found = direct(lambda x: _sum_of_squares(coarse, *(x * scale)), box, maxfun=1500, maxiter=1000)
+    best = minimize(
+        lambda x: _sum_of_squares(pair, *(x * scale)),
+        found.x,
+        method="Nelder-Mead",
+        bounds=box,
+        options={"xatol": 1e-6, "fatol": 1e-14, "initial_simplex": _simplex(found.x, 0.02)},
+    )
+    offset, drift = best.x * scale
+    return float(offset), float(drift)
+
+
+def _simplex(start: FloatArray, size: float) -> FloatArray:
+    """A first simplex inside the box of -1 to 1."""
+    inward = np.where(start > 0.0, -size, size)
+    return start + np.diag([*inward, 0.0])[[2, 0, 1], :2]
+
+
+def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> NDArray[np.bool_]:
+    """Which samples are no gross errors of one of the streams."""
+    level = without_turns(pair.differences(offset_s, drift))
+    centre = float(np.median(level))
+    sigma = float(np.median(np.abs(level - centre))) / 0.6745
+    return np.asarray(np.abs(level - centre) <= max(_OUTLIER_SIGMAS * sigma, 1e-6))
+
+
+def _refine(
+    pair: HeadingPair,
+    wandering: Wandering,
+    start: tuple[float, float],
+    bounds: SyncSettings,
+    *,
+    with_drift: bool = True,
+) -> tuple[float, float]:
+    """Least whitened squares near a result of the global search."""
+    scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
+    x0 = np.clip(np.array(start) / scale, -1.0, 1.0)
+    if not with_drift:
+        alone = minimize(
+            lambda x: wandering.squared(without_turns(pair.differences(x[0] * scale[0], start[1]))),
+            x0[:1],
+            method="Nelder-Mead",
+            bounds=Bounds([-1.0], [1.0]),
+            options={"xatol": 1e-7, "fatol": 1e-9},
+        )
+        return float(alone.x[0] * scale[0]), start[1]
+    found = minimize(
+        lambda x: wandering.squared(without_turns(pair.differences(*(x * scale)))),
+        x0,
+        method="Nelder-Mead",
+        bounds=Bounds([-1.0, -1.0], [1.0, 1.0]),
+        options={"xatol": 1e-7, "fatol": 1e-9, "initial_simplex": _simplex(x0, 0.02)},
+    )
+    offset, drift = found.x * scale
+    return float(offset), float(drift)
+
+
+def _covariance(
+    pair: HeadingPair,
+    wandering: Wandering,
+    offset_s: float,
+    drift: float,
+    *,
+    with_drift: bool = True,
+) -> FloatArray:
+    """Covariance of offset and drift from the information in the segment's turns."""
+    jacobian = pair.sensitivities(offset_s, drift)
+    information = jacobian.T @ wandering.whiten(jacobian)
+    if not with_drift:
+        variance = 1.0 / information[0, 0] if information[0, 0] > 0.0 else math.inf
+        return np.diag([variance, math.inf])
+    scale = np.sqrt(np.diag(information))
+    if not np.all(scale > 0.0):
+        return np.diag([math.inf, math.inf])
+    correlation = information / scale[:, None] / scale
+    if np.linalg.eigvalsh(correlation)[0] < 1e-9:
+        return np.diag([math.inf, math.inf])
+    return np.asarray(np.linalg.inv(correlation) / scale[:, None] / scale)
+
+
+def _untold(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
+    return ClockSegment(
+        from_s=float(segment.times_s[0]),
+        to_s=float(segment.times_s[-1]),
+        reference_s=float(np.mean(segment.times_s)),
+        offset_s=0.0,
+        rate=1.0,
+        angle_rad=0.0,
+        sigma_offset_s=math.inf,
+        sigma_rate=math.inf,
+        sigma_angle_rad=math.inf,
+        turned_rad=turned_rad,
+        status="no turns",
+        note=note,
+    )
+
+
+def _told_by_the_others(segments: list[ClockSegment]) -> list[ClockSegment]:
+    """Interpolate the offsets of undetermined segments from the others."""
+    determined = [segment for segment in segments if segment.status != "no turns"]
+    if not determined:
+        return segments
+    ends = [
+        (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
+        for segment in determined
+        for time in (segment.from_s, segment.to_s)
+    ]
+    times, offsets = np.array(ends).T
+    return [
+        replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
+        if segment.status == "no turns"
+        else segment
+        for segment in segments
+    ]

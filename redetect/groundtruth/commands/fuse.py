@@ -1,0 +1,102 @@
+"""``groundtruth fuse``: files and messages round the fusion."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from redetect.groundtruth.clocks.clock import read_clock
+from redetect.groundtruth.commands.options import Fuse
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.leave_out import leave_out
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+
+
+def perform(options: Fuse) -> int:
+    """Carry out ``groundtruth fuse``; returns the exit code."""
+    account = options.output.with_suffix(".json")
+    check_outputs([options.output, account], options.force)
+    named = {"laser": options.laser, "camera": options.camera}
+    files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
+    if not files:
+        raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
+    settings = FuseSettings(
+        distance_sigma=options.distance_sigma,
+        lateral_sigma=options.lateral_sigma,
+        turn_sigma=options.turn_sigma,
+        turn_per_metre_sigma=options.turn_per_metre_sigma,
+        learn_noise=options.learn_noise,
+        gate_probability=options.gate_probability,
+        covariance_scale=dict(zip(named, options.covariance_scale)),
+    )
+    odometry = read_planar_poses(options.odometry)
+    if options.clock is not None:
+        times = read_clock(options.clock).groundtruth_times(odometry.times_s)
+        odometry = PlanarPoses(times, odometry.poses)
+    streams = {name: read_planar_poses(path) for name, path in files.items()}
+    for name, stream in streams.items():
+        if stream.covariances is None:
+            raise GroundTruthError(
+                f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
+            )
+    fusion = fuse(odometry, streams, settings)
+    left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
+    document = {
+        **provenance(
+            settings,
+            [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
+        ),
+        "used": fusion.used,
+        "odometry": asdict(fusion.odometry),
+        "localisation": asdict(fusion.localisation) if fusion.localisation else None,
+        "left_out": [asdict(segment) for segment in left_out],
+        "covariances_repaired": fusion.repaired,
+        "measurements_repeated": fusion.repeated,
+        "restarts_s": fusion.restarts_s,
+        "odometry_pauses_s": fusion.pauses_s,
+        "rejected": [asdict(rejected) for rejected in fusion.rejected],
+    }
+    write_planar_poses(options.output, fusion.poses, overwrite=options.force)
+    write_account(account, document, overwrite=options.force)
+    assert fusion.poses.covariances is not None
+    sigma = 1e3 * np.sqrt(
+        np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
+    )
+    used = ", ".join(f"{count} from {name}" for name, count in fusion.used.items())
+    print(
+        f"{options.output}: {len(fusion.poses)} poses out of {used}; "
+        f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
+        f"median sigma {sigma:.1f} mm"
+    )
+    if fusion.localisation is not None:
+        print(
+            f"{options.odometry} is taken for a localisation: its errors are stationary, of "
+            f"{1e3 * fusion.localisation.position_sigma:.0f} mm in x and y and "
+            f"{np.degrees(fusion.localisation.heading_sigma):.2f} degrees"
+        )
+    for segment in left_out:
+        print(
+            f"without {segment.from_s:.1f} s to {segment.to_s:.1f} s: predicted to "
+            f"{segment.position_rms_m:.3f} m, {np.degrees(segment.heading_rms_rad):.2f} degrees "
+            f"(rms; NEES {segment.normalised_error:.2f}); odometry aligned rigidly: "
+            f"{segment.aligned_position_rms_m:.3f} m, "
+            f"{np.degrees(segment.aligned_heading_rms_rad):.2f} degrees"
+        )
+    if fusion.pauses_s:
+        begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
+        print(
+            f"warning: {options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
+            f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: which way the robot went "
+            "is not known there, and covariances are raised",
+            file=sys.stderr,
+        )
+    return 0

@@ -1,0 +1,129 @@
+"""The command ``groundtruth laser``: a session's scans in, poses and an account of each set out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.commands.options import Laser
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
+from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.lasers.session import load_session
+from redetect.groundtruth.lasers.settings import LaserSettings
+from redetect.groundtruth.lasers.suspects import excess_shifts, track_without_suspects
+from redetect.groundtruth.lasers.tracking import (
+    COASTING,
+    LOST,
+    OK,
+    REACQUIRED,
+    STATUS,
+    UNDETERMINED,
+    LaserTrack,
+)
+from redetect.groundtruth.trajectories.streams import write_planar_poses
+from redetect.storage import write_whole
+
+FloatArray = NDArray[np.float64]
+
+#: A set is disturbed by this many readings that hide the robot or are of objects beside it.
+_DISTURBED = 3
+
+
+def perform(options: Laser) -> int:
+    """Carry the command out; returns the exit code: 1 without a single pose."""
+    settings = LaserSettings(gate_m=options.gate_m, kept=options.keep)
+    output = options.output or options.session / "laser.csv"
+    account, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
+    check_outputs([output, account, summary], options.force)
+    calibration = options.scanners or options.session / "aligned.json"
+    if options.scanners is None and not calibration.is_file():
+        calibration = options.session / "scanners.json"
+    scanners, robot, tables, sets = load_session(options.session, calibration)
+    track, left_out = track_without_suspects(sets, tables, robot, scanners, settings)
+
+    poses = combined_poses(track, options.average)
+    write_planar_poses(output, poses, overwrite=options.force)
+    with write_whole(account, overwrite=options.force) as stream:
+        stream.write(("\n".join(account_lines(track)) + "\n").encode())
+    described = describe(track, scanners, left_out)
+    files = [calibration, options.session / "robot.json"]
+    content = {**provenance(settings, files), "sets_per_pose": options.average, **described}
+    write_account(summary, content, overwrite=options.force)
+
+    expected = int(np.sum(track.status != LOST))
+    determined = int(np.isin(track.status, (OK, REACQUIRED)).sum())
+    coasted = int((track.status == COASTING).sum())
+    print(
+        f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
+        f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
+    )
+    for segment in described["segments"]:
+        print(f"  {segment['from_s']:.2f} to {segment['to_s']:.2f} s: front: {segment['front']}")
+    for scanner in described["scanners"]:
+        if scanner["suspect"]:
+            shift = scanner["correction"]
+            print(
+                f"warning: scanner {scanner['name']} does not fit the others: its readings suggest "
+                f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
+                f"{np.degrees(shift[2]):.2f} deg; "
+                + ("it was left out" if scanner["left_out"] else "it was used all the same"),
+                file=sys.stderr,
+            )
+    return 0 if len(poses) else 1
+
+
+def account_lines(track: LaserTrack) -> list[str]:
+    """A line of JSON for every set of scans."""
+    lines = []
+    names = ("expected", "agree", "through", "hidden", "none", "beside")
+    for i, status in enumerate(track.status.tolist()):
+        line: dict[str, Any] = {"t": round(float(track.times_s[i]), 6), "status": STATUS[status]}
+        if status != LOST:
+            line["visit"] = int(track.segment[i])
+        if status not in (LOST, COASTING):
+            beams = {name: int(n) for name, n in zip(names, track.beams[i])}
+            line["readings"] = int(track.readings[i])
+            line["rms_m"] = round(float(track.rms_m[i]), 5)
+            line["chi2_per_freedom"] = round(float(track.chi2[i]), 3)
+            line["beams"] = beams
+            line["disturbed"] = beams["hidden"] + beams["beside"] >= _DISTURBED
+        if status == UNDETERMINED:
+            line["direction"] = [round(float(v), 4) for v in track.weak[i]]
+        if i in track.reasons and status == COASTING:
+            line["reason"] = track.reasons[i]
+        lines.append(json.dumps(line))
+    return lines
+
+
+def describe(
+    track: LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
+) -> dict[str, Any]:
+    """Visits and how their front was found; what each scanner's residuals say of its pose."""
+    segments = []
+    for segment, front in sorted(track.fronts.items()):
+        times = track.times_s[track.segment == segment]
+        segments.append(
+            {"visit": segment, "from_s": float(times[0]), "to_s": float(times[-1]), "front": front}
+        )
+    entries = []
+    excess = excess_shifts(track, scanners)
+    for k, scanner in enumerate(scanners):
+        out = scanner.name in left_out
+        shift, sigma = (
+            left_out[scanner.name] if out else (track.corrections[k], track.correction_sigma[k])
+        )
+        entries.append(
+            {
+                "name": scanner.name,
+                "correction": [float(v) if np.isfinite(v) else None for v in shift],
+                "sigma": [float(v) if np.isfinite(v) else None for v in sigma],
+                "suspect": bool(out or excess[k] > 1.0),
+                "left_out": out,
+            }
+        )
+    return {"segments": segments, "scanners": entries}

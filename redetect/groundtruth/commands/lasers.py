@@ -1,0 +1,92 @@
+"""The command ``groundtruth lasers``: scanners measured by hand in, poses on the map out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from redetect.groundtruth.commands.options import Lasers
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.lasers.alignment import AlignmentSettings, align_scanners, still_scan
+from redetect.groundtruth.lasers.alignment_picture import draw_alignment
+from redetect.groundtruth.lasers.building import find_building, read_building
+from redetect.groundtruth.lasers.scanners import Scanner, read_scanners, write_scanners
+from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.landmarks import wrap_angle
+from redetect.storage import write_whole
+
+#: Scanners this many standard deviations from their measured pose are reported.
+_FAR_OFF_SIGMA = 5.0
+
+
+def perform(options: Lasers) -> int:
+    """Carry the command out; returns the exit code."""
+    session = options.session
+    output = options.output or session / "aligned.json"
+    picture = options.picture or output.with_suffix(".png")
+    check_outputs([output, picture], options.force)
+    settings = AlignmentSettings(gate_m=options.gate_m, kept=options.keep)
+    by_hand = session / "scanners.json"
+    measured = read_scanners(by_hand)
+    map_file = options.building or find_building(session)
+    building = read_building(map_file).segments
+    empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
+    alignment = align_scanners(measured, empties, building, settings)
+
+    far_off = [
+        a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
+    ]
+    steps = {name: poses.tolist() for name, poses in alignment.steps.items()}
+    pairs = [
+        {"scanners": [measured[i].name, measured[j].name], "explained": share}
+        for (i, j), share in sorted(alignment.pairs.items())
+    ]
+    extra: dict[str, Any] = {
+        **{k: v for k, v in provenance(settings, [by_hand, map_file]).items() if k != "version"},
+        "steps": steps,
+        "pairs": pairs,
+        "beams_on_map": alignment.matched.tolist(),
+        "rms_m": alignment.rms_m.tolist(),
+        "far_off_measured": far_off,
+        "undetermined": list(alignment.undetermined),
+        "inconsistent": list(alignment.inconsistent),
+    }
+    write_scanners(output, alignment.scanners, extra, overwrite=options.force)
+    scans = [still_scan(a, b) for a, b in zip(measured, empties)]
+    with write_whole(picture, overwrite=options.force) as stream:
+        stream.write(draw_alignment(measured, alignment, scans, building))
+
+    for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
+        shift = after.pose - before.pose
+        sigma = np.sqrt(np.diag(after.covariance))
+        print(
+            f"{after.name}: moved by {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
+            f"{np.degrees(wrap_angle(shift[2])):.3f} deg; sigma {1e3 * sigma[0]:.2f}, "
+            f"{1e3 * sigma[1]:.2f} mm, {np.degrees(sigma[2]):.4f} deg; {alignment.matched[k]} "
+            f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
+        )
+    for name in far_off:
+        print(
+            f"warning: scanner {name}: was measured wrong, or the map shows another place like it",
+            file=sys.stderr,
+        )
+    for name in alignment.undetermined:
+        print(f"warning: scanner {name}: the map leaves a direction open", file=sys.stderr)
+    for name in alignment.inconsistent:
+        print(
+            f"warning: scanner {name}: its place on the map is not that among the other scanners",
+            file=sys.stderr,
+        )
+    return 0
+
+
+def _sigmas(before: Scanner, after: Scanner) -> float:
+    """How far a scanner is from where it was measured, in the measurement's standard deviations."""
+    shift = after.pose - before.pose
+    shift[2] = wrap_angle(shift[2])
+    covariance = before.covariance + after.covariance
+    if not np.any(before.covariance):
+        return 0.0
+    return float(np.sqrt(shift @ np.linalg.pinv(covariance) @ shift))

@@ -1,0 +1,91 @@
+"""``groundtruth network``: files and messages round the cameras' poses."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from redetect.groundtruth.commands.options import Network as NetworkCommand
+from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
+from redetect.groundtruth.commands.tables import print_sigmas, print_table, residual_figures
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.boards_file import find_boards, read_boards
+from redetect.groundtruth.markers.calibration import Network, write_network
+from redetect.groundtruth.markers.network_estimation import (
+    BoardView,
+    NetworkEstimate,
+    estimate_network,
+)
+
+
+def perform(command: NetworkCommand) -> int:
+    """Carry out ``groundtruth network``; returns the exit code."""
+    check_outputs((command.output,), command.force)
+    boards = read_boards(command.boards)
+    shots: dict[int, list[BoardView]] = {}
+    failures = []
+    with progress("boards") as (count, advance):
+        count(len(boards.images))
+        for image in boards.images:
+            try:
+                view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
+                shots.setdefault(image.placement, []).append(view)
+            except GroundTruthError as error:
+                failures.append(str(error))
+            advance()
+    for line in failures:
+        print(f"left out: {line}", file=sys.stderr)
+    double = boards.double
+    if double is not None and command.estimate_offset:
+        double = replace(double, offset=None)
+    estimate = estimate_network(
+        boards.cameras,
+        boards.boards,
+        {"world": boards.world_from_board},
+        double,
+        list(shots.values()),
+        command.settings,
+    )
+    folder = command.boards if command.boards.is_dir() else command.boards.parent
+    calibrations = tuple(
+        Path(os.path.relpath(folder / boards.calibrations[name], command.output.parent)).as_posix()
+        for name in estimate.names
+    )
+    network = Network(
+        estimate.names,
+        tuple(boards.cameras[name] for name in estimate.names),
+        calibrations,
+        estimate.world_from_camera,
+        estimate.covariance,
+    )
+    table = _board_residuals(estimate)
+    write_network(
+        command.output,
+        network,
+        {
+            "made_by": provenance(command.settings),
+            "reduced_cost": estimate.adjusted.reduced_cost,
+            "residuals": table,
+        },
+        overwrite=command.force,
+    )
+    print_table(table)
+    print_sigmas("camera", list(estimate.names), estimate.covariance)
+    print(f"{command.output}: {len(estimate.names)} cameras")
+    return 0
+
+
+def _board_residuals(estimate: NetworkEstimate) -> list[dict[str, Any]]:
+    adjusted = estimate.adjusted
+    rows = []
+    for name in estimate.names:
+        for board in sorted({view.board for view in estimate.views}):
+            chosen = [
+                i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)
+            ]
+            if chosen:
+                rows.append({"camera": name, "board": board, **residual_figures(adjusted, chosen)})
+    return rows

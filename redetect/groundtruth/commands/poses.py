@@ -1,0 +1,100 @@
+"""``groundtruth poses``: files and messages round the poses of a session."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from redetect.groundtruth.commands.options import Poses
+from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.json_file import write_json
+from redetect.groundtruth.markers.calibration import Network, read_network, read_rig
+from redetect.groundtruth.markers.session import (
+    RIG_NAME,
+    MarkerFrame,
+    find_runs,
+    read_marker_frames,
+)
+from redetect.groundtruth.markers.track import report_entry, track_robot
+from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
+from redetect.storage import write_whole
+from redetect.storage.exit_codes import EXIT_ERROR
+
+
+def perform(command: Poses) -> int:
+    """Carry out ``groundtruth poses``; returns the exit code: 1 without a single pose."""
+    runs, network_path = find_runs(command.paths, command.network)
+    folder = network_path.parent if command.network is None else command.paths[0]
+    rig_path = command.rig if command.rig is not None else folder / RIG_NAME
+    output = command.output if command.output is not None else folder / "poses.csv"
+    settings_path = output.with_suffix(".json")
+    check_outputs((output, settings_path, command.tum, command.report), command.force)
+    network = read_network(network_path)
+    rig = read_rig(rig_path)
+    frames = read_all_frames(runs, network)
+    with progress("poses") as (count, advance):
+        track = track_robot(
+            frames, rig, network, command.settings, on_progress=advance, on_count=count
+        )
+    poses = track.planar()
+    print(
+        f"{len(poses)} poses of {len(track.times)} times: "
+        + ", ".join(f"{number} {status}" for status, number in track.counts.items() if number)
+    )
+    if track.unknown_markers:
+        print(f"{track.unknown_markers} markers found are not on the rig: left out")
+    left_out = sum(int((~pose.views).sum()) for _, pose in track.posed)
+    if left_out:
+        print(f"{left_out} markers do not fit the others of their time: left out")
+    if command.report is not None:
+        with write_whole(command.report, overwrite=command.force) as stream:
+            for tracked in track.times:
+                line = json.dumps(report_entry(tracked, network), allow_nan=False)
+                stream.write(f"{line}\n".encode())
+    if not len(poses):
+        print("error: no pose", file=sys.stderr)
+        return EXIT_ERROR
+    print(f"squared residuals per degree of freedom: {track.reduced_cost:.2f}")
+    write_planar_poses(output, poses, overwrite=command.force)
+    write_json(
+        settings_path,
+        {
+            **provenance(command.settings, (rig_path, network_path)),
+            "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
+            "times": dict(track.counts),
+            "reduced_cost": track.reduced_cost,
+        },
+        overwrite=command.force,
+    )
+    if command.tum is not None:
+        text = format_tum(
+            poses.times_s, np.stack([pose.world_from_robot for _, pose in track.posed])
+        )
+        with write_whole(command.tum, overwrite=command.force) as stream:
+            stream.write(text.encode())
+    print(f"{output}: written")
+    return 0
+
+
+def read_all_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
+    """The markers found in all runs, whose folders' names are the cameras'.
+
+    Raises
+    ------
+    GroundTruthError
+        If a folder's name is no camera of the network.
+    """
+    frames = []
+    for run in runs:
+        name = run.resolve().name
+        if name not in network.names:
+            raise GroundTruthError(
+                f"{run}: is no camera of the network: expected one of {', '.join(network.names)}"
+            )
+        frames += read_marker_frames(run, network.names.index(name))
+    return frames

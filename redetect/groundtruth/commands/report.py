@@ -1,0 +1,27 @@
+"""The command ``groundtruth report``: a session in, one page out."""
+
+from __future__ import annotations
+
+import sys
+
+from redetect.groundtruth import __version__
+from redetect.groundtruth.commands.options import Report
+from redetect.groundtruth.commands.outputs import check_outputs
+from redetect.groundtruth.report.inputs import gather
+from redetect.groundtruth.report.page import report_page
+from redetect.storage import write_whole
+
+
+def perform(options: Report) -> int:
+    """Carry the command out; returns the exit code."""
+    output = options.output or options.session / "report.html"
+    check_outputs([output], options.force)
+    inputs = gather(options.session, options.truth)
+    page = report_page(inputs, __version__)
+    with write_whole(output, overwrite=options.force) as stream:
+        stream.write(page)
+    for problem in inputs.problems:
+        print(f"warning: {problem}", file=sys.stderr)
+    shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]
+    print(f"{output}: {', '.join(shown) or 'no poses'}; {len(inputs.missing)} files not there")
+    return 0

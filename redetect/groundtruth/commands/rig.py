@@ -1,0 +1,183 @@
+"""The command ``groundtruth rig``: reads runs, estimates a rig, puts it into the robot's frame."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from redetect.groundtruth.commands.options import Rig as RigCommand
+from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
+from redetect.groundtruth.commands.poses import read_all_frames
+from redetect.groundtruth.commands.tables import print_sigmas, print_table, residual_figures
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.calibration import Network, read_network, read_rig, write_rig
+from redetect.groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
+from redetect.groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
+from redetect.groundtruth.markers.rig_picture import draw_rig
+from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, read_marker_frames
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.storage import write_whole
+
+FloatArray = NDArray[np.float64]
+
+
+def perform(command: RigCommand) -> int:
+    """Carry out ``groundtruth rig``; returns the exit code."""
+    if command.robot is not None and command.reference_poses is not None:
+        raise GroundTruthError("--robot and --reference-poses both define the robot's frame")
+    if command.reference_poses is not None and command.network is None:
+        raise GroundTruthError("--reference-poses needs --network: where the cameras are")
+    picture = command.picture if command.picture is not None else command.output.with_suffix(".png")
+    check_outputs((command.output, picture), command.force)
+    cameras, poses, groups, network = _input(command)
+    dictionary, widths = _markers(command, groups)
+    with progress("rig"):
+        estimate = estimate_rig(
+            groups,
+            cameras,
+            poses,
+            widths,
+            dictionary,
+            command.settings,
+            reference=command.reference,
+            camera_covariance=None if network is None else network.covariance,
+        )
+    estimate, frame = _in_robot_frame(command, estimate)
+    rig = estimate.rig
+    table = [
+        {"marker": marker, **residual_figures(estimate.adjusted, _views_of(estimate, index))}
+        for index, marker in enumerate(rig.ids)
+    ]
+    pairs = [
+        {
+            "markers": [rig.ids[a], rig.ids[b]],
+            "times": len(pair.agrees),
+            "agree": pair.support,
+            "agree_with_second_solution": int((pair.agrees & ~pair.first).sum()),
+        }
+        for (a, b), pair in sorted(estimate.pairs.items())
+    ]
+    extra: dict[str, Any] = {
+        "made_by": provenance(command.settings),
+        "frame": frame,
+        "times": estimate.times,
+        "reduced_cost": estimate.adjusted.reduced_cost,
+        "residuals": table,
+        "pairs": pairs,
+    }
+    drawn = draw_rig(estimate)
+    write_rig(command.output, rig, extra, overwrite=command.force)
+    with write_whole(picture, overwrite=command.force) as stream:
+        stream.write(drawn)
+    for marker, reason in estimate.left_out.items():
+        print(f"marker {marker}: left out: {reason}")
+    print_table(table)
+    print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
+    print(
+        f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "
+        f"squared residuals per degree of freedom {estimate.adjusted.reduced_cost:.2f}"
+    )
+    return 0
+
+
+def _input(
+    command: RigCommand,
+) -> tuple[tuple[Camera, ...], FloatArray, list[tuple[MarkerFrame, ...]], Network | None]:
+    """Cameras, their poses (identities without a network), images grouped by time, the network."""
+    if command.network is not None:
+        network = read_network(command.network)
+        frames = read_all_frames(command.runs, network)
+        groups = group_by_time(frames, command.settings.time_tolerance_s)
+        return network.cameras, network.world_from_camera, groups, network
+    cameras = []
+    alone: list[tuple[MarkerFrame, ...]] = []
+    for index, run in enumerate(command.runs):
+        cameras.append(read_camera(_calibration(run)))
+        alone += [(frame,) for frame in read_marker_frames(run, index, timed=False)]
+    return tuple(cameras), np.tile(np.eye(4), (len(cameras), 1, 1)), alone, None
+
+
+def _calibration(run: Path) -> Path:
+    own = run / f"{run.resolve().name}.cam"
+    found = sorted(run.glob("*.cam"))
+    if own in found:
+        return own
+    if len(found) != 1:
+        raise GroundTruthError(f"{run}: {len(found)} calibrations: expected one .cam file")
+    return found[0]
+
+
+def _markers(
+    command: RigCommand, groups: Sequence[Sequence[MarkerFrame]]
+) -> tuple[str, dict[int, float]]:
+    """The dictionary, and the widths of the markers that may be on the robot."""
+    markers = [marker for group in groups for frame in group for marker in frame.markers]
+    dictionaries = sorted({marker.dictionary for marker in markers})
+    if command.dictionary is None and len(dictionaries) != 1:
+        raise GroundTruthError(
+            f"markers of the dictionaries {dictionaries}: name the robot's by --dictionary"
+        )
+    dictionary = command.dictionary if command.dictionary is not None else dictionaries[0]
+    found = {marker.id for marker in markers if marker.dictionary == dictionary}
+    ids = sorted(found & set(command.ids)) if command.ids else sorted(found)
+    if not found:
+        raise GroundTruthError(f"no markers of the dictionary {dictionary} in any of the runs")
+    if not ids:
+        raise GroundTruthError(
+            "ids: none of these markers in any of the runs: "
+            f"expected some of {_listed(sorted(found))}"
+        )
+    if missing := sorted(set(command.ids or ()) - found):
+        print(f"warning: ids: not in any of the runs: {_listed(missing)}", file=sys.stderr)
+    if not (np.isfinite(command.width_m) and command.width_m > 0.0):
+        raise GroundTruthError(f"width_m is {command.width_m:g}: expected metres above 0")
+    widths = dict.fromkeys(ids, command.width_m)
+    named: dict[int, float] = {}
+    for word in command.widths:
+        marker, _, width = word.partition("=")
+        try:
+            number, metres = int(marker), float(width)
+        except ValueError:
+            number, metres = -1, float("nan")
+        if number < 0 or not (np.isfinite(metres) and metres > 0.0):
+            raise GroundTruthError(f"widths: {word!r}: expected a marker and metres, as 31=0.15")
+        if number in named:
+            raise GroundTruthError(f"widths: marker {number} twice: expected one width")
+        named[number] = metres
+    for number, metres in named.items():
+        if number in widths:
+            widths[number] = metres
+        else:
+            print(
+                f"warning: widths: marker {number} is not among those found ({_listed(ids)}): its "
+                "width counts for none",
+                file=sys.stderr,
+            )
+    return dictionary, widths
+
+
+def _listed(ids: Sequence[int], most: int = 10) -> str:
+    return ", ".join(map(str, ids[:most])) + (", ..." if len(ids) > most else "")
+
+
+def _views_of(estimate: RigEstimate, index: int) -> list[int]:
+    return [i for i, view in enumerate(estimate.views) if view.rig_index == index]
+
+
+def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:
+    """The estimate in the robot's frame, and what that is."""
+    if command.robot is not None:
+        known = read_rig(command.robot)
+        moved = rig_by_known_markers(estimate, known, command.settings)
+        return moved, f"robot, by {command.robot.name}"
+    if command.reference_poses is not None:
+        reference = read_planar_poses(command.reference_poses)
+        moved, used = rig_by_reference_poses(estimate, reference, command.settings)
+        return moved, f"robot, by {used} poses of {command.reference_poses.name}"
+    return estimate, f"marker {estimate.reference}"

@@ -1,0 +1,72 @@
+"""``groundtruth score``: files and messages round errors against the truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from redetect.groundtruth.commands.options import Score
+from redetect.groundtruth.commands.outputs import check_outputs
+from redetect.groundtruth.json_file import write_json
+from redetect.groundtruth.trajectories.alignment import moved_poses, planar_alignment
+from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.streams import read_planar_poses
+from redetect.groundtruth.validation.relative_errors import (
+    read_relations,
+    score_relations,
+    score_steps,
+)
+from redetect.groundtruth.validation.scoring import score_poses
+
+
+def perform(command: Score) -> int:
+    """Carry out ``groundtruth score``; returns the exit code."""
+    check_outputs((command.json,), command.force)
+    solution, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
+    relations = None if command.relations is None else read_relations(command.relations)
+    poses, truth, unmatched = matched_streams(
+        solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
+    )
+    alignment = planar_alignment(poses, truth) if command.align else None
+    if alignment is not None:
+        poses = moved_poses(poses, alignment)
+    score = score_poses(poses, truth, unmatched)
+    print(f"poses             {score.poses} ({score.unmatched} without the other at their time)")
+    print(
+        f"position error    mean {1e3 * score.position_mean_m:.2f} mm, sigma "
+        f"{1e3 * score.position_sigma_m:.2f}, rmse {1e3 * score.position_rmse_m:.2f}, "
+        f"max {1e3 * score.position_max_m:.2f}"
+    )
+    print(
+        f"angle error       mean {math.degrees(score.angle_mean_rad):.3f} deg, sigma "
+        f"{math.degrees(score.angle_sigma_rad):.3f}, max {math.degrees(score.angle_max_rad):.3f}"
+    )
+    if score.normalised:
+        print(
+            f"normalised error squared / dof  {score.normalised_error:.3f} "
+            f"({score.normalised} poses with a covariance that can be inverted)"
+        )
+    else:
+        print("normalised error squared / dof  none: no covariance that can be inverted")
+    relative = {}
+    if relations is not None:
+        relative["relations"] = score_relations(solution, relations, command.largest_gap_s)
+    if command.rpe_step is not None:
+        steps = score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
+        relative[f"steps of {command.rpe_step}"] = steps
+    for name, figures in relative.items():
+        print(
+            f"relative error, {name}: {figures.pairs} pairs ({figures.unmatched} left out), "
+            f"rmse {1e3 * figures.position_rmse_m:.2f} mm, median "
+            f"{1e3 * figures.position_median_m:.2f}, max {1e3 * figures.position_max_m:.2f}; "
+            f"rmse {math.degrees(figures.angle_rmse_rad):.3f} deg"
+        )
+    if command.json is not None:
+        values: dict[str, Any] = {k: v if v == v else None for k, v in asdict(score).items()}
+        if alignment is not None:
+            values["alignment"] = alignment.tolist()
+        if relative:
+            values["relative"] = {name: asdict(figures) for name, figures in relative.items()}
+        write_json(command.json, values, overwrite=command.force)
+    return 0

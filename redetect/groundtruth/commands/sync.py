@@ -1,0 +1,130 @@
+"""``groundtruth sync``: files and the printed account round the synchronisation of clocks."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document
+from redetect.groundtruth.clocks.ptpd import PtpdLog, read_ptpd
+from redetect.groundtruth.clocks.sync import SyncSettings, synchronise
+from redetect.groundtruth.commands.options import Sync
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    read_planar_poses,
+    write_planar_poses,
+)
+
+_CONFIDENCE = 1.959964
+
+
+def perform(options: Sync) -> int:
+    """Carry out ``groundtruth sync``; returns the exit code: 1 if no segment could be aligned."""
+    check_outputs([options.output, options.apply], options.force)
+    settings = SyncSettings(
+        largest_offset_s=options.largest_offset_s,
+        largest_drift=options.largest_drift,
+        segment_gap_s=options.segment_gap_s,
+        use_movement=options.use_movement,
+    )
+    odometry = read_planar_poses(options.odometry)
+    truth = read_planar_poses(options.groundtruth)
+    log = None if options.ptpd is None else read_ptpd(options.ptpd)
+    segments = synchronise(odometry, truth, settings)
+    determined = [segment for segment in segments if segment.status != "no turns"]
+    for segment in segments:
+        print(_line(segment))
+    if not determined:
+        print("no segment turns enough: the clocks cannot be aligned by headings")
+        return 1
+    model = ClockModel(segments)
+    document: dict[str, Any] = {
+        **provenance(settings, [options.odometry, options.groundtruth]),
+        "segments": clock_document(segments),
+    }
+    if log is not None:
+        document["ptpd"] = compare_with_ptpd(model, determined, log)
+        print(_ptpd_line(document["ptpd"]))
+    write_account(options.output, document, overwrite=options.force)
+    if options.apply is not None:
+        aligned = PlanarPoses(
+            model.groundtruth_times(odometry.times_s), odometry.poses, odometry.covariances
+        )
+        write_planar_poses(options.apply, aligned, overwrite=options.force)
+    return 0
+
+
+def compare_with_ptpd(
+    model: ClockModel, determined: list[ClockSegment], log: PtpdLog
+) -> dict[str, float | int | None]:
+    """Compare the clocks estimated from headings with ptpd's reports.
+
+    Parameters
+    ----------
+    model : ClockModel
+    determined : list of ClockSegment
+        Those whose offset is determined.
+    log : PtpdLog
+        Its times are those of the robot's clock; an offset is the robot's minus the master's.
+
+    Returns
+    -------
+    dict
+        Reports, how many of them lie in a segment, the root mean square of the difference between
+        their offsets and the model's there (s), the mean drift of both, and by how much ptpd's
+        offsets leave the best straight line through them (s): how far piecewise linear is true.
+        None where nothing can be said.
+    """
+    timed = np.isfinite(log.times_s)
+    times, offsets = log.times_s[timed], log.offset_s[timed]
+    groundtruth = times - offsets
+    inside = np.zeros(len(times), dtype=np.bool_)
+    bends = []
+    for segment in determined:
+        here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
+        inside |= here
+        if np.count_nonzero(here) >= 3:
+            t = groundtruth[here] - segment.reference_s
+            line = np.polyfit(t, offsets[here], 1)
+            bends.append(offsets[here] - np.polyval(line, t))
+    expected = model.robot_times(groundtruth[inside]) - groundtruth[inside]
+    difference = offsets[inside] - expected
+    drift = log.drift[np.isfinite(log.drift)]
+    return {
+        "reports": len(log.offset_s),
+        "reports_in_segments": int(np.count_nonzero(inside)),
+        "rms_difference_s": _rms(difference),
+        "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
+        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
+        "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
+    }
+
+
+def _rms(values: Any) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def _line(segment: ClockSegment) -> str:
+    head = f"{segment.from_s:.2f} .. {segment.to_s:.2f} s: "
+    if segment.status == "no turns":
+        return head + f"cannot be synchronised: {segment.note}"
+    offset = _CONFIDENCE * segment.sigma_offset_s
+    drift = _CONFIDENCE * segment.sigma_rate
+    text = (
+        f"offset {1e3 * segment.offset_s:+.2f} +- {1e3 * offset:.2f} ms, "
+        f"drift {1e6 * (segment.rate - 1.0):+.1f} +- {1e6 * drift:.1f} ppm, "
+        f"angle {math.degrees(segment.angle_rad):+.3f} deg, "
+        f"turned {math.degrees(segment.turned_rad):.0f} deg"
+    )
+    return head + text + (f" ({segment.status}: {segment.note})" if segment.note else "")
+
+
+def _ptpd_line(figures: dict[str, float | int | None]) -> str:
+    rms = figures["rms_difference_s"]
+    compared = "none in a segment" if rms is None else f"rms difference {1e3 * rms:.2f} ms"
+    return (
+        f"ptpd: {figures['reports']} reports, {figures['reports_in_segments']} compared, {compared}"
+    )

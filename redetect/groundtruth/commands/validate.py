@@ -1,0 +1,227 @@
+"""The command ``groundtruth validate``: distances and scans in, table, poses and plots out."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from redetect.groundtruth.clocks.clock import read_clock
+from redetect.groundtruth.commands.options import Validate
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.building import find_building, read_building
+from redetect.groundtruth.lasers.scanners import read_robot
+from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
+from redetect.groundtruth.validation.fiducials import read_distances, read_survey
+from redetect.groundtruth.validation.picture import draw_errors
+from redetect.groundtruth.validation.reference_poses import DistanceSettings, poses_from_distances
+from redetect.groundtruth.validation.reference_poses_scans import Onboard, RefineSettings
+from redetect.groundtruth.validation.validate import (
+    PUBLISHED,
+    Figures,
+    ReferencePose,
+    Refused,
+    document,
+    figures_of,
+    pose_errors,
+    reference_poses,
+    stream_of,
+    table_rows,
+)
+from redetect.storage import write_whole
+
+#: Files written to the folder.
+OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
+
+_FARTHEST_S = 0.5
+
+
+@dataclass(frozen=True)
+class _Settings:
+    refine: str
+    distances: DistanceSettings = field(default_factory=DistanceSettings)
+    scans: Any = None
+    farthest_s: float = _FARTHEST_S
+
+
+def perform(options: Validate) -> int:
+    """Carry the command out; returns the exit code: 1 without a reference pose to compare with."""
+    session, folder = options.session, options.output
+    outputs = {name: folder / name for name in OUTPUTS}
+    check_outputs(list(outputs.values()), options.force)
+    survey = read_survey(session / "fiducials.json")
+    measured = read_distances(session / "distances.csv", survey)
+    if not measured:
+        raise GroundTruthError(f"{session / 'distances.csv'}: no distances in it")
+    poses = read_planar_poses(options.poses)
+    files = [session / "fiducials.json", session / "distances.csv", options.poses]
+    onboard: list[Onboard] = []
+    clock, segments, clock_path = None, None, None
+    settings = _Settings(options.refine)
+    if options.refine == "scans":
+        settings = _Settings(options.refine, scans=RefineSettings())
+        map_file = find_building(session)
+        segments = read_building(map_file).segments
+        onboard, scan_files = _onboard(session)
+        clock_path = _clock_path(session, options.clock)
+        if onboard and clock_path is None:
+            print(
+                "warning: no clock.json: the times of the on-board scans are not corrected",
+                file=sys.stderr,
+            )
+        clock = None if clock_path is None else read_clock(clock_path)
+        files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
+    elif (session / "building.csv").is_file() or (session / "building.dxf").is_file():
+        segments = read_building(find_building(session)).segments  # for the picture
+    solved = poses_from_distances(survey, measured, settings.distances)
+    references, refused = reference_poses(solved, onboard, segments, clock, settings.scans)
+    for entry in refused:
+        print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
+    if not references:
+        print("error: not a single reference pose", file=sys.stderr)
+        return 1
+    errors, without = pose_errors(references, poses, settings.farthest_s)
+    for entry in without:
+        print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
+    if not errors:
+        print("error: no ground truth at the time of any reference pose", file=sys.stderr)
+        return 1
+    figures = figures_of(errors)
+    rows = table_rows(references, errors)
+    content = {
+        **provenance(settings, files),
+        "poses": str(options.poses.name),
+        "clock": None if clock_path is None else clock_path.name,
+        **document(figures, [*refused, *without]),
+        "distances": _distance_figures(solved, survey.sigma_m),
+        "rows": [
+            {**row, "note": r.note, "points": r.points, "rms_m": _finite(r.rms_m)}
+            for row, r in zip(rows, references)
+        ],
+        "sigma": [
+            {"pose": e.index, "linear_m": _finite(e.sigma_linear_m),
+             "angular_rad": _finite(e.sigma_angular_rad)}
+            for e in errors
+        ],
+    }  # fmt: skip
+    picture = draw_errors(references, errors, figures, segments)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
+    for name, data in (
+        ("table.csv", table_text(rows).encode()),
+        ("errors.png", picture),
+        ("validation.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()),
+    ):
+        with write_whole(outputs[name], overwrite=options.force) as stream:
+            stream.write(data)
+    for line in account(references, refused, figures, content["distances"]):
+        print(line)
+    print(f"{folder}: written")
+    return 0
+
+
+def table_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows as lines between commas, with a head; empty where there is no value."""
+    decimals = {"t": 6, "nees": 4, "angular_deg": 5}
+
+    def word(name: str, value: Any) -> str:
+        if value is None:
+            return ""
+        return f"{value:.{decimals.get(name, 6)}f}" if isinstance(value, float) else str(value)
+
+    lines = [",".join(rows[0])]
+    lines += [",".join(word(name, value) for name, value in row.items()) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def account(
+    references: Sequence[ReferencePose],
+    refused: Sequence[Refused],
+    figures: Figures,
+    distances: dict[str, Any],
+) -> list[str]:
+    """The printed figures, with RAWSEEDS' beside them."""
+    refined = sum(reference.scans == "used" for reference in references)
+    lines = [
+        f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by scans"
+    ]
+    chi2 = distances["chi2_per_freedom"]
+    lines.append(
+        f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
+        f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}, "
+        f"{distances['gross']} gross errors"
+    )
+    lines.append(
+        f"linear error       mean {1e3 * figures.linear_mean_m:.2f} mm, sigma "
+        f"{1e3 * figures.linear_sigma_m:.2f}, worst {1e3 * figures.linear_worst_m:.2f}"
+    )
+    lines.append(
+        f"angular error      mean {math.degrees(figures.angular_mean_rad):+.3f} deg, sigma "
+        f"{math.degrees(figures.angular_sigma_rad):.3f}, worst "
+        f"{math.degrees(figures.angular_worst_rad):.3f}"
+    )
+    for p in PUBLISHED:
+        lines.append(
+            f"{p.name:<18} mean {1e3 * p.position_mean_m:.0f} mm, sigma "
+            f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
+            f"{p.angle_sigma_deg:.2f} (published)"
+        )
+    if figures.normalised:
+        lines.append(
+            f"NEES / 3           {figures.nees:.3f} over {figures.normalised} poses; 95 % of right "
+            f"ones between {figures.nees_low:.3f} and {figures.nees_high:.3f}"
+        )
+    else:
+        lines.append("NEES / 3           none: no covariance that can be inverted")
+    return lines
+
+
+def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
+    """The robot's scanners that have scans in the session, and the files read."""
+    path = session / "robot.json"
+    robot = read_robot(path)
+    boards, files = [], [path]
+    for scanner in robot.scanners:
+        try:
+            found = find_scans(session, scanner.name)
+        except GroundTruthError as error:
+            print(f"warning: {error}: its scans do not refine", file=sys.stderr)
+            continue
+        # A clock that was set makes times step back; the poses' own times are looked up.
+        boards.append(Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
+        files.append(found)
+    if not boards:
+        print("warning: no scans of a scanner on board: distances alone count", file=sys.stderr)
+    return boards, files
+
+
+def _clock_path(session: Path, given: Path | None) -> Path | None:
+    if given is not None:
+        return given
+    path = session / "clock.json"
+    return path if path.is_file() else None
+
+
+def _distance_figures(solved: Any, sigma_m: float) -> dict[str, Any]:
+
+    good = [d for d in solved if d.status in ("ok", "ambiguous")]
+    residuals = np.concatenate([d.residuals_m[d.used] for d in good]) if good else np.zeros(0)
+    freedom = sum(d.freedom for d in good)
+    return {
+        "sigma_m": sigma_m,
+        "rms_m": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0,
+        "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
+        "gross": int(sum((~d.used).sum() for d in good)),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,175 @@
+"""Odometry as movements between nodes, and what each of them may be off by at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.geometry.plane import between, log_motion
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+
+FloatArray = NDArray[np.float64]
+
+# A robot at rest may still move a little; without this noise, rest would give singular covariances.
+_CREEP_M2_PER_S = (1e-4) ** 2
+_CREEP_RAD2_PER_S = (1e-4) ** 2
+# A turn is distinct if, from a second before to a second after, odometry turned by more than so
+# many of its standard deviations.
+_DISTINCT_OVER_S = 1.0
+_DISTINCT_SIGMAS = 4.0
+# Odometry pauses where samples are farther apart than both, in seconds and in usual intervals.
+_PAUSE_S = 1.0
+_PAUSE_INTERVALS = 10.0
+# Motion that is possible in a pause: at this quantile of the rates over a second.
+_USUAL_RATES_OVER_S = 1.0
+_USUAL_RATES_QUANTILE = 0.9
+
+
+def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
+    """Pauses of odometry: only the resulting movement is known, not the path.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        No two samples of one time.
+
+    Returns
+    -------
+    list of (float, float)
+        The times of the samples before and after each pause.
+    """
+    times = odometry.times_s
+    return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
+
+
+def _paused(times_s: FloatArray) -> NDArray[np.bool_]:
+    interval = np.diff(times_s)
+    if len(interval) == 0:
+        return np.zeros(0, dtype=np.bool_)
+    return np.asarray(interval > max(_PAUSE_S, _PAUSE_INTERVALS * float(np.median(interval))))
+
+
+def movements(
+    odometry: PlanarPoses, node_times_s: FloatArray, settings: FuseSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Movements between nodes, each a share of an arc between two samples of odometry.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        Two samples or more, no two of one time.
+    node_times_s : (N,) array
+        Ascending, within odometry's time.
+    settings : FuseSettings
+
+    Returns
+    -------
+    controls : (N, 4) float64
+        As in `redetect.groundtruth.fusion.movement.MovementProblem`.
+    unseen : (N, 2) float64
+        Additional distance (m) and turn (rad) that the robot may have made where odometry pauses,
+        at its usual rates.
+    """
+    arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
+    way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
+    distinct = np.where(_distinct(odometry.times_s, way, turn, settings), turn, 0.0)
+    arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, way, turn)])
+    last = len(odometry) - 2
+    at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
+    share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
+    shares = np.concatenate([np.zeros((1, 6)), share[:, None] * arcs[at]])
+    return shares[:, :4].copy(), shares[:, 4:].copy()
+
+
+def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[FloatArray, ...]:
+    """Sums of steps from a margin before each to a margin after it, and over how long."""
+    from_s = np.maximum(times_s[:-1] - margin_s, times_s[0])
+    to_s = np.minimum(times_s[1:] + margin_s, times_s[-1])
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    ends = (np.interp(at, times_s, total) for at in (to_s, from_s))
+    return np.asarray(np.subtract(*ends)), to_s - from_s
+
+
+def _distinct(
+    times_s: FloatArray, way: FloatArray, turn: FloatArray, settings: FuseSettings
+) -> NDArray[np.bool_]:
+    """Between which samples the robot turned by more than odometry's random errors explain.
+
+    Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
+    errors, which measured headings contradict, so that the estimate would be biased towards -1
+    (regression dilution).
+    """
+    turned, passed = _within(times_s, turn, _DISTINCT_OVER_S)
+    driven, _ = _within(times_s, way, _DISTINCT_OVER_S)
+    variance = (
+        settings.turn_sigma**2 * np.abs(turned)
+        + settings.turn_per_metre_sigma**2 * driven
+        + _CREEP_RAD2_PER_S * passed
+    )
+    return np.asarray(turned**2 > _DISTINCT_SIGMAS**2 * variance)
+
+
+def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:
+    """(N - 1, 2) way and turn that pauses may hide, beyond the arcs over them."""
+    paused = _paused(times_s)
+    hidden = np.zeros((len(way), 2))
+    if not np.any(paused) or np.all(paused):
+        return hidden
+    usual = []
+    for steps in (way, turn):
+        total, passed = _within(times_s, steps, 0.5 * _USUAL_RATES_OVER_S)
+        usual.append(float(np.quantile((np.abs(total) / passed)[~paused], _USUAL_RATES_QUANTILE)))
+    passed = np.diff(times_s)[paused]
+    for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
+        hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
+    # Some odometry is written on change only: with all digits equal, the robot was at rest.
+    hidden[(way == 0.0) & (turn == 0.0)] = 0.0
+    return hidden
+
+
+def variances_of(
+    times_s: FloatArray,
+    controls: FloatArray,
+    unseen: FloatArray,
+    noise: Sequence[float] | FloatArray,
+    settings: FuseSettings,
+) -> FloatArray:
+    """Noise of movements, summed up.
+
+    All of it is proportional to way, turn and time, so that it adds up over parts of a movement;
+    but for what pauses hide: there odometry's systematic bend has a way to act on that is not
+    known, and what a wrong heading leads aside is taken to be that of a way out and back.
+
+    Parameters
+    ----------
+    times_s, controls, unseen : (N,), (N, 4), (N, 2) arrays
+        Nodes, and the movements to them.
+    noise : (4,) array
+        Odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
+    settings : FuseSettings
+
+    Returns
+    -------
+    (N, 3) float64
+        Along the way, across it (m^2), of the turn (rad^2).
+    """
+    along, across, by_turn, by_way = np.square(noise)
+    way = np.hypot(controls[:, 0], controls[:, 1])
+    passed = np.concatenate([[0.0], np.diff(times_s)])
+    hidden_way, hidden_turn = unseen.T
+    hidden = (
+        by_turn * hidden_turn
+        + by_way * hidden_way
+        + np.square(settings.turn_bias_per_metre_sigma * hidden_way)
+    )
+    aside = hidden * hidden_way**2 / 12.0
+    return np.column_stack(
+        [
+            along * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
+            across * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
+            by_turn * np.abs(controls[:, 2]) + by_way * way + hidden + _CREEP_RAD2_PER_S * passed,
+        ]
+    )

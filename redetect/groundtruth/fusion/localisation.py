@@ -1,0 +1,361 @@
+"""Odometry that is a localisation: its poses err about a rigid motion, however long it goes on.
+
+A localisation in a map, or a path that was closed into loops, doesn't drift as wheels do. Its
+poses are those of the ground truth after one rigid motion, and their errors besides are stationary:
+an Ornstein-Uhlenbeck process for x, y and the heading, of a deviation and a correlation time each
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, appendix B). Filter and
+smoother over it are linear. Odometry is taken for a localisation only if, as such, it predicts the
+measurements a hundred times as well as by the movements between its poses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from redetect.groundtruth.fusion.motion_kernels import POSE
+from redetect.groundtruth.fusion.movement import MovementProblem
+from redetect.groundtruth.trajectories.alignment import moved_poses, planar_alignment
+from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
+# Errors of x, y (m) and heading (rad); then the rigid motion about the measured poses' centroid
+# beyond the first alignment, and the angle at which its heading is mounted.
+_STATE = 7
+# Deviations of the last four before anything was measured.
+_ALIGNMENT_SIGMAS = (10.0, 10.0, 1.0, 0.1)
+# Deviations (m, rad) and correlation times (s) to begin with, and how far from them is searched. A
+# few visits hardly determine the latter: a deviation of their logarithms is assumed.
+_START = (0.1, 0.03, 10.0, 10.0)
+_LARGEST_FACTOR = 300.0
+_LOG_CORRELATION_SIGMA = 0.7
+_MOST_TO_LEARN_FROM = 1000
+# Both ways to see odometry are compared by measurements this far apart, if there are enough, and
+# only where a longer gap is to be bridged.
+_SPACING_S = 2.0
+_FEWEST = 10
+_LEAST_GAP_S = 20.0
+_CLEAR_LEAD = 2.0 * math.log(100.0)
+# Poses this many times as far off as half of them are no part of the alignment, nor of the path.
+_USUAL = 6.0
+_TRIMMINGS = 5
+# Of a pose that may be anywhere within 10 m by 10 m, of which there is one in 10000.
+_OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
+
+
+@dataclass(frozen=True)
+class LocalisationErrors:
+    """How odometry errs that is a localisation.
+
+    Attributes
+    ----------
+    position_sigma, heading_sigma : float
+        Standard deviations of x and y (m each), and of the heading (rad).
+    position_correlation_s, heading_correlation_s : float
+        After which time errors are alike by 1/e only.
+    heading_offset : float
+        Heading of the ground truth beyond that of the aligned localisation (rad).
+    """
+
+    position_sigma: float
+    heading_sigma: float
+    position_correlation_s: float
+    heading_correlation_s: float
+    heading_offset: float
+
+
+class LocalisationProblem(NamedTuple):
+    """Measured poses beside odometry's, aligned.
+
+    Attributes
+    ----------
+    odometry : PlanarPoses
+        Aligned rigidly with the measured poses.
+    times_s : (M,) float64
+    differences, covariances : (M, 3), (M, 3, 3) float64
+        Measured poses minus odometry's at their times; covariances of the former.
+    offsets : (M, 2) float64
+        Odometry's positions less the centroid (m).
+    centroid : (2,) float64
+    gate : float
+        Largest squared normalised innovation.
+    """
+
+    odometry: PlanarPoses
+    times_s: FloatArray
+    differences: FloatArray
+    covariances: FloatArray
+    offsets: FloatArray
+    centroid: FloatArray
+    gate: float
+
+
+def localisation_problem(
+    odometry: PlanarPoses, measured: PlanarPoses, gate: float
+) -> LocalisationProblem:
+    """Align odometry with measured poses.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        No two samples of one time.
+    measured : PlanarPoses
+        Two or more, with covariances, within odometry's time.
+    gate : float
+        Largest squared normalised innovation.
+    """
+    assert measured.covariances is not None
+    own, _ = interpolate_poses(odometry, measured.times_s)
+    usual = np.ones(len(measured), dtype=np.bool_)
+    for _ in range(_TRIMMINGS):
+        motion = planar_alignment(_some(own, usual), _some(measured, usual))
+        beside = moved_poses(own, motion)
+        differences = measured.poses - beside.poses
+        differences[:, 2] = wrap_angle(differences[:, 2])
+        off = np.column_stack([np.hypot(differences[:, 0], differences[:, 1]), differences[:, 2]])
+        usual = np.all(np.abs(off) <= _USUAL * np.median(np.abs(off), axis=0), axis=1)
+        if np.count_nonzero(usual) < 2:
+            break
+    differences[~usual] = np.nan
+    centroid = beside.poses[:, :2].mean(axis=0)
+    return LocalisationProblem(
+        moved_poses(odometry, motion),
+        measured.times_s,
+        differences,
+        measured.covariances,
+        beside.poses[:, :2] - centroid,
+        centroid,
+        gate,
+    )
+
+
+def _some(poses: PlanarPoses, which: NDArray[np.bool_]) -> PlanarPoses:
+    return PlanarPoses(poses.times_s[which], poses.poses[which])
+
+
+def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]:
+    """Deviations (m, rad) and correlation time that make the measurements likeliest.
+
+    Parameters
+    ----------
+    problem : LocalisationProblem
+        Of few measurements, seconds apart.
+
+    Returns
+    -------
+    errors : (4,) float64
+        Deviations of position and heading, correlation times of both (s).
+    surprise : float
+        Minus twice the logarithm of the measurements' likelihood.
+    """
+    start = np.array(_START)
+    bound = math.log(_LARGEST_FACTOR)
+    stride = max(1, len(problem.times_s) // _MOST_TO_LEARN_FROM)
+
+    def surprise(logarithms: FloatArray, stride: int = stride) -> float:
+        errors = start * np.exp(np.clip(logarithms, -bound, bound))
+        return float(
+            _filter(
+                problem.times_s[::stride],
+                problem.differences[::stride],
+                problem.covariances[::stride],
+                problem.offsets[::stride],
+                errors,
+                np.array(_ALIGNMENT_SIGMAS),
+                problem.gate,
+            ).surprise
+        )
+
+    def with_prior(logarithms: FloatArray) -> float:
+        return surprise(logarithms) + float(np.sum((logarithms[2:] / _LOG_CORRELATION_SIGMA) ** 2))
+
+    found = minimize(
+        with_prior,
+        np.zeros(4),
+        method="Nelder-Mead",
+        options={
+            "xatol": 0.02,
+            "fatol": 0.02,
+            "initial_simplex": np.vstack([np.zeros(4), -np.eye(4)]),
+        },
+    )
+    errors = start * np.exp(np.clip(found.x, -bound, bound))
+    return np.asarray(errors), surprise(found.x, 1)
+
+
+class _Filtered(NamedTuple):
+    predicted: FloatArray
+    predicted_covariance: FloatArray
+    filtered: FloatArray
+    filtered_covariance: FloatArray
+    squared: FloatArray
+    surprise: float
+
+
+@njit(cache=True, error_model="numpy")
+def _filter(
+    times_s: FloatArray,
+    differences: FloatArray,
+    covariances: FloatArray,
+    offsets: FloatArray,
+    errors: FloatArray,
+    alignment_sigmas: FloatArray,
+    gate: float,
+) -> _Filtered:
+    """Kalman filter over the errors; differences that are NaN are not measured."""
+    count = len(times_s)
+    variances = np.array([errors[0] ** 2, errors[0] ** 2, errors[1] ** 2])
+    x = np.zeros(_STATE)
+    p = np.zeros((_STATE, _STATE))
+    for i in range(POSE):
+        p[i, i] = variances[i]
+    for i in range(POSE, _STATE):
+        p[i, i] = alignment_sigmas[i - POSE] ** 2
+    predicted, filtered = np.empty((count, _STATE)), np.empty((count, _STATE))
+    predicted_covariance = np.empty((count, _STATE, _STATE))
+    filtered_covariance = np.empty((count, _STATE, _STATE))
+    squared = np.zeros(count)
+    surprise = 0.0
+    h = np.zeros((POSE, _STATE))
+    h[0, 0] = h[0, 3] = h[1, 1] = h[1, 4] = h[2, 2] = h[2, 5] = h[2, 6] = 1.0
+    for k in range(count):
+        if k > 0:
+            for i in range(POSE):
+                share = math.exp(-(times_s[k] - times_s[k - 1]) / errors[3 if i == 2 else 2])
+                x[i] *= share
+                p[i] *= share
+                p[:, i] *= share
+                p[i, i] += variances[i] * (1.0 - share * share)
+        predicted[k], predicted_covariance[k] = x, p
+        if math.isnan(differences[k, 0]):
+            squared[k] = math.inf
+            surprise += _OUTLIER_SURPRISE
+        else:
+            h[0, 5], h[1, 5] = -offsets[k, 1], offsets[k, 0]
+            innovation = differences[k] - h @ x
+            innovation[2] = (innovation[2] + math.pi) % (2.0 * math.pi) - math.pi
+            s = h @ p @ h.T + covariances[k]
+            gain = np.linalg.solve(s, h @ p).T
+            squared[k] = innovation @ np.linalg.solve(s, innovation)
+            surprise += min(squared[k] + math.log(np.linalg.det(s)), _OUTLIER_SURPRISE)
+            if squared[k] <= gate:
+                x = x + gain @ innovation
+                p = p - gain @ s @ gain.T
+                p = 0.5 * (p + p.T)
+        filtered[k], filtered_covariance[k] = x, p
+    return _Filtered(
+        predicted, predicted_covariance, filtered, filtered_covariance, squared, surprise
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _smooth(
+    times_s: FloatArray, errors: FloatArray, filtered: _Filtered
+) -> tuple[FloatArray, FloatArray]:
+    """Rauch-Tung-Striebel: states and covariances."""
+    x, p = filtered.filtered.copy(), filtered.filtered_covariance.copy()
+    f = np.ones(_STATE)
+    for k in range(len(times_s) - 2, -1, -1):
+        passed = times_s[k + 1] - times_s[k]
+        f[:2], f[2] = math.exp(-passed / errors[2]), math.exp(-passed / errors[3])
+        before = filtered.predicted_covariance[k + 1]
+        gain = np.linalg.solve(before, (p[k] * f).T).T
+        x[k] += gain @ (x[k + 1] - filtered.predicted[k + 1])
+        p[k] += gain @ (p[k + 1] - before) @ gain.T
+    return x, p
+
+
+def smooth_localisation(
+    problem: LocalisationProblem, errors: FloatArray, times_s: FloatArray
+) -> tuple[PlanarPoses, FloatArray, float]:
+    """The path from odometry that is a localisation.
+
+    Parameters
+    ----------
+    problem : LocalisationProblem
+    errors : (4,) array
+        See `learn_localisation`.
+    times_s : (N,) array
+        Odometry's times at which poses are wanted.
+
+    Returns
+    -------
+    poses : PlanarPoses
+        With covariances.
+    squared : (M,) float64
+        Squared normalised innovations of the measurements.
+    heading_offset : float
+        Rad.
+    """
+    there, _ = interpolate_poses(problem.odometry, times_s)
+    all_times = np.concatenate([times_s, problem.times_s])
+    order = np.argsort(all_times, kind="stable")
+    none = np.full((len(times_s), POSE), np.nan)
+    offsets = np.concatenate([there.poses[:, :2] - problem.centroid, problem.offsets])[order]
+    filtered = _filter(
+        all_times[order],
+        np.concatenate([none, problem.differences])[order],
+        np.concatenate([np.zeros((len(times_s), POSE, POSE)), problem.covariances])[order],
+        offsets,
+        errors,
+        np.array(_ALIGNMENT_SIGMAS),
+        problem.gate,
+    )
+    states, spreads = _smooth(all_times[order], errors, filtered)
+    own = np.flatnonzero(order < len(times_s))
+    h = np.zeros((len(own), POSE, _STATE))
+    h[:, [0, 0, 1, 1, 2, 2, 2], [0, 3, 1, 4, 2, 5, 6]] = 1.0
+    h[:, 0, 5], h[:, 1, 5] = -offsets[own, 1], offsets[own, 0]
+    poses = there.poses + np.einsum("nij,nj->ni", h, states[own])
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    covariances = h @ spreads[own] @ np.swapaxes(h, 1, 2)
+    squared = filtered.squared[order >= len(times_s)]
+    return PlanarPoses(times_s, poses, covariances), squared, float(states[-1, 6])
+
+
+def as_localisation(
+    odometry: PlanarPoses, problem: MovementProblem, noise: FloatArray, times_s: FloatArray
+) -> tuple[PlanarPoses, FloatArray, LocalisationErrors] | None:
+    """The path from odometry that is a localisation, if it clearly is one.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        No two samples of one time.
+    problem : MovementProblem
+        The same with the measurements.
+    noise : (4,) array
+        Random errors of its movements over seconds.
+    times_s : (N,) array
+        Odometry's times at which poses are wanted.
+
+    Returns
+    -------
+    poses : PlanarPoses
+    squared : (M,) float64
+        Squared normalised innovations of the measurements; infinite where they were left out.
+    errors : LocalisationErrors
+    """
+    thin = problem.thinned(_SPACING_S)
+    if len(thin.nodes) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
+        return None
+    errors, surprise = learn_localisation(_beside(odometry, thin))
+    if not surprise < thin.account(noise).surprise - _CLEAR_LEAD:
+        return None
+    poses, squared, offset = smooth_localisation(_beside(odometry, problem), errors, times_s)
+    return poses, squared, LocalisationErrors(*(float(error) for error in (*errors, offset)))
+
+
+def _beside(odometry: PlanarPoses, problem: MovementProblem) -> LocalisationProblem:
+    times_s = problem.times_s[problem.nodes]
+    measured = PlanarPoses(times_s, problem.measured, problem.covariances)
+    return localisation_problem(odometry, measured, problem.gate())

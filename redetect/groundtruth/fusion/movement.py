@@ -1,0 +1,356 @@
+"""Odometry as control and measured poses: their likelihood together, and the smoothed path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from redetect.groundtruth.fusion.controls import movements, variances_of
+from redetect.groundtruth.fusion.gaps import (
+    UNMEASURED_S,
+    Bridge,
+    back_from,
+    bridge,
+    ends_that_did_not_fit,
+    gaps_where_lost,
+)
+from redetect.groundtruth.fusion.measurements import gather
+from redetect.groundtruth.fusion.motion_kernels import POSE, STATE
+from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.fusion.smoother_kernels import (
+    FilterHistory,
+    Gating,
+    MeasuredPoses,
+    Odometry,
+    empty_history,
+    filter_forward,
+    smooth_backward,
+)
+from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
+
+FloatArray = NDArray[np.float64]
+
+_RESTART_AFTER = 40
+_RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
+# Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
+_LOST_VARIANCE = 0.5**2
+_RELINEARISATIONS = 1
+_RELINEARISATIONS_WHERE_LOST = 3
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementAccount:
+    """How the measurements were used.
+
+    Attributes
+    ----------
+    squared : (M,) float64
+        Squared normalised innovations.
+    accepted : (M,) bool
+    restarted : (N,) int8
+        Whether the filter was restarted at a node, and why (see `smoother_kernels`).
+    surprise : float
+        Minus twice the logarithm of their likelihood.
+    """
+
+    squared: FloatArray
+    accepted: NDArray[np.bool_]
+    restarted: NDArray[np.int8]
+    surprise: float
+
+
+class Smoothed(NamedTuple):
+    """Smoothed states (N, 6) and covariances (N, 6, 6) at the nodes."""
+
+    states: FloatArray
+    covariances: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class MovementProblem:
+    """Odometry and measured poses on common nodes, whatever odometry errs at random.
+
+    Attributes
+    ----------
+    times_s : (N,) float64
+        The nodes.
+    controls : (N, 4) float64
+        Odometry's movement to each node: way forward, way to the left (m) and turn (rad), each
+        summed up in the robot's turning frame; and the turn again where it is a distinct one, else
+        0.
+    unseen : (N, 2) float64
+        Way (m) and turn (rad) that it may have made besides, where odometry pauses.
+    nodes : (M,) int64
+        At which node each measurement was made, ascending.
+    measured, covariances : (M, 3), (M, 3, 3) float64
+        The measured poses.
+    streams : tuple of M str
+        Their streams.
+    repaired : dict of str to int
+        Covariances that had to be raised, by stream.
+    repeated : dict of str to int
+        Rows that repeated the row before and were left out, by stream.
+    settings : FuseSettings
+    """
+
+    times_s: FloatArray
+    controls: FloatArray
+    unseen: FloatArray
+    nodes: NDArray[np.int64]
+    measured: FloatArray
+    covariances: FloatArray
+    streams: tuple[str, ...]
+    repaired: dict[str, int]
+    repeated: dict[str, int]
+    settings: FuseSettings
+
+    def shortened(self, count: int) -> MovementProblem:
+        """The contiguous nodes, at most `count`, that have the most measurements."""
+        if len(self.times_s) <= count:
+            return self
+        begins = self.nodes[self.nodes + count <= len(self.times_s)]
+        if len(begins) == 0:
+            begins = np.array([len(self.times_s) - count], dtype=np.int64)
+        held = np.searchsorted(self.nodes, begins + count) - np.searchsorted(self.nodes, begins)
+        begin = int(begins[int(np.argmax(held))])
+        return self._part(begin, begin + count)
+
+    def _part(self, begin: int, end: int) -> MovementProblem:
+        here = (self.nodes >= begin) & (self.nodes < end)
+        return MovementProblem(
+            self.times_s[begin:end],
+            self.controls[begin:end],
+            self.unseen[begin:end],
+            self.nodes[here] - begin,
+            self.measured[here],
+            self.covariances[here],
+            tuple(self.streams[i] for i in np.flatnonzero(here)),
+            self.repaired,
+            self.repeated,
+            self.settings,
+        )
+
+    def split(self, longest_s: float) -> list[MovementProblem]:
+        """The parts between which nothing was measured for longer than this, without the gaps."""
+        at = self.times_s[self.nodes]
+        cuts = np.flatnonzero(np.diff(at) > longest_s) + 1
+        return [
+            self._part(int(self.nodes[own[0]]), int(self.nodes[own[-1]]) + 1)
+            for own in np.split(np.arange(len(at)), cuts)
+        ]
+
+    def surprise(self, noise: FloatArray) -> float:
+        """Minus twice the logarithm of the measurements' likelihood."""
+        return self.account(noise).surprise
+
+    def account(
+        self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
+    ) -> MeasurementAccount:
+        """How a forward-only filter uses the measurements.
+
+        It begins with the given means and deviations of odometry's systematic errors, by default
+        with those of the settings.
+        """
+        return self._forward(
+            self._variances(noise),
+            np.empty((1, STATE)),
+            np.zeros(len(self.times_s), dtype=np.bool_),
+            None,
+            systematic,
+        )
+
+    def thinned(self, spacing_s: float) -> MovementProblem:
+        """With no measurement sooner than this after the one before."""
+        at = self.times_s[self.nodes]
+        kept = np.zeros(len(at), dtype=np.bool_)
+        last = -np.inf
+        for i, time in enumerate(at):
+            if time - last >= spacing_s:
+                kept[i] = True
+                last = time
+        return self.with_only(kept)
+
+    def with_only(self, kept: NDArray[np.bool_]) -> MovementProblem:
+        """With some of its measurements."""
+        return replace(
+            self,
+            nodes=self.nodes[kept],
+            measured=self.measured[kept],
+            covariances=self.covariances[kept],
+            streams=tuple(self.streams[i] for i in np.flatnonzero(kept)),
+        )
+
+    def smooth(
+        self, noise: FloatArray, looser_in_gaps: float = 1.0
+    ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
+        """Smoothed states, their covariances, and what became of the measurements.
+
+        Parameters
+        ----------
+        noise : (4,) array
+            Odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
+        looser_in_gaps : float
+            Factor on the variances they make where nothing is measured.
+
+        Returns
+        -------
+        states, covariances : (N, 6), (N, 6, 6) arrays
+        account : MeasurementAccount
+        """
+        variances = self._variances(noise)
+        as_sampled = variances.copy()
+        after = np.flatnonzero(np.diff(self.times_s[self.nodes]) > UNMEASURED_S)
+        for begin, end in zip(self.nodes[after], self.nodes[after + 1]):
+            variances[begin + 1 : end + 1] *= looser_in_gaps
+        history = empty_history(len(self.times_s))
+        points = np.empty((1, STATE))
+        cuts = np.zeros(len(self.times_s), dtype=np.bool_)
+        while True:
+            account = self._forward(variances, points, cuts, history)
+            unfit = ends_that_did_not_fit(
+                self.times_s, self.nodes, account.accepted, account.restarted
+            )
+            if not unfit:
+                break
+            cuts[unfit] = True
+        smoothed = Smoothed(*smooth_backward(history))
+        gaps = gaps_where_lost(self.nodes, account.accepted, account.restarted)
+        points = smoothed.states.copy()
+        cuts[:] = False
+        for begin, end in gaps:
+            found = self._bridge(begin, end, as_sampled, points, smoothed)
+            cuts[end] = found.path is None
+            variances[begin + 1 : end + 1] *= max(1.0, found.looser / looser_in_gaps)
+        # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
+        # too far off on its way for its derivatives to hold.
+        for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
+            account = self._forward(variances, points, cuts, history)
+            smoothed = Smoothed(*smooth_backward(history))
+            points = smoothed.states.copy()
+        for begin, end in gaps:
+            if cuts[end]:
+                self._anchor(begin, end, variances, smoothed)
+        return smoothed.states, smoothed.covariances, account
+
+    def _bridge(
+        self, begin: int, end: int, variances: FloatArray, points: FloatArray, smoothed: Smoothed
+    ) -> Bridge:
+        """Bridge a gap that was cut with points, if possible.
+
+        The number of whole turns by which headings differ is that with the least noise.
+        """
+        gap = slice(begin, end + 1)
+        found = bridge(
+            self.controls[gap],
+            variances[gap],
+            points[begin:end],
+            smoothed.covariances[begin],
+            points[end, :POSE],
+            smoothed.covariances[end, :POSE, :POSE],
+            self.gate(),
+        )
+        if found.path is None:
+            return found
+        points[begin:end] = found.path[:-1]
+        # Whole turns, so that headings continue without a jump.
+        turns = np.round((found.path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
+        points[end:, 2] += 2.0 * math.pi * turns
+        return found
+
+    def _anchor(self, begin: int, end: int, variances: FloatArray, smoothed: Smoothed) -> None:
+        """Determine the second half of a gap that was cut from the measurements after it."""
+        gap = slice(begin, end + 1)
+        states, spreads = back_from(
+            self.controls[gap],
+            variances[gap],
+            smoothed.states[end],
+            smoothed.covariances[end],
+        )
+        way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
+        half = int(np.searchsorted(way, 0.5 * (way[0] + way[-1]))) + 1
+        smoothed.states[begin + half : end] = states[half:-1]
+        smoothed.covariances[begin + half : end] = spreads[half:-1]
+
+    def gate(self) -> float:
+        """Largest squared normalised innovation."""
+        return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
+
+    def _variances(self, noise: FloatArray) -> FloatArray:
+        """(N, 3) what odometry's random errors sum up to."""
+        return variances_of(self.times_s, self.controls, self.unseen, noise, self.settings)
+
+    def _forward(
+        self,
+        variances: FloatArray,
+        points: FloatArray,
+        cuts: NDArray[np.bool_],
+        history: FilterHistory | None,
+        systematic: tuple[FloatArray, FloatArray] | None = None,
+    ) -> MeasurementAccount:
+        means, deviations = systematic or (np.zeros(3), self.settings.systematic_sigmas())
+        return MeasurementAccount(
+            *filter_forward(
+                Odometry(self.controls, variances),
+                np.concatenate([self.measured[0], means]),
+                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
+                MeasuredPoses(self.nodes, self.measured, self.covariances),
+                Gating(
+                    self.gate(),
+                    _RESTART_AFTER,
+                    _RESTART_VARIANCES,
+                    _LOST_VARIANCE if len(points) == 1 else math.inf,
+                    cuts,
+                ),
+                points,
+                empty_history(0) if history is None else history,
+            )
+        )
+
+
+def movement_problem(
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
+) -> MovementProblem:
+    """Bring odometry and measured poses to common nodes.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        On the measurements' clock.
+    streams : mapping of str to PlanarPoses
+        Measured poses with covariances, by name.
+    settings : FuseSettings
+
+    Returns
+    -------
+    MovementProblem
+        From the first measurement within the odometry's time to the last.
+
+    Raises
+    ------
+    GroundTruthError
+        If there is no measurement within the odometry's time, a stream has no covariances, or one
+        of them cannot be repaired.
+    """
+    names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
+    odometry = last_of_each_time(odometry)
+    inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
+    node_times = np.union1d(inside, times)
+    controls, unseen = movements(odometry, node_times, settings)
+    return MovementProblem(
+        times_s=node_times,
+        controls=controls,
+        unseen=unseen,
+        nodes=np.searchsorted(node_times, times).astype(np.int64),
+        measured=measured,
+        covariances=covariances,
+        streams=tuple(names),
+        repaired=repaired,
+        repeated=repeated,
+        settings=settings,
+    )

@@ -1,0 +1,85 @@
+"""Rigid motions of the plane as (x, y, theta): composition, inverse, points, covariances.
+
+A pose `a_from_b` takes points of frame b to frame a. Metres and radians; stacks of any leading
+shape. Covariances are those of (x, y, theta) themselves, as in the streams of poses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
+
+def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
+    """(..., 3) poses a_from_c; the heading is wrapped."""
+    a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def invert(a_from_b: ArrayLike) -> FloatArray:
+    """(..., 3) poses b_from_a."""
+    a = np.asarray(a_from_b, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -(c * a[..., 0] + s * a[..., 1])
+    y = -(-s * a[..., 0] + c * a[..., 1])
+    return np.stack([x, y, wrap_angle(-a[..., 2])], axis=-1)
+
+
+def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
+    """(..., 3) poses a_from_b of two poses in one world; the heading is wrapped."""
+    a, b = np.asarray(world_from_a, dtype=np.float64), np.asarray(world_from_b, dtype=np.float64)
+    # The difference is turned, not each pose: far from the origin that keeps more digits.
+    apart = b - a
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = c * apart[..., 0] + s * apart[..., 1]
+    y = -s * apart[..., 0] + c * apart[..., 1]
+    return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
+
+
+def log_motion(a_from_b: ArrayLike) -> FloatArray:
+    """(..., 3) constant rates vx, vy, turn that lead from a to b within one unit of time.
+
+    They are those of the moving frame itself, so that way and turn are those of an arc.
+    """
+    pose = np.asarray(a_from_b, dtype=np.float64)
+    half = 0.5 * wrap_angle(pose[..., 2])
+    small = np.abs(half) < 1e-3
+    cotangent = np.where(small, 1.0 - half**2 / 3.0, half / np.tan(np.where(small, 1.0, half)))
+    return np.stack(
+        [
+            cotangent * pose[..., 0] + half * pose[..., 1],
+            cotangent * pose[..., 1] - half * pose[..., 0],
+            2.0 * half,
+        ],
+        axis=-1,
+    )
+
+
+def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
+    """(n, 2) points of frame b taken to frame a by one pose."""
+    a, p = np.asarray(a_from_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.stack(
+        [a[0] + c * p[..., 0] - s * p[..., 1], a[1] + s * p[..., 0] + c * p[..., 1]], -1
+    )
+
+
+def composed_covariance(
+    a_from_b: FloatArray,
+    covariance_a: FloatArray,
+    b_from_c: FloatArray,
+    covariance_b: FloatArray,
+) -> FloatArray:
+    """(3, 3) covariance of a_from_c = a_from_b composed with b_from_c, with independent errors."""
+    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
+    dx, dy = c * b_from_c[0] - s * b_from_c[1], s * b_from_c[0] + c * b_from_c[1]
+    first = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    second = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(first @ covariance_a @ first.T + second @ covariance_b @ second.T)

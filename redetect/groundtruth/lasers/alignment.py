@@ -1,0 +1,384 @@
+"""Poses of fixed scanners, aligned with each other and with the building, in steps.
+
+The order is that of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners by ICP; the scans merged
+one after the other; each scanner aligned again with the others' merged scans; all together until
+nothing moves; and the whole, then each scanner, to the building map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.plane import apply, between, compose, invert
+from redetect.groundtruth.lasers.icp import IcpSettings, icp_to_segments
+from redetect.groundtruth.lasers.icp_kernels import rigid_fit
+from redetect.groundtruth.lasers.icp_scan_kernels import align_scans, explained, scan_normals
+from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
+from redetect.landmarks import wrap_angle
+from redetect.storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
+
+FloatArray = NDArray[np.float64]
+
+#: Steps of the published order, by which results are named.
+STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
+
+_NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD = 0.4, 4, 0.2
+_JUDGED_M = 0.05
+_ROUNDS = 50
+#: Standard deviations of readings, wall and map together, as the fit to the map narrows (m).
+_NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
+_FLOOR_M = 0.001
+_WEAK_M = 0.02
+_LONE_STEPS = 30
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Settings of the scanners' alignment.
+
+    Parameters
+    ----------
+    gate_m : float
+        Farthest that a reading may lie from what it is matched with at first (m).
+    kept : float
+        Share of the matches that counts: the best.
+    turns_deg : tuple of float
+        Pairs are begun from the measured headings turned by these (deg).
+    inconsistent_m : float
+        A scanner whose place on the map is farther from that among the other scanners is named (m).
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is out of range.
+    """
+
+    gate_m: float = 0.5
+    kept: float = 0.95
+    turns_deg: tuple[float, ...] = (0.0, -2.0, 2.0, -4.0, 4.0)
+    inconsistent_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            GroundTruthError,
+            gate_m=ABOVE_0,
+            kept=SHARE_ABOVE_0,
+            turns_deg=from_to(-360.0, 360.0),
+            inconsistent_m=LIMIT_OR_0,
+        )
+        if not self.turns_deg:
+            raise GroundTruthError("turns_deg is empty: expected one or more")
+
+
+@dataclass(frozen=True, eq=False)
+class StillScan:
+    """Points of a scanner in the empty area, averaged over its scans.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        In the scanner's frame, in the order of the beams (m).
+    range_m : (n,) float64
+    direction : (n, 2) float64
+        Of the beams.
+    sigma_m : float
+        Of the averaged readings.
+    normals : (n, 2) float64
+    good : (n,) bool
+        Which normals are good.
+    """
+
+    points: FloatArray
+    range_m: FloatArray
+    direction: FloatArray
+    sigma_m: float
+    normals: FloatArray
+    good: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where the scanners were found.
+
+    Attributes
+    ----------
+    scanners : tuple of Scanner
+        With poses on the map and their covariances.
+    steps : dict of str to (scanners, 3) float64
+        Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
+    pairs : dict of (int, int) to float
+        Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1.
+    matched : (scanners,) int64
+        Number of beams that hit the map.
+    rms_m : (scanners,) float64
+        Their root mean square distance from it.
+    undetermined : tuple of str
+        Scanners whose view of the map leaves a direction open.
+    inconsistent : tuple of str
+        Scanners whose place on the map is not that among the others.
+    """
+
+    scanners: tuple[Scanner, ...]
+    steps: dict[str, FloatArray]
+    pairs: dict[tuple[int, int], float]
+    matched: NDArray[np.int64]
+    rms_m: FloatArray
+    undetermined: tuple[str, ...]
+    inconsistent: tuple[str, ...]
+
+
+def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
+    """Average the scans of the empty area.
+
+    Beams without a reading in half of the scans, and those along an edge, which see near and far
+    in turn, are left out; a beam's readings far off its median, which passed by, too.
+
+    Raises
+    ------
+    GroundTruthError
+        If fewer than ten beams see something.
+    """
+    metres = empty.ranges_mm * 1e-3
+    hit = scanner.has_return(empty.ranges_mm)
+    masked = np.where(hit, metres, np.nan)
+    usable = hit.sum(axis=0) >= max(1.0, 0.5 * len(empty))
+    median = np.full(scanner.readings, np.nan)
+    median[usable] = np.nanmedian(masked[:, usable], axis=0)
+    off = np.abs(masked - median)
+    close = off < 4.0 * max(scanner.sigma_m, 0.005)
+    count = close.sum(axis=0)
+    usable &= count >= 0.8 * hit.sum(axis=0)
+    if int(usable.sum()) < 10:
+        raise GroundTruthError(
+            f"scanner {scanner.name}: {int(usable.sum())} beams see something in the empty area: "
+            "expected 10 or more"
+        )
+    mean = np.where(close, metres, 0.0).sum(axis=0)[usable] / count[usable]
+    angle = scanner.angles_rad[usable]
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = np.ascontiguousarray(mean[:, None] * direction)
+    normals, good = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
+    sigma = max(scanner.sigma_m, 0.003) / math.sqrt(float(np.median(count[usable])))
+    return StillScan(points, mean, direction, sigma, normals, good)
+
+
+def align_scanners(
+    scanners: Sequence[Scanner],
+    empties: Sequence[Scans],
+    building: FloatArray,
+    settings: AlignmentSettings | None = None,
+) -> Alignment:
+    """Align fixed scanners with each other and with the building.
+
+    Parameters
+    ----------
+    scanners : sequence of Scanner
+        With poses measured by hand.
+    empties : sequence of Scans
+        Scans of the empty area, as many.
+    building : (k, 4) float64
+        The map's walls x1, y1, x2, y2 (m).
+    settings : AlignmentSettings, optional
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    GroundTruthError
+        If there are no scanners, or one sees nothing.
+    GeometryError
+        If a scanner's readings do not reach the map within the gate.
+    """
+    s = AlignmentSettings() if settings is None else settings
+    if not scanners or len(scanners) != len(empties):
+        raise GroundTruthError(f"{len(scanners)} scanners, {len(empties)} scans: expected as many")
+    scans = [still_scan(a, b) for a, b in zip(scanners, empties)]
+    measured = np.stack([scanner.pose for scanner in scanners])
+    steps: dict[str, FloatArray] = {}
+    shares, relative = _pairs(scans, measured, s)
+    steps["pairs"] = _chained(measured, shares, relative)
+    steps["merged"] = _merged(scans, steps["pairs"], shares, s)
+    steps["realigned"] = _round(scans, steps["merged"], s)
+    steps["together"] = _together(scans, steps["realigned"], s)
+    steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
+    found, matched, rms, weak = [], [], [], []
+    for scanner, scan, start in zip(scanners, scans, steps["map as a whole"]):
+        pose, covariance, summary = _to_map(scanner.name, scan, start, building, s)
+        found.append(replace(scanner, pose=pose, covariance=covariance))
+        matched.append(int(summary[0]))
+        rms.append(float(summary[3]))
+        if summary[2] > 0.0:
+            weak.append(scanner.name)
+    steps["each to the map"] = np.stack([scanner.pose for scanner in found])
+    moved = steps["each to the map"] - steps["map as a whole"]
+    far = np.hypot(moved[:, 0], moved[:, 1]) > s.inconsistent_m
+    names = tuple(scanner.name for scanner, is_far in zip(found, far) if is_far)
+    return Alignment(
+        tuple(found), steps, shares, np.array(matched), np.array(rms), tuple(weak), names
+    )
+
+
+def _gates(first_m: float, last_m: float, count: int) -> FloatArray:
+    return np.asarray(np.geomspace(first_m, last_m, count))
+
+
+def _pairs(
+    scans: list[StillScan], measured: FloatArray, s: AlignmentSettings
+) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], FloatArray]]:
+    """ICP of every pair, from the measured poses: shares explained, and poses j in i."""
+    shares: dict[tuple[int, int], float] = {}
+    relative: dict[tuple[int, int], FloatArray] = {}
+    gates = _gates(max(2.0 * s.gate_m, 0.1), 0.1, 12)
+    for i in range(len(scans)):
+        for j in range(i + 1, len(scans)):
+            best = (-1.0, between(measured[i], measured[j]))
+            for turn in s.turns_deg:
+                start = between(measured[i], measured[j]) + np.array([0.0, 0.0, math.radians(turn)])
+                pose, _, _ = align_scans(
+                    scans[j].points, scans[i].points, scans[i].normals, scans[i].good, start,
+                    gates, s.kept, 1e-6,
+                )  # fmt: skip
+                if np.isfinite(pose).all():
+                    share = explained(scans[j].points, scans[i].points, pose, _JUDGED_M)
+                    best = max(best, (share, pose), key=lambda entry: entry[0])
+            shares[i, j], relative[i, j] = max(best[0], 0.0), best[1]
+    return shares, relative
+
+
+def _chained(
+    measured: FloatArray,
+    shares: dict[tuple[int, int], float],
+    relative: dict[tuple[int, int], FloatArray],
+) -> FloatArray:
+    """Poses by the pairs that agree best, from the first scanner, whose pose stays."""
+    poses = measured.copy()
+    placed = [0]
+    while len(placed) < len(measured):
+        pair = max(
+            (p for p in shares if (p[0] in placed) != (p[1] in placed)), key=lambda p: shares[p]
+        )
+        i, j = pair
+        if i in placed:
+            poses[j] = compose(poses[i], relative[pair])
+            placed.append(j)
+        else:
+            poses[i] = compose(poses[j], invert(relative[pair]))
+            placed.append(i)
+    return poses
+
+
+def _merge(
+    scans: list[StillScan], poses: FloatArray, members: list[int]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Points, normals and which of these are good, of several scans in one frame."""
+    turned = [apply(np.array([0.0, 0.0, poses[k][2]]), scans[k].normals) for k in members]
+    return (
+        np.concatenate([apply(poses[k], scans[k].points) for k in members]),
+        np.concatenate(turned),
+        np.concatenate([scans[k].good for k in members]),
+    )
+
+
+def _align_one(
+    scans: list[StillScan], poses: FloatArray, k: int, members: list[int], gates: FloatArray,
+    s: AlignmentSettings,
+) -> FloatArray:  # fmt: skip
+    points, normals, good = _merge(scans, poses, members)
+    pose, _, _ = align_scans(scans[k].points, points, normals, good, poses[k], gates, s.kept, 1e-7)
+    return pose if np.isfinite(pose).all() else poses[k]
+
+
+def _merged(
+    scans: list[StillScan], poses: FloatArray, shares: dict[tuple[int, int], float],
+    s: AlignmentSettings,
+) -> FloatArray:  # fmt: skip
+    """One scan after the other, best overlapping first, aligned with those merged already."""
+    poses = poses.copy()
+    members = [0]
+    while len(members) < len(scans):
+        outside = [k for k in range(len(scans)) if k not in members]
+        k = max(outside, key=lambda k: max(shares[min(k, m), max(k, m)] for m in members))
+        poses[k] = _align_one(scans, poses, k, members, _gates(s.gate_m, 0.08, 8), s)
+        members.append(k)
+    return poses
+
+
+def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
+    """Each scanner but the first aligned again with the merged scans of all others."""
+    poses = poses.copy()
+    for k in range(1, len(scans)):
+        others = [m for m in range(len(scans)) if m != k]
+        poses[k] = _align_one(scans, poses, k, others, _gates(0.15, 0.06, 4), s)
+    return poses
+
+
+def _together(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
+    """Rounds until no scanner moves."""
+    for _ in range(_ROUNDS):
+        before = poses
+        poses = _round(scans, poses, s)
+        if np.abs(poses - before).max() < 1e-5:
+            break
+    return poses
+
+
+def _whole_to_map(
+    scans: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    s: AlignmentSettings,
+) -> FloatArray:  # fmt: skip
+    """All scanners as one rigid body on the map, from where they were measured."""
+    if len(poses) > 1:
+        body = rigid_fit(poses[:, :2].copy(), measured[:, :2].copy(), np.ones(len(poses), bool))
+    else:
+        body = compose(measured[0], invert(poses[0]))
+    everything, _, _ = _merge(scans, poses, list(range(len(scans))))
+    for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
+        body = icp_to_segments(everything, building, body, IcpSettings(gate, s.kept, 1e-5)).pose
+    return compose(np.broadcast_to(body, poses.shape), poses)
+
+
+def _to_map(
+    name: str, scan: StillScan, start: FloatArray, building: FloatArray, s: AlignmentSettings
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pose of one scanner on the map, its covariance, and the fit's summary.
+
+    The kernel moves faces to points: here the map to the scanner's frame. Walls are seen from both
+    sides. Readings of objects in front of a wall are far from the wall that the beam would hit, and
+    are excluded as the gate narrows.
+    """
+    faces = np.vstack([building, building[:, [2, 3, 0, 1]]])
+    lone = np.zeros(len(scan.points), dtype=np.int64)
+    seen = Seen(scan.points, lone, scan.direction, scan.range_m)
+    pose, floor = invert(start), _FLOOR_M
+    for narrow in (*(n for n in _NARROWING_M if n <= s.gate_m), _FLOOR_M, 0.0):
+        # Last, the residuals themselves say how large the errors are.
+        floor = narrow if narrow > 0.0 else floor
+        fit = OutlineFit(floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M, 1.0, _LONE_STEPS)
+        result = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
+        pose, covariance, summary = result[0], result[1], result[3]
+        if summary[0] < 10:
+            raise GeometryError(
+                f"scanner {name}: {summary[0]:.0f} readings lie on the map: expected 10 or more"
+            )
+        if narrow == _FLOOR_M:
+            ratio = summary[1] / (summary[0] - 3.0)
+            floor = max(_FLOOR_M * math.sqrt(max(ratio, 1.0)), _FLOOR_M)
+    ratio = max(summary[1] / (summary[0] - 3.0), 0.1)
+    world = invert(pose)
+    # The inverse's covariance: x' = -R' t and theta' = -theta.
+    c, sn = math.cos(world[2]), math.sin(world[2])
+    jacobian = np.array([[-c, sn, world[1]], [-sn, -c, -world[0]], [0.0, 0.0, -1.0]])
+    covariance = ratio * jacobian @ covariance @ jacobian.T
+    world[2] = wrap_angle(world[2])
+    return world, 0.5 * (covariance + covariance.T), summary

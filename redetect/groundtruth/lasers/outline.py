@@ -1,0 +1,135 @@
+"""The robot's outline: faces with outward normals, and the motions that map it onto itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.icp_kernels import moved, nearest_on_segments, rigid_fit
+
+FloatArray = NDArray[np.float64]
+
+
+def outline_faces(outline: ArrayLike) -> FloatArray:
+    """Faces of a closed outline, counter-clockwise: their outward normal is to the right.
+
+    Parameters
+    ----------
+    outline : (k, 2) array
+        Corners in order, either way round (m).
+
+    Returns
+    -------
+    (k, 4) float64
+        x1, y1, x2, y2.
+
+    Raises
+    ------
+    GroundTruthError
+        If there are fewer than three corners, two that follow each other are one, a number is not
+        finite, or faces cross.
+    """
+    corners = np.asarray(outline, dtype=np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise GroundTruthError(f"outline of shape {corners.shape}: expected (k, 2), k of 3 or more")
+    if not np.isfinite(corners).all():
+        raise GroundTruthError("outline with a number that is not finite")
+    following = np.roll(corners, -1, axis=0)
+    if np.any(np.hypot(*(following - corners).T) < 1e-6):
+        raise GroundTruthError("outline: two corners that follow each other are the same")
+    area = 0.5 * float(np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]))
+    if abs(area) < 1e-6:
+        raise GroundTruthError(f"outline: encloses {abs(area):g} m2")
+    if area < 0.0:
+        corners = corners[::-1]
+    faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
+    for i in range(len(faces)):
+        for j in range(i + 2, len(faces) - (i == 0)):
+            if _cross(faces[i], faces[j]):
+                raise GroundTruthError(f"outline: faces {i + 1} and {j + 1} cross")
+    return faces
+
+
+def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
+    """Middle (2,) of the outline's bounding box, and its farthest corner's distance from it (m)."""
+    corners = faces[:, :2]
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    return middle, float(np.max(np.hypot(*(corners - middle).T)))
+
+
+def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
+    """Motions other than none that map the outline onto itself.
+
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`.
+
+    Parameters
+    ----------
+    faces : (k, 4) array
+        From `outline_faces`.
+    tolerance_m : float
+        Largest distance that a point of the turned outline may have from the outline (m).
+
+    Returns
+    -------
+    (s, 3) float64
+        x, y (m), theta (rad), by rising theta from -pi on; s is 0 for an outline that shows where
+        the front is, 1 for a box, 3 for a square.
+    """
+    along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
+    points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)
+    points = np.ascontiguousarray(points)
+    # A symmetry keeps the centre of the area where it is.
+    x1, y1, x2, y2 = faces.T
+    twice = x1 * y2 - x2 * y1
+    centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
+    poses, errors = [], []
+    for degrees in range(-180, 180, 3):
+        angle = math.radians(degrees)
+        c, s = math.cos(angle), math.sin(angle)
+        turned = np.array([c * centre[0] - s * centre[1], s * centre[0] + c * centre[1]])
+        pose = np.array([*(centre - turned), angle])
+        poses.append(pose)
+        errors.append(_farthest_m(points, faces, pose))
+    found: list[FloatArray] = []
+    for i, error in enumerate(errors):
+        if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
+            continue
+        pose = _settled(points, faces, poses[i])
+        far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
+        if far and _farthest_m(points, faces, pose) <= tolerance_m:
+            found.append(pose)
+    return np.array(sorted(found, key=lambda p: p[2])).reshape(-1, 3)
+
+
+def _farthest_m(points: FloatArray, faces: FloatArray, pose: FloatArray) -> float:
+    _, _, squared = nearest_on_segments(moved(points, pose), faces)
+    return math.sqrt(float(squared.max()))
+
+
+def _settled(points: FloatArray, faces: FloatArray, start: FloatArray) -> FloatArray:
+    """Where an ICP of the whole outline to itself ends."""
+    everything = np.ones(len(points), dtype=np.bool_)
+    pose = start
+    for _ in range(200):
+        near, _, _ = nearest_on_segments(moved(points, pose), faces)
+        pose = rigid_fit(points, near, everything)
+    pose[2] = _turn(pose[2])
+    return pose
+
+
+def _turn(angle: float) -> float:
+    """An angle taken to [-pi, pi), -pi also where rounding made it just less than pi."""
+    return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
+
+
+def _cross(a: FloatArray, b: FloatArray) -> bool:
+    def side(face: FloatArray, x: float, y: float) -> float:
+        return float((face[2] - face[0]) * (y - face[1]) - (face[3] - face[1]) * (x - face[0]))
+
+    return (
+        side(a, b[0], b[1]) * side(a, b[2], b[3]) < 0.0
+        and side(b, a[0], a[1]) * side(b, a[2], a[3]) < 0.0
+    )

@@ -1,0 +1,396 @@
+"""Tracking the robot by fixed scanners, one set of scans after the other.
+
+Per set: select the readings that are new against the background and within the robot's reach; run a
+trimmed ICP of the outline from the predicted pose; refine the result to the most likely pose; check
+that the beams agree. Errors of one set affect the next one's pose only through its start.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.geometry.plane import compose
+from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine
+from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
+from redetect.groundtruth.lasers.settings import LaserSettings
+from redetect.groundtruth.lasers.tracking_kernels import Seen, fit_outline, new_points
+from redetect.landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
+STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
+
+#: Gains of the filter that only says where the next set starts.
+_POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
+
+_VELOCITY_WINDOW_S = 0.3
+_LARGEST_CHI2 = 9.0
+_FRONT_SAMPLE = 60
+
+
+@dataclass(frozen=True, eq=False)
+class LaserTrack:
+    """Result for every set of scans.
+
+    Attributes
+    ----------
+    times_s : (N,) float64
+    status : (N,) int64
+        Index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
+        direction where it is UNDETERMINED.
+    segment : (N,) int64
+        Number of the acquisition that the set belongs to; -1 where the robot is lost.
+    poses : (N, 3) float64
+        x, y (m), theta (rad); NaN without a pose.
+    covariances : (N, 3, 3) float64
+        Of (x, y, theta), from the readings' noise and the scanners' poses.
+    noise : (N, 3, 3) float64
+        The part from the readings' noise, independent from set to set.
+    motion : (N, 3) float64
+        Velocity (m/s) and turn (rad/s) in the world, from the poses before and after.
+    readings : (N,) int64
+        Readings that the pose rests on.
+    rms_m : (N,) float64
+        Their root mean square distance from the outline.
+    chi2 : (N,) float64
+        Their squared normalised residuals per degree of freedom.
+    beams : (N, 6) float64
+        As in `redetect.groundtruth.lasers.tracking_kernels.explain_set`.
+    weak : (N, 3) float64
+        The least determined direction of (x, y, theta times the outline's radius), where it is
+        UNDETERMINED.
+    reasons : dict of int to str
+        Why a set has no pose, where the robot was expected.
+    corrections : (scanners, 3) float64
+        Corrections of the scanners' given poses that their residuals suggest.
+    correction_sigma : (scanners, 3) float64
+    """
+
+    times_s: FloatArray
+    status: IntArray
+    segment: IntArray
+    poses: FloatArray
+    covariances: FloatArray
+    noise: FloatArray
+    motion: FloatArray
+    readings: IntArray
+    rms_m: FloatArray
+    chi2: FloatArray
+    beams: FloatArray
+    weak: FloatArray
+    reasons: dict[int, str]
+    corrections: FloatArray
+    correction_sigma: FloatArray
+    fronts: dict[int, str] = field(default_factory=dict)
+
+
+class Tracker:
+    """Follows the robot through sets of scans.
+
+    Parameters
+    ----------
+    sets : ScanSets
+    tables : ScannerTables
+    body : Body
+    largest_speed_m_s, largest_turn_rad_s : float
+        The robot moves no faster.
+    settings : LaserSettings, optional
+    """
+
+    def __init__(
+        self,
+        sets: ScanSets,
+        tables: ScannerTables,
+        body: Body,
+        largest_speed_m_s: float,
+        largest_turn_rad_s: float,
+        settings: LaserSettings | None = None,
+    ) -> None:
+        self.sets, self.tables, self.body = sets, tables, body
+        self.speed, self.turn = largest_speed_m_s, largest_turn_rad_s
+        self.settings = LaserSettings() if settings is None else settings
+        n, many = len(sets), len(tables.names)
+        self.seen_by = tables.as_beams()
+        self.status = np.full(n, LOST, dtype=np.int64)
+        self.segment = np.full(n, -1, dtype=np.int64)
+        self.poses = np.full((n, 3), np.nan)
+        self.covariances = np.full((n, 3, 3), np.nan)
+        self.noise = np.full((n, 3, 3), np.nan)
+        self.motion = np.zeros((n, 3))
+        self.readings = np.zeros(n, dtype=np.int64)
+        self.rms_m, self.chi2 = np.full(n, np.nan), np.full(n, np.nan)
+        self.beams, self.weak = np.zeros((n, 6)), np.zeros((n, 3))
+        self.reasons: dict[int, str] = {}
+        self.prior_m = np.full(n, 0.02)
+        self.information = np.zeros((many, 3, 3))
+        self.gradient = np.zeros((many, 3))
+
+    def run(self) -> LaserTrack:
+        """Track, resolve the front, and work the poses out again with their motion known."""
+        times = self.sets.times_s
+        pose, motion = np.zeros(3), np.zeros(3)
+        last = before = sure = looked = -math.inf
+        segment, begun = -1, 0
+        tracked = False
+        for i, t in enumerate(times.tolist()):
+            if tracked and t - last > self.settings.coast_s:
+                tracked = False
+            if not tracked:
+                if t - looked < self.settings.acquire_s:
+                    continue
+                looked = t
+                found = acquire(self.sets, i, self.tables, self.body, self.settings)
+                if found is None:
+                    continue
+                fitted = self._fit(i, found, np.zeros(3), 0.0)
+                if fitted is None:
+                    continue
+                pose, motion, segment, tracked = fitted, np.zeros(3), segment + 1, True
+                last, before, sure, begun = t, t, t, i
+                self.segment[i] = segment
+                self.status[i] = REACQUIRED if self.status[i] == OK else self.status[i]
+                continue
+            step = t - before
+            before = t
+            predicted = pose + motion * step
+            self.segment[i] = segment
+            # Undetermined directions: as uncertain as the motion since they were last determined.
+            self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - sure)
+            fitted = self._fit(i, predicted, motion, t - last)
+            if fitted is None:
+                self.status[i], pose = COASTING, predicted
+                continue
+            error = fitted - predicted
+            error[2] = wrap_angle(error[2])
+            # At first no motion is known: it follows the poses more quickly.
+            young = max(0.0, 1.0 - (i - begun) / 12.0)
+            pose = predicted + (_POSE_GAIN + (1.0 - _POSE_GAIN) * young) * error
+            if step > 0.0:
+                motion = motion + (_MOTION_GAIN + 0.3 * young) / step * error
+            last = t
+            sure = t if self.status[i] == OK else sure
+        return self._finished()
+
+    def _fit(
+        self, i: int, predicted: FloatArray, motion: FloatArray, alone_s: float
+    ) -> FloatArray | None:
+        """Pose of set i, or None and the reason."""
+        s, body = self.settings, self.body
+        seen = self._points(i, predicted, motion, alone_s)
+        if len(seen.points) < s.least_readings:
+            self.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
+            return None
+        start, _, count, _ = fit_outline(
+            seen.points, body.faces, predicted, s.gate_m, s.kept, s.threshold_m, s.most_steps
+        )
+        if count < s.least_readings:
+            self.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
+            return None
+        pose, summary = self._refine(i, seen, start)
+        used, chi2 = summary[0], summary[1]
+        if used < s.least_readings:
+            self.reasons[i] = f"{used:.0f} readings on the outline"
+            return None
+        if chi2 > _LARGEST_CHI2 * (used - 3.0):
+            self.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used:.0f} readings"
+            return None
+        far = math.hypot(pose[0] - predicted[0], pose[1] - predicted[1])
+        if far > 0.1 + 2.0 * self.speed * alone_s:
+            self.reasons[i] = f"{far:.2f} m from where the robot should be"
+            return None
+        beams = self._explain(i, pose)
+        if beams[2] > 0.25 * (beams[1] + beams[2]) + 2.0:
+            self.reasons[i] = f"{beams[2]:.0f} beams see through the robot, {beams[1]:.0f} see it"
+            return None
+        self._store(i, pose, summary, beams)
+        return pose
+
+    def _points(self, i: int, pose: FloatArray, motion: FloatArray, alone_s: float) -> Seen:
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x, y = self.body.middle
+        centre = np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y])
+        reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
+        about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
+        return Seen(
+            *new_points(
+                self.sets.ranges_mm, self.sets.rows[i], self.seen_by, centre, reach, about,
+                self.sets.ages_s[i],
+            )
+        )  # fmt: skip
+
+    def _refine(self, i: int, seen: Seen, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        tables = self.tables
+        found = refine(seen, start, tables, self.body, self.settings, float(self.prior_m[i]))
+        calibration = found.by_scanner @ tables.covariance @ found.by_scanner.T
+        self.noise[i] = found.covariance
+        self.covariances[i] = found.covariance + calibration
+        self.weak[i] = found.weak
+        self._evidence = found.information, found.gradient
+        return found.pose, found.summary
+
+    def _explain(self, i: int, pose: FloatArray) -> FloatArray:
+        return explain(self.sets, i, self.tables, self.body, pose)
+
+    def _store(self, i: int, pose: FloatArray, summary: FloatArray, beams: FloatArray) -> None:
+        self.poses[i] = pose
+        self.poses[i, 2] = wrap_angle(pose[2])
+        self.readings[i], self.rms_m[i] = int(summary[0]), summary[3]
+        self.chi2[i] = summary[1] / max(summary[0] - 3.0, 1.0)
+        self.beams[i] = beams
+        self.status[i] = UNDETERMINED if summary[2] > 0 else OK
+
+    def _finished(self) -> LaserTrack:
+        good = np.flatnonzero(np.isfinite(self.poses[:, 0]))
+        fronts: dict[int, str] = {}
+        for segment in np.unique(self.segment[good]).tolist():
+            rows = good[self.segment[good] == segment]
+            velocity = _velocities(self.sets.times_s[rows], self.poses[rows])
+            fronts[segment] = self._front(rows, velocity)
+            velocity = _velocities(self.sets.times_s[rows], self.poses[rows])
+            self.motion[rows] = velocity
+            for row, motion in zip(rows.tolist(), velocity):
+                self._again(row, motion)
+        good = good[np.isfinite(self.poses[good, 0])]
+        scale = self._scales(good)
+        for covariances in (self.covariances, self.noise):
+            covariances[good] *= scale[:, None, None]
+        corrections, sigma = self._corrections()
+        return LaserTrack(
+            self.sets.times_s, self.status, self.segment, self.poses, self.covariances,
+            self.noise, self.motion, self.readings, self.rms_m, self.chi2, self.beams, self.weak,
+            self.reasons, corrections, sigma, fronts,
+        )  # fmt: skip
+
+    def _again(self, i: int, motion: FloatArray) -> None:
+        """The pose once more, from the motion before *and* after it."""
+        status = int(self.status[i])
+        seen = self._points(i, self.poses[i], motion, 0.0)
+        refined, summary = self._refine(i, seen, self.poses[i].copy())
+        if summary[0] < self.settings.least_readings:
+            self.reasons[i] = f"{summary[0]:.0f} readings on the outline"
+            self.status[i], self.poses[i] = COASTING, np.nan
+            return
+        self._store(i, refined, summary, self._explain(i, refined))
+        # Keeps what the whole visit, or its first set, has determined.
+        if status == UNRESOLVED or (status == REACQUIRED and self.status[i] == OK):
+            self.status[i] = status
+        self.information += self._evidence[0]
+        self.gradient += self._evidence[1]
+
+    def _front(self, rows: IntArray, velocity: FloatArray) -> str:
+        """Choose among the poses that the outline hardly distinguishes; returns the criterion.
+
+        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
+        motion: robots drive forward.
+        """
+        if len(self.body.symmetries) == 0:
+            return "outline"
+        choices = [np.zeros(3), *self.body.symmetries]
+        sample = rows[np.unique(np.linspace(0, len(rows) - 1, _FRONT_SAMPLE).astype(np.int64))]
+        costs = np.array([[self._cost(i, choice) for choice in choices] for i in sample.tolist()])
+        best = int(np.argmin(costs.mean(axis=0)))
+        worse = np.delete(costs, best, axis=1) - costs[:, best : best + 1]
+        error = worse.std(axis=0) / math.sqrt(len(sample)) + 1e-9
+        by = f"outline, by {float(np.min(worse.mean(axis=0) / error)):.0f} sigma"
+        if np.min(worse.mean(axis=0) / error) < self.settings.front_sigma:
+            ahead = self._ahead(rows, velocity, choices)
+            order = np.argsort(ahead)[::-1]
+            best = int(order[0])
+            by = f"driven forward, {ahead[best]:.2f} m"
+            if ahead[best] - ahead[int(order[1])] < 2.0 * self.settings.forward_m:
+                self.status[rows] = UNRESOLVED
+                return "unknown: the outline does not show it and the robot hardly drove"
+        if best > 0:
+            self.poses[rows] = compose(self.poses[rows], choices[best])
+            for i in rows.tolist():
+                seen = self._points(i, self.poses[i], np.zeros(3), 0.0)
+                self.poses[i] = fit_outline(
+                    seen.points, self.body.faces, self.poses[i], self.settings.gate_m,
+                    self.settings.kept, self.settings.threshold_m, self.settings.most_steps,
+                )[0]  # fmt: skip
+        return by
+
+    def _cost(self, i: int, choice: FloatArray) -> float:
+        """Squared normalised residuals of set i from a choice of its front, those gated at most."""
+        s, body = self.settings, self.body
+        start = compose(self.poses[i], choice)
+        seen = self._points(i, start, np.zeros(3), 0.0)
+        start, _, _, _ = fit_outline(
+            seen.points, body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
+        )
+        found = refine(seen, start, self.tables, body, s, 0.02)
+        _, _, through, hidden, _, beside = self._explain(i, found.pose)
+        return float(found.summary[1] + s.gate_sigma**2 * (through + hidden + beside))
+
+    def _ahead(
+        self, rows: IntArray, velocity: FloatArray, choices: list[FloatArray]
+    ) -> list[float]:
+        """How far the robot drove forward, by every choice of its front (m)."""
+        times, poses = self.sets.times_s[rows], self.poses[rows]
+        step = np.diff(times, append=times[-1])
+        ahead = []
+        for choice in choices:
+            heading = poses[:, 2] + choice[2]
+            # The same motion at the place that would be the robot's origin.
+            arm = compose(poses, np.broadcast_to(choice, poses.shape))[:, :2] - poses[:, :2]
+            vx = velocity[:, 0] - velocity[:, 2] * arm[:, 1]
+            vy = velocity[:, 1] + velocity[:, 2] * arm[:, 0]
+            ahead.append(float(np.sum((np.cos(heading) * vx + np.sin(heading) * vy) * step)))
+        return ahead
+
+    def _scales(self, good: IntArray) -> FloatArray:
+        """Factors on the covariances where residuals are larger than the scanners' noise.
+
+        The residuals of half a second; one set's alone would say too little.
+        """
+        scale = np.ones(len(good))
+        freedom = np.maximum(self.readings[good] - 3.0, 1.0)
+        chi2 = self.chi2[good] * freedom
+        for i in range(len(good)):
+            first, last = max(0, i - 18), i + 19
+            part = slice(first, last)
+            total = float(freedom[part].sum())
+            ratio = float(chi2[part].sum()) / total
+            # Within its own scatter a ratio above 1 is none.
+            scale[i] = ratio if ratio > 1.0 + 4.0 * math.sqrt(2.0 / total) else 1.0
+        return scale
+
+    def _corrections(self) -> tuple[FloatArray, FloatArray]:
+        many = len(self.tables.names)
+        corrections = np.full((many, 3), np.nan)
+        sigma = np.full((many, 3), np.nan)
+        for k in range(many):
+            full = self.information[k] + np.tril(self.information[k], -1).T
+            values, vectors = np.linalg.eigh(full)
+            if values[0] > 1e-9 * max(values[2], 1e-9) and values[0] > 0.0:
+                covariance = (vectors / values) @ vectors.T
+                corrections[k] = -covariance @ self.gradient[k]
+                sigma[k] = np.sqrt(np.diag(covariance))
+        return corrections, sigma
+
+
+def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
+    """(n, 3) slopes of lines through the poses of the window round each time."""
+    values = poses.copy()
+    values[:, 2] = np.unwrap(poses[:, 2])
+    out = np.zeros_like(values)
+    first = np.searchsorted(times_s, times_s - _VELOCITY_WINDOW_S)
+    last = np.searchsorted(times_s, times_s + _VELOCITY_WINDOW_S, side="right")
+    origin = times_s[0] if len(times_s) else 0.0
+    t = times_s - origin
+    sums = [
+        np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v, axis=0)])
+        for v in (t[:, None], t[:, None] ** 2, values, values * t[:, None])
+    ]
+    n = (last - first)[:, None].astype(np.float64)
+    st, stt, sx, stx = (total[last] - total[first] for total in sums)
+    spread = stt - st * st / n
+    enough = (n[:, 0] > 4) & (spread[:, 0] > 1e-6)
+    out[enough] = ((stx - st * sx / n) / np.where(spread > 0.0, spread, 1.0))[enough]
+    return out

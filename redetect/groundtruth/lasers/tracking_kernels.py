@@ -1,0 +1,454 @@
+"""Kernels of laser tracking: new readings in a set of scans, and their fit to the robot.
+
+A set of scans is a row of `ranges` per scanner (-1: none). Poses are (x, y, theta) of the robot in
+the world; its faces (k, 4) run counter-clockwise in its own frame, so that outward normals are to
+their right. Tables per scanner are padded to the longest scan.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from redetect.groundtruth.lasers.icp_kernels import nearest_on_segments, rigid_fit
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Beams(NamedTuple):
+    """The beams of all scanners.
+
+    Attributes
+    ----------
+    near_mm : (scanners, readings) float64
+        Below this a reading is new: nearer than the background.
+    direction : (scanners, readings, 2) float64
+        In the world.
+    origins : (scanners, 2) float64
+        In the world (m).
+    """
+
+    near_mm: FloatArray
+    direction: FloatArray
+    origins: FloatArray
+
+
+class Seen(NamedTuple):
+    """New readings of a set of scans.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        In the world (m).
+    scanner : (n,) int64
+    direction : (n, 2) float64
+        Of the beams.
+    range_m : (n,) float64
+    """
+
+    points: FloatArray
+    scanner: IntArray
+    direction: FloatArray
+    range_m: FloatArray
+
+    def where(self, chosen: NDArray[np.bool_]) -> Seen:
+        """Those chosen."""
+        return Seen(
+            self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]
+        )
+
+
+class OutlineFit(NamedTuple):
+    """How an outline is fitted.
+
+    Attributes
+    ----------
+    floor_m : float
+        Standard deviation of what the outline and the scanner are not.
+    least_slope : float
+        Beams that graze a face count as if they met it at this sine.
+    gate_sigma, gate_m : float
+        Readings farther off do not count; metres in the first step.
+    prior_sigma_m : float
+        With it, open directions hold on to the start.
+    weak_sigma_m : float
+        Directions along which the standard deviation would be larger are open.
+    scale_m : float
+        A radian counts as this.
+    steps : int
+        At most.
+    """
+
+    floor_m: float
+    least_slope: float
+    gate_sigma: float
+    gate_m: float
+    prior_sigma_m: float
+    weak_sigma_m: float
+    scale_m: float
+    steps: int
+
+
+@njit(cache=True, error_model="numpy")
+def new_points(
+    ranges_mm: NDArray[np.uint16],
+    rows: IntArray,
+    beams: Beams,
+    centre: FloatArray,
+    reach_m: float,
+    motion: FloatArray,
+    ages_s: FloatArray,
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Points of a set that are nearer than the background and within reach of a place.
+
+    Parameters
+    ----------
+    ranges_mm : (scans, readings) uint16
+    rows : (scanners,) int64
+        Each scanner's scan of the set.
+    beams : Beams
+    centre : (2,)
+        Points farther than `reach_m` from here are left out.
+    motion : (5,)
+        Of the robot: velocity (m/s), turn (rad/s), and the point it turns about at the set's time.
+    ages_s : (scanners,)
+        The set's time minus the scan's: the points are moved on by as much.
+
+    Returns
+    -------
+    points : (n, 2)
+        In the world (m).
+    scanner : (n,) int64
+    direction : (n, 2)
+        Of the beams that saw them.
+    range_m : (n,)
+        Their readings.
+    """
+    most = rows.size * ranges_mm.shape[1]
+    points = np.empty((most, 2))
+    scanner = np.empty(most, dtype=np.int64)
+    direction = np.empty((most, 2))
+    range_m = np.empty(most)
+    n = 0
+    for s in range(rows.size):
+        if rows[s] < 0:
+            continue
+        age = ages_s[s]
+        c, sn = math.cos(motion[2] * age), math.sin(motion[2] * age)
+        # Where the robot was at the scan's time.
+        then_x, then_y = motion[3] - motion[0] * age, motion[4] - motion[1] * age
+        for i in range(ranges_mm.shape[1]):
+            r = float(ranges_mm[rows[s], i])
+            if r <= 0.0 or r >= beams.near_mm[s, i]:
+                continue
+            x = beams.origins[s, 0] + 1e-3 * r * beams.direction[s, i, 0]
+            y = beams.origins[s, 1] + 1e-3 * r * beams.direction[s, i, 1]
+            dx, dy = x - centre[0], y - centre[1]
+            if dx * dx + dy * dy > reach_m * reach_m:
+                continue
+            dx, dy = x - then_x, y - then_y
+            points[n, 0] = motion[3] + c * dx - sn * dy
+            points[n, 1] = motion[4] + sn * dx + c * dy
+            bx, by = beams.direction[s, i, 0], beams.direction[s, i, 1]
+            direction[n, 0], direction[n, 1] = c * bx - sn * by, sn * bx + c * by
+            scanner[n] = s
+            range_m[n] = 1e-3 * r
+            n += 1
+    return points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def to_robot(points: FloatArray, pose: FloatArray) -> FloatArray:
+    """Points of the world in the robot's frame."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    out = np.empty_like(points)
+    for i in range(points.shape[0]):
+        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
+        out[i, 0], out[i, 1] = c * dx + s * dy, -s * dx + c * dy
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def fit_outline(
+    points: FloatArray,
+    faces: FloatArray,
+    start: FloatArray,
+    gate_m: float,
+    kept: float,
+    threshold_m: float,
+    most_steps: int,
+) -> tuple[FloatArray, float, int, int]:
+    """Trimmed ICP of the outline to points: pose, root mean square error, pairs used, steps.
+
+    Every step pairs each point with the nearest point of the outline within the gate, keeps the
+    best share and fits by singular values, until the error changes by less than the threshold.
+    """
+    pose = start.copy()
+    before = np.inf
+    rms, count, step = np.inf, 0, 0
+    used = np.zeros(points.shape[0], dtype=np.bool_)
+    while True:
+        nearest, _, squared = nearest_on_segments(to_robot(points, pose), faces)
+        limit = gate_m * gate_m
+        within = squared[squared <= limit]
+        if within.size < 3:
+            return pose, np.inf, within.size, step
+        within.sort()
+        limit = within[math.ceil(kept * within.size) - 1]
+        total, count = 0.0, 0
+        for i in range(points.shape[0]):
+            used[i] = squared[i] <= limit
+            if used[i]:
+                total += squared[i]
+                count += 1
+        rms = math.sqrt(total / count)
+        if abs(before - rms) < threshold_m or step == most_steps:
+            return pose, rms, count, step
+        before = rms
+        pose = rigid_fit(nearest, points, used)
+        step += 1
+
+
+@njit(cache=True, error_model="numpy")
+def refine_outline(
+    seen: Seen,
+    faces: FloatArray,
+    start: FloatArray,
+    origins: FloatArray,
+    sigmas_m: FloatArray,
+    fit: OutlineFit,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
+
+    A reading is uncertain along its beam: its distance from a face has the standard deviation
+    sigma |n . beam|, and a floor for what the outline and the scanner are not. A reading belongs to
+    the face that its beam meets first, whatever its noise; at first, while the pose may be off, to
+    the nearest one turned to the scanner. Readings beyond the gate do not count, and open
+    directions hold on to the start (see `OutlineFit`).
+
+    Returns
+    -------
+    pose : (3,)
+    covariance : (3, 3)
+        Of (x, y, theta), from the readings alone, but for open directions, which have the prior's.
+    calibration : (3, 3 scanners)
+        Derivatives of the pose by the scanners' poses.
+    summary : (4,)
+        Readings used, their squared normalised residuals, the pose's open directions, the root mean
+        square distance from the outline (m).
+    weak : (3,)
+        The least determined direction of (x, y, theta), theta times `scale_m`.
+    information, gradient : (scanners, 3, 3), (scanners, 3)
+        Correction of each scanner's own pose by the residuals.
+    """
+    points, scanner, direction, range_m = seen
+    many = sigmas_m.size
+    pose = start.copy()
+    normal = np.empty((faces.shape[0], 2))
+    for k in range(faces.shape[0]):
+        ex, ey = faces[k, 2] - faces[k, 0], faces[k, 3] - faces[k, 1]
+        length = math.sqrt(ex * ex + ey * ey)
+        normal[k, 0], normal[k, 1] = ey / length, -ex / length
+    covariance = np.full((3, 3), np.nan)
+    calibration = np.zeros((3, 3 * many))
+    information = np.zeros((many, 3, 3))
+    gradient = np.zeros((many, 3))
+    summary = np.zeros(4)
+    weak = np.zeros(3)
+    local_covariance: FloatArray = np.zeros((3, 3))
+    for step in range(fit.steps):
+        h = np.zeros((3, 3))
+        g = np.zeros(3)
+        cross = np.zeros((3, 3 * many))
+        information[:] = 0.0
+        gradient[:] = 0.0
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        used, chi2, squares = 0, 0.0, 0.0
+        sx = sy = 0.0
+        for i in range(points.shape[0]):
+            dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
+            x, y = c * dx + s * dy, -s * dx + c * dy
+            bx, by = (
+                c * direction[i, 0] + s * direction[i, 1],
+                (-s * direction[i, 0] + c * direction[i, 1]),
+            )
+            best, face = np.inf, -1
+            for k in range(faces.shape[0]):
+                slope = normal[k, 0] * bx + normal[k, 1] * by
+                if slope >= 0.0:
+                    continue
+                x1, y1 = faces[k, 0], faces[k, 1]
+                ex, ey = faces[k, 2] - x1, faces[k, 3] - y1
+                length2 = ex * ex + ey * ey
+                if step == 0:
+                    t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
+                    d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
+                    if d > fit.gate_m:
+                        continue
+                else:
+                    # From the reading along its beam to the face: the beam's point there.
+                    ahead = (normal[k, 0] * (x1 - x) + normal[k, 1] * (y1 - y)) / slope
+                    t = ((x + ahead * bx - x1) * ex + (y + ahead * by - y1) * ey) / length2
+                    d = range_m[i] + ahead
+                    if t < 0.0 or t > 1.0 or d <= 0.0:
+                        continue
+                if d < best:
+                    best, face = d, k
+            if face < 0:
+                continue
+            nx, ny = normal[face, 0], normal[face, 1]
+            e = nx * (x - faces[face, 0]) + ny * (y - faces[face, 1])
+            across = min(nx * bx + ny * by, -fit.least_slope) * sigmas_m[scanner[i]]
+            variance = across * across + fit.floor_m * fit.floor_m
+            if e * e > fit.gate_sigma * fit.gate_sigma * variance:
+                continue
+            w = 1.0 / variance
+            used += 1
+            chi2 += w * e * e
+            squares += e * e
+            sx += x
+            sy += y
+            j0, j1, j2 = -nx, -ny, nx * y - ny * x
+            h[0, 0] += w * j0 * j0
+            h[1, 0] += w * j1 * j0
+            h[1, 1] += w * j1 * j1
+            h[2, 0] += w * j2 * j0
+            h[2, 1] += w * j2 * j1
+            h[2, 2] += w * j2 * j2
+            g[0] += w * j0 * e
+            g[1] += w * j1 * e
+            g[2] += w * j2 * e
+            # By the scanner's pose: the normal in the world, and turning about the scanner.
+            q = scanner[i]
+            wx, wy = c * nx - s * ny, s * nx + c * ny
+            b2 = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+            for a in range(3):
+                ja = j0 if a == 0 else (j1 if a == 1 else j2)
+                cross[a, 3 * q] += w * ja * wx
+                cross[a, 3 * q + 1] += w * ja * wy
+                cross[a, 3 * q + 2] += w * ja * b2
+            information[q, 0, 0] += w * wx * wx
+            information[q, 1, 0] += w * wy * wx
+            information[q, 1, 1] += w * wy * wy
+            information[q, 2, 0] += w * b2 * wx
+            information[q, 2, 1] += w * b2 * wy
+            information[q, 2, 2] += w * b2 * b2
+            gradient[q, 0] += w * wx * e
+            gradient[q, 1] += w * wy * e
+            gradient[q, 2] += w * b2 * e
+        summary[0], summary[1] = used, chi2
+        if used < 3:
+            return pose, covariance, calibration, summary, weak, information, gradient
+        summary[3] = math.sqrt(squares / used)
+        # Undetermined directions are evaluated about the middle of the points, theta in metres.
+        mx, my = sx / used, sy / used
+        scale = fit.scale_m
+        for a in range(3):
+            for b in range(a):
+                h[b, a] = h[a, b]
+        # Turning about the middle: xi' = (t + theta x middle, theta * scale).
+        back = np.array([[1.0, 0.0, my / scale], [0.0, 1.0, -mx / scale], [0.0, 0.0, 1.0 / scale]])
+        values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
+        there = np.linalg.inv(back)
+        open_count = 0
+        dx, dy = start[0] - pose[0], start[1] - pose[1]
+        turn = start[2] - pose[2]
+        to_start = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
+        for k in range(3):
+            if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
+                open_count += 1
+                row = np.ascontiguousarray(vectors[:, k]) @ there
+                p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
+                ahead = row @ to_start
+                for a in range(3):
+                    g[a] -= p * row[a] * ahead
+                    for b in range(3):
+                        h[a, b] += p * row[a] * row[b]
+        summary[2] = open_count
+        v = vectors[:, 0]
+        weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
+        local_covariance[:, :] = np.linalg.inv(h)
+        delta = -local_covariance @ g
+        if step == fit.steps - 1 or (
+            step > 0 and math.sqrt(delta[0] ** 2 + delta[1] ** 2) + abs(delta[2]) < 1e-6
+        ):
+            break
+        pose[0] += c * delta[0] - s * delta[1]
+        pose[1] += s * delta[0] + c * delta[1]
+        pose[2] += delta[2]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
+    calibration[:] = -(turn_world @ local_covariance) @ cross
+    return pose, covariance, calibration, summary, weak, information, gradient
+
+
+@njit(cache=True, error_model="numpy")
+def explain_set(
+    ranges_mm: NDArray[np.uint16],
+    rows: IntArray,
+    beams: Beams,
+    faces: FloatArray,
+    middle: FloatArray,
+    radius_m: float,
+    pose: FloatArray,
+    tolerance_m: float,
+) -> FloatArray:
+    """How a pose explains the beams of a set, by casting each of them at the outline.
+
+    Returns
+    -------
+    (6,) float64
+        Beams that should see the robot before the background; of these: as far as they should,
+        farther (through it), nearer (hidden by something), without a reading; and new readings
+        in the outline's circle where the robot is not: objects beside it.
+    """
+    out = np.zeros(6)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    centre_x = pose[0] + c * middle[0] - s * middle[1]
+    centre_y = pose[1] + s * middle[0] + c * middle[1]
+    for q in range(rows.size):
+        if rows[q] < 0:
+            continue
+        to_x, to_y = centre_x - beams.origins[q, 0], centre_y - beams.origins[q, 1]
+        ox = -c * (pose[0] - beams.origins[q, 0]) - s * (pose[1] - beams.origins[q, 1])
+        oy = s * (pose[0] - beams.origins[q, 0]) - c * (pose[1] - beams.origins[q, 1])
+        for i in range(ranges_mm.shape[1]):
+            bx, by = beams.direction[q, i, 0], beams.direction[q, i, 1]
+            if beams.near_mm[q, i] <= 0.0:
+                continue
+            off = to_x * by - to_y * bx
+            ahead = to_x * bx + to_y * by
+            if abs(off) > radius_m or ahead < -radius_m:
+                continue
+            rx, ry = c * bx + s * by, -s * bx + c * by
+            best = np.inf
+            for k in range(faces.shape[0]):
+                ex, ey = faces[k, 2] - faces[k, 0], faces[k, 3] - faces[k, 1]
+                cross = rx * ey - ry * ex
+                if cross == 0.0:
+                    continue
+                ax, ay = faces[k, 0] - ox, faces[k, 1] - oy
+                r = (ax * ey - ay * ex) / cross
+                t = (ax * ry - ay * rx) / cross
+                if r > 0.0 and 0.0 <= t <= 1.0 and r < best:
+                    best = r
+            reading = 1e-3 * ranges_mm[rows[q], i]
+            if best < 1e-3 * beams.near_mm[q, i]:
+                out[0] += 1
+                if reading <= 0.0:
+                    out[4] += 1
+                elif reading > best + tolerance_m:
+                    out[2] += 1
+                elif reading < best - tolerance_m:
+                    out[3] += 1
+                else:
+                    out[1] += 1
+            elif 0.0 < reading < 1e-3 * beams.near_mm[q, i] and abs(reading - ahead) < radius_m:
+                out[5] += 1
+    return out

@@ -1,0 +1,233 @@
+"""``boards.json``: which checkerboard is in which image of which camera, and the boards' data.
+
+::
+
+    {"boards": {"first": {"columns": 7, "rows": 6, "square_m": 0.11}, "second": {...},
+                "world": {...}},
+     "world_from_board": {"translation_m": [...], "quaternion_xyzw": [...]},
+     "first_from_second": {"translation_m": [...], "quaternion_xyzw": [...], "sigmas": [...]},
+     "images": [{"camera": "a", "image": "a/images/0001.png", "placement": 0, "board": "first"}]}
+
+``first`` and ``second`` are the double board; ``first_from_second`` may be absent, then it is
+estimated, and may have ``sigmas`` or a ``covariance``. Images of one placement were taken without
+moving the board. Instead of ``image`` there may be ``corners``, found by other means. A camera's
+calibration is ``<camera>/<camera>.cam`` beside the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from camera.calibration.images import grey_of_content
+from camera.errors import CalibrationError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.json_file import read_json
+from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
+from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
+from redetect.groundtruth.markers.network_estimation import BoardView, DoubleBoard
+from redetect.storage.bounded import read_bounded
+from redetect.storage.image_header import claimed_size
+from redetect.storage.inside import path_inside
+from redetect.storage.messages import excerpt, one_line
+
+FloatArray = NDArray[np.float64]
+
+BOARDS_NAME = "boards.json"
+_LARGEST_IMAGE_BYTES = 1 << 28
+FIRST, SECOND, WORLD = "first", "second", "world"
+
+
+@dataclass(frozen=True, eq=False)
+class BoardImage:
+    """A board in an image that has not been read yet."""
+
+    camera: str
+    board: str
+    placement: int
+    image: Path | None
+    corners: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class BoardsFile:
+    """Content of a ``boards.json``.
+
+    Attributes
+    ----------
+    boards : dict of str to Checkerboard
+    world_from_board : (4, 4) float64
+    double : DoubleBoard or None
+    cameras : dict of str to Camera
+    calibrations : dict of str to str
+        Their files, relative to the folder.
+    images : tuple of BoardImage
+    """
+
+    boards: dict[str, Checkerboard]
+    world_from_board: FloatArray
+    double: DoubleBoard | None
+    cameras: dict[str, Camera]
+    calibrations: dict[str, str]
+    images: tuple[BoardImage, ...]
+
+
+def read_boards(path: Path) -> BoardsFile:
+    """Read a ``boards.json`` and the calibrations of its cameras.
+
+    Parameters
+    ----------
+    path : path
+        The file, or its folder.
+
+    Returns
+    -------
+    BoardsFile
+
+    Raises
+    ------
+    GroundTruthError, camera.CameraError
+        If a file cannot be read or an entry is missing or impossible.
+    """
+    path = path / BOARDS_NAME if path.is_dir() else path
+    content = read_json(path)
+    boards = {
+        name: _board(f"{path}: board {one_line(name, 60)}", entry)
+        for name, entry in _objects(f"{path}: boards", content.get("boards")).items()
+    }
+    unknown = sorted(set(boards) - {FIRST, SECOND, WORLD})
+    if unknown or WORLD not in boards or (FIRST in boards) != (SECOND in boards):
+        raise GroundTruthError(
+            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first "
+            "and second or neither"
+        )
+    world = parse_pose(f"{path}: world_from_board", content.get("world_from_board"))
+    double = None
+    if FIRST in boards:
+        entry = content.get("first_from_second")
+        place = f"{path}: first_from_second"
+        double = DoubleBoard(
+            FIRST,
+            SECOND,
+            None if entry is None else parse_pose(place, entry),
+            np.zeros((6, 6)) if entry is None else parse_covariance(place, entry),
+        )
+    rows = content.get("images")
+    if not isinstance(rows, list) or not rows:
+        raise GroundTruthError(f"{path}: images: expected a list of at least one")
+    images = tuple(
+        _image(f"{path}: image {i + 1}", row, path.parent, boards) for i, row in enumerate(rows)
+    )
+    names = sorted({image.camera for image in images})
+    calibrations = {name: f"{name}/{name}.cam" for name in names}
+    return BoardsFile(
+        boards,
+        world,
+        double,
+        {name: read_camera(_inside(str(path), path.parent, calibrations[name])) for name in names},
+        calibrations,
+        images,
+    )
+
+
+def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> BoardView:
+    """The corners of the board in an image.
+
+    Raises
+    ------
+    GroundTruthError
+        If the image cannot be read, has another size than the calibration, or shows no board.
+    """
+    if image.corners is not None:
+        return BoardView(image.camera, image.board, image.corners)
+    assert image.image is not None
+    try:
+        content = read_bounded(image.image, _LARGEST_IMAGE_BYTES)
+    except OSError as error:
+        raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
+    size = claimed_size(content)
+    # Larger claims are not decoded: memory is allocated for the expected size only.
+    if size is not None and size != (camera.width, camera.height):
+        raise _other_size(image.image, size, camera)
+    if size is None:
+        raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")
+    try:
+        grey = grey_of_content(content, image.image)
+    except CalibrationError as error:
+        raise GroundTruthError(str(error)) from None
+    if grey.shape != (camera.height, camera.width):
+        raise _other_size(image.image, (grey.shape[1], grey.shape[0]), camera)
+    try:
+        corners = find_checkerboard(grey, board)
+    except GeometryError as error:
+        raise GroundTruthError(f"{image.image}: {error}") from None
+    return BoardView(image.camera, image.board, corners)
+
+
+def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> GroundTruthError:
+    return GroundTruthError(
+        f"{path}: is {size[0]}x{size[1]} px: expected {camera.width}x{camera.height}, the "
+        "calibration's size"
+    )
+
+
+def _inside(place: str, folder: Path, name: str) -> Path:
+    try:
+        return path_inside(folder, name)
+    except ValueError as error:
+        raise GroundTruthError(f"{place}: {excerpt(name)} {error}: expected a file in it") from None
+
+
+def _objects(place: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict) or not value:
+        raise GroundTruthError(f"{place}: expected an object with at least one entry")
+    return value
+
+
+def _board(place: str, entry: Any) -> Checkerboard:
+    numbers = [entry.get(key) if isinstance(entry, dict) else None for key in ("columns", "rows")]
+    square = entry.get("square_m") if isinstance(entry, dict) else None
+    if any(not isinstance(n, int) or isinstance(n, bool) for n in numbers) or (
+        not isinstance(square, int | float) or isinstance(square, bool)
+    ):
+        raise GroundTruthError(f"{place}: expected whole columns and rows, and square_m")
+    try:
+        return Checkerboard(int(numbers[0] or 0), int(numbers[1] or 0), float(square))
+    except GroundTruthError as error:
+        raise GroundTruthError(f"{place}: {error}") from None
+
+
+def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) -> BoardImage:
+    entry = row if isinstance(row, dict) else {}
+    camera, board, placement = entry.get("camera"), entry.get("board"), entry.get("placement")
+    if not isinstance(camera, str) or not camera:
+        raise GroundTruthError(f"{place}: camera is {excerpt(camera)}: expected its name")
+    if not isinstance(board, str) or board not in boards:
+        raise GroundTruthError(
+            f"{place}: board is {excerpt(board)}: expected one of {sorted(boards)}"
+        )
+    if not isinstance(placement, int) or isinstance(placement, bool):
+        raise GroundTruthError(
+            f"{place}: placement is {excerpt(placement)}: expected a whole number"
+        )
+    image, corners = entry.get("image"), entry.get("corners")
+    if (image is None) == (corners is None):
+        raise GroundTruthError(f"{place}: expected either image or corners")
+    if image is not None:
+        if not isinstance(image, str):
+            raise GroundTruthError(f"{place}: image is {excerpt(image)}: expected a file's name")
+        path = _inside(place, folder, image)
+        return BoardImage(camera, board, placement, path, None)
+    try:
+        array = np.asarray(corners, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    expected = (boards[board].rows * boards[board].columns, 2)
+    if array.shape != expected or not np.all(np.isfinite(array)):
+        raise GroundTruthError(f"{place}: corners: expected {expected[0]} pairs of finite numbers")
+    return BoardImage(camera, board, placement, None, array)

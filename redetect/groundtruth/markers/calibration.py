@@ -1,0 +1,352 @@
+"""Calibrations on disk: where the markers sit on the robot, where the cameras sit in the world.
+
+``rig.json`` holds `robot_from_marker` for each marker, ``network.json`` `world_from_camera` for
+each camera; both may say how uncertain that is (see docs/groundtruth.md).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.transforms import quaternion_xyzw, transform_from_quaternion
+from redetect.groundtruth.json_file import read_json, write_json
+from redetect.storage.messages import excerpt, one_line
+
+FloatArray = NDArray[np.float64]
+
+_LARGEST_NUMBER = 1e100
+_QUATERNION_TOLERANCE = 1e-3
+_LARGEST_NEGATIVE_EIGENVALUE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Square markers on a robot.
+
+    Attributes
+    ----------
+    dictionary : str
+        Which set of markers the identifiers are from.
+    ids : tuple of int
+        The markers, M of them.
+    widths_m : (M,) float64
+        Widths of the black squares.
+    robot_from_marker : (M, 4, 4) float64
+        Marker frame: origin at the centre, x right, y up, z out of the printed face.
+    covariance : (6 M, 6 M) float64
+        Joint covariance of the poses' right perturbations (m, rad); zeros where exactly known.
+    """
+
+    dictionary: str
+    ids: tuple[int, ...]
+    widths_m: FloatArray
+    robot_from_marker: FloatArray
+    covariance: FloatArray
+
+    @property
+    def corners(self) -> FloatArray:
+        """(M, 4, 3) corners in each marker's frame: top left, right, bottom right, left (m)."""
+        return np.stack([marker_corners(width) for width in self.widths_m])
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Cameras fixed in the world.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The cameras, C of them.
+    cameras : tuple of Camera
+        Their calibrations. The mounting that a ``.cam`` file holds means nothing here.
+    calibrations : tuple of str
+        Their files, relative to the folder of the network's own.
+    world_from_camera : (C, 4, 4) float64
+    covariance : (6 C, 6 C) float64
+        Joint covariance of the poses' right perturbations (m, rad); zeros where exactly known.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    calibrations: tuple[str, ...]
+    world_from_camera: FloatArray
+    covariance: FloatArray
+
+
+def marker_corners(width_m: float) -> FloatArray:
+    """(4, 3) corners in a marker's frame: top left, top right, bottom right, bottom left (m)."""
+    half = 0.5 * width_m
+    return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+
+
+def read_rig(path: str | os.PathLike[str]) -> Rig:
+    """Read a ``rig.json``.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Rig
+        Markers in the order of their identifiers.
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read, or an entry is missing or impossible.
+    """
+    content = read_json(path)
+    dictionary = content.get("dictionary")
+    if not isinstance(dictionary, str) or not dictionary:
+        raise GroundTruthError(f"{path}: dictionary is {excerpt(dictionary)}: expected its name")
+    markers = _entries(path, content, "markers")
+    try:
+        by_id = {int(key): entry for key, entry in markers.items()}
+    except ValueError:
+        raise GroundTruthError(f"{path}: markers: expected whole numbers as keys") from None
+    ids = tuple(sorted(by_id))
+    if len(ids) != len(markers) or (ids and ids[0] < 0):
+        raise GroundTruthError(f"{path}: markers: expected different IDs of 0 or more")
+    widths = []
+    for marker in ids:
+        width = by_id[marker].get("width_m")
+        if width is None or not _is_number(width) or not width > 0.0:
+            raise GroundTruthError(
+                f"{path}: marker {marker}: width_m is {excerpt(width)}: expected metres above 0"
+            )
+        widths.append(float(width))
+    poses = np.stack([_pose(f"{path}: marker {m}", by_id[m]) for m in ids])
+    names = [str(marker) for marker in ids]
+    covariance = _joint_covariance(
+        str(path), content, "markers", names, [by_id[marker] for marker in ids]
+    )
+    return Rig(dictionary, ids, np.array(widths), poses, covariance)
+
+
+def read_network(path: str | os.PathLike[str]) -> Network:
+    """Read a ``network.json`` and the calibrations that it names.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Network
+        Cameras in the order of their names.
+
+    Raises
+    ------
+    GroundTruthError, camera.CameraError
+        If a file cannot be read, or an entry is missing or impossible.
+    """
+    content = read_json(path)
+    cameras = _entries(path, content, "cameras")
+    names = tuple(sorted(cameras))
+    calibrations = []
+    paths = []
+    for name in names:
+        calibration = cameras[name].get("calibration")
+        if not isinstance(calibration, str) or not calibration:
+            raise GroundTruthError(
+                f"{path}: camera {one_line(name, 60)}: calibration is {excerpt(calibration)}: "
+                "expected a file"
+            )
+        # It may well lie beside the network's folder; but only a calibration is ever opened.
+        if (
+            Path(calibration).is_absolute()
+            or not calibration.endswith(".cam")
+            or "\0" in calibration
+        ):
+            raise GroundTruthError(
+                f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} "
+                "is no .cam file by a relative path: expected one"
+            )
+        paths.append(Path(path).parent / calibration)
+        calibrations.append(calibration)
+    return Network(
+        names,
+        tuple(read_camera(place) for place in paths),
+        tuple(calibrations),
+        np.stack([_pose(f"{path}: camera {one_line(name, 60)}", cameras[name]) for name in names]),
+        _joint_covariance(
+            str(path), content, "cameras", list(names), [cameras[name] for name in names]
+        ),
+    )
+
+
+def write_rig(
+    path: str | os.PathLike[str],
+    rig: Rig,
+    extra: Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
+    entries = {
+        str(marker): {"width_m": float(width), **_pose_entries(pose)}
+        for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
+    }
+    content: dict[str, Any] = {"dictionary": rig.dictionary, "markers": entries}
+    if np.any(rig.covariance):
+        content["covariance"] = {
+            "markers": [str(marker) for marker in rig.ids],
+            "matrix": rig.covariance.tolist(),
+        }
+    write_json(path, {**content, **(extra or {})}, overwrite=overwrite)
+
+
+def write_network(
+    path: str | os.PathLike[str],
+    network: Network,
+    extra: Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
+    entries = {
+        name: {"calibration": calibration, **_pose_entries(pose)}
+        for name, calibration, pose in zip(
+            network.names, network.calibrations, network.world_from_camera
+        )
+    }
+    content: dict[str, Any] = {"cameras": entries}
+    if np.any(network.covariance):
+        content["covariance"] = {
+            "cameras": list(network.names),
+            "matrix": network.covariance.tolist(),
+        }
+    write_json(path, {**content, **(extra or {})}, overwrite=overwrite)
+
+
+def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
+    return {
+        "translation_m": pose[:3, 3].tolist(),
+        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+    }
+
+
+def _entries(
+    path: str | os.PathLike[str], content: dict[str, Any], key: str
+) -> dict[str, dict[str, Any]]:
+    entries = content.get(key)
+    if not isinstance(entries, dict) or not entries:
+        raise GroundTruthError(f"{path}: {key}: expected an object with at least one entry")
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise GroundTruthError(f"{path}: {key}: {one_line(name, 60)}: expected an object")
+    return entries
+
+
+def _is_number(value: Any) -> bool:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) <= _LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
+
+
+def _vector(place: str, value: Any, length: int) -> FloatArray:
+    if not isinstance(value, list) or len(value) != length or not all(map(_is_number, value)):
+        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {length} finite numbers")
+    return np.array(value, dtype=np.float64)
+
+
+def _pose(place: str, entry: dict[str, Any]) -> FloatArray:
+    translation = _vector(f"{place}: translation_m", entry.get("translation_m"), 3)
+    quaternion = _vector(f"{place}: quaternion_xyzw", entry.get("quaternion_xyzw"), 4)
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1.0) <= _QUATERNION_TOLERANCE:
+        raise GroundTruthError(
+            f"{place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
+        )
+    return transform_from_quaternion(quaternion / length, translation)
+
+
+def parse_pose(place: str, entry: Any) -> FloatArray:
+    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw.
+
+    Raises
+    ------
+    GroundTruthError
+        If it is none; the message names `place`.
+    """
+    if not isinstance(entry, dict):
+        raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
+    return _pose(place, entry)
+
+
+def parse_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
+    """(6, 6) covariance of a JSON object with ``covariance`` or ``sigmas``; zeros without both.
+
+    ``covariance`` is a 6x6 matrix of the right perturbation (translation m, rotation rad);
+    ``sigmas`` six standard deviations in the same order.
+
+    Raises
+    ------
+    GroundTruthError
+        If it has both, or an invalid one; the message names `place`.
+    """
+    matrix, sigmas = entry.get("covariance"), entry.get("sigmas")
+    if matrix is not None and sigmas is not None:
+        raise GroundTruthError(f"{place}: has covariance and sigmas: expected one of them")
+    if sigmas is not None:
+        values = _vector(f"{place}: sigmas", sigmas, 6)
+        if np.any(values < 0.0):
+            raise GroundTruthError(f"{place}: sigmas: expected 0 or more")
+        return np.diag(values**2)
+    if matrix is not None:
+        return _covariance(f"{place}: covariance", matrix, 6)
+    return np.zeros((6, 6))
+
+
+def _joint_covariance(
+    path: str, content: dict[str, Any], key: str, names: list[str], entries: list[dict[str, Any]]
+) -> FloatArray:
+    size = 6 * len(names)
+    joint = content.get("covariance")
+    single = key.removesuffix("s")
+    if joint is None:
+        covariance = np.zeros((size, size))
+        for i, (name, entry) in enumerate(zip(names, entries)):
+            block = slice(6 * i, 6 * i + 6)
+            covariance[block, block] = parse_covariance(
+                f"{path}: {single} {one_line(name, 60)}", entry
+            )
+        return covariance
+    if any("covariance" in entry or "sigmas" in entry for entry in entries):
+        raise GroundTruthError(
+            f"{path}: covariance for all {key} together and for one of them: expected one of both"
+        )
+    if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
+        raise GroundTruthError(f"{path}: covariance: expected an object with {key} and matrix")
+    order = [str(name) for name in joint[key]]
+    if sorted(order) != sorted(names):
+        raise GroundTruthError(
+            f"{path}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
+        )
+    matrix = _covariance(f"{path}: covariance", joint.get("matrix"), size)
+    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
+    return np.asarray(matrix[np.ix_(index, index)])
+
+
+def _covariance(place: str, value: Any, size: int) -> FloatArray:
+    if not isinstance(value, list) or len(value) != size:
+        raise GroundTruthError(f"{place}: expected {size} rows of {size} numbers")
+    matrix = np.stack([_vector(f"{place}: row {i + 1}", row, size) for i, row in enumerate(value)])
+    scale = np.sqrt(np.clip(np.diagonal(matrix), 0.0, None))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    correlation = matrix / safe[:, None] / safe[None, :]
+    if np.abs(correlation - correlation.T).max() > 1e-6:
+        raise GroundTruthError(f"{place}: expected a symmetric matrix")
+    if np.linalg.eigvalsh(correlation)[0] < -_LARGEST_NEGATIVE_EIGENVALUE:
+        raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
+    return np.asarray(0.5 * (matrix + matrix.T))

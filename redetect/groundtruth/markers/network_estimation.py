@@ -1,0 +1,322 @@
+"""Where the cameras are, from a double checkerboard that two of them see at a time.
+
+One camera sees a board that is fixed in the world. From there the others are chained: a camera
+sees one face of the double board while another sees the other face. Then all is adjusted together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.transforms import inverse, log_se3, transform
+from redetect.groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
+from redetect.groundtruth.markers.bundle import Bundle, PosePrior
+from redetect.groundtruth.markers.chain import ChainPoints
+from redetect.groundtruth.markers.checkerboard import Checkerboard
+from redetect.groundtruth.markers.pnp import solve_camera
+from redetect.groundtruth.markers.settings import NetworkSettings
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A board in an image.
+
+    Attributes
+    ----------
+    camera : str
+    board : str
+    corners : (K, 2) float64
+        Pixels, in the order of `Checkerboard.points`.
+    """
+
+    camera: str
+    board: str
+    corners: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class DoubleBoard:
+    """Two boards held together.
+
+    Attributes
+    ----------
+    first, second : str
+    offset : (4, 4) float64 or None
+        `first_from_second`; None if it is to be estimated.
+    covariance : (6, 6) float64
+        Of its right perturbation; zeros if it is exactly known.
+    """
+
+    first: str
+    second: str
+    offset: FloatArray | None
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkEstimate:
+    """A network and what it was made from.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The cameras.
+    world_from_camera : (C, 4, 4) float64
+    covariance : (6 C, 6 C) float64
+        Joint, scaled by the residuals.
+    offset : (4, 4) float64 or None
+        `first_from_second` of the double board, adjusted.
+    adjusted : AdjustedBundle
+    views : tuple of BoardView
+        The bundle's views.
+    """
+
+    names: tuple[str, ...]
+    world_from_camera: FloatArray
+    covariance: FloatArray
+    offset: FloatArray | None
+    adjusted: AdjustedBundle
+    views: tuple[BoardView, ...]
+
+
+def estimate_network(
+    cameras: Mapping[str, Camera],
+    boards: Mapping[str, Checkerboard],
+    world_from_board: Mapping[str, FloatArray],
+    double: DoubleBoard | None,
+    shots: Sequence[Sequence[BoardView]],
+    settings: NetworkSettings,
+) -> NetworkEstimate:
+    """Estimate where the cameras are.
+
+    Parameters
+    ----------
+    cameras : mapping of str to Camera
+    boards : mapping of str to Checkerboard
+    world_from_board : mapping of str to (4, 4) array
+        Boards that are fixed in the world.
+    double : DoubleBoard or None
+        None if all cameras see boards of the world.
+    shots : sequence of sequences of BoardView
+        Markers seen at one time.
+    settings : NetworkSettings
+
+    Returns
+    -------
+    NetworkEstimate
+
+    Raises
+    ------
+    GroundTruthError
+        If a camera is not connected to the world, or the offset cannot be estimated.
+    """
+    names = tuple(sorted(cameras))
+    seen = [[(view, _camera_from_board(view, cameras, boards)) for view in shot] for shot in shots]
+    offset = None
+    if double is not None:
+        offset = double.offset if double.offset is not None else _estimated_offset(seen, double)
+    parts = dict(world_from_board)
+    if double is not None and offset is not None:
+        parts[double.first], parts[double.second] = np.eye(4), offset
+    poses, bodies = _chained(names, seen, world_from_board, parts)
+    bundle, views = _bundle(
+        names, cameras, boards, world_from_board, parts, double, seen, poses, bodies, settings
+    )
+    try:
+        adjusted = adjust_bundle(
+            bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
+        )
+    except GeometryError as error:
+        raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
+    if double is not None and offset is not None:
+        offset = adjusted.bundle.body_from_part[sorted(parts).index(double.second)]
+    return NetworkEstimate(
+        names,
+        adjusted.bundle.world_from_camera,
+        adjusted.camera_covariance * adjusted.reduced_cost,
+        offset,
+        adjusted,
+        views,
+    )
+
+
+_Seen = Sequence[Sequence[tuple[BoardView, FloatArray]]]
+
+
+def _camera_from_board(
+    view: BoardView, cameras: Mapping[str, Camera], boards: Mapping[str, Checkerboard]
+) -> FloatArray:
+    try:
+        found = solve_camera(
+            cameras[view.camera], boards[view.board].points, view.corners, "iterative"
+        )
+    except GeometryError as error:
+        raise GroundTruthError(f"camera {view.camera}, board {view.board}: {error}") from None
+    return found[0].pose
+
+
+def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
+    """`first_from_second`, from shots in which two cameras, or one, see both faces.
+
+    With A_k the pose of the first face in one camera and B_k that of the second in another, both
+    fixed, (A_1^-1 A_k) X = X (B_1^-1 B_k): the hand-eye problem (Park & Martin 1994).
+    """
+    together: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
+    for shot in seen:
+        for view_a, a in shot:
+            for view_b, b in shot:
+                if (view_a.board, view_b.board) == (double.first, double.second):
+                    if view_a.camera == view_b.camera:
+                        return np.asarray(inverse(a) @ b)
+                    together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
+    left, right = [], []
+    for pairs in together.values():
+        first_a, first_b = pairs[0]
+        left += [inverse(first_a) @ a for a, _ in pairs[1:]]
+        right += [inverse(first_b) @ b for _, b in pairs[1:]]
+    axes = np.array([log_se3(motion)[3:] for motion in left]).reshape(-1, 3)
+    if len(left) < 2 or np.linalg.svd(axes, compute_uv=False)[1] < 0.05:
+        raise GroundTruthError(
+            f"the offset of boards {double.first} and {double.second} cannot be estimated: "
+            "expected 3 or more shots of two cameras with the boards turned about different axes"
+        )
+    return hand_eye(np.stack(left), np.stack(right))
+
+
+def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
+    """(4, 4) X with left_k X = X right_k in the sense of least squares (Park & Martin 1994)."""
+    a, b = log_se3(left)[:, 3:], log_se3(right)[:, 3:]
+    u, _, vt = np.linalg.svd(a.T @ b)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    matrix = np.concatenate(left[:, :3, :3] - np.eye(3))
+    vector = np.concatenate(right[:, :3, 3] @ rotation.T - left[:, :3, 3])
+    translation = np.linalg.lstsq(matrix, vector, rcond=None)[0]
+    return transform(rotation, translation)
+
+
+def _chained(
+    names: tuple[str, ...],
+    seen: _Seen,
+    world_from_board: Mapping[str, FloatArray],
+    parts: Mapping[str, FloatArray],
+) -> tuple[dict[str, FloatArray], dict[int, FloatArray]]:
+    """Cameras, and the double board of each shot, in the world; from camera to camera."""
+    cameras: dict[str, FloatArray] = {}
+    bodies: dict[int, FloatArray] = {}
+    fixed: dict[str, list[FloatArray]] = {}
+    for shot in seen:
+        for view, pose in shot:
+            if view.board in world_from_board:
+                fixed.setdefault(view.camera, []).append(
+                    world_from_board[view.board] @ inverse(pose)
+                )
+    cameras.update({name: _most_central(poses) for name, poses in fixed.items()})
+    while True:
+        reached: dict[str, list[FloatArray]] = {}
+        for number, shot in enumerate(seen):
+            moving = [(v, pose) for v, pose in shot if v.board not in world_from_board]
+            known = [(v, pose) for v, pose in moving if v.camera in cameras]
+            if not known:
+                continue
+            view, pose = known[0]
+            body = cameras[view.camera] @ pose @ inverse(parts[view.board])
+            bodies[number] = body
+            for other, other_pose in moving:
+                if other.camera not in cameras:
+                    reached.setdefault(other.camera, []).append(
+                        body @ parts[other.board] @ inverse(other_pose)
+                    )
+        if not reached:
+            break
+        # The best supported first: chains stay short and sure.
+        name = max(sorted(reached), key=lambda camera: len(reached[camera]))
+        cameras[name] = _most_central(reached[name])
+    missing = [name for name in names if name not in cameras]
+    if missing:
+        raise GroundTruthError(
+            f"camera {missing[0]} is not connected to the world: expected shots in which it sees "
+            "a board of the world, or the double board together with a camera that is connected"
+        )
+    return cameras, bodies
+
+
+def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
+    """The pose with the least sum of distances (m, rad) to the others."""
+    stack = np.stack(poses)
+    sums = [
+        float(np.sum(np.minimum(np.linalg.norm(log_se3(inverse(pose) @ stack), axis=1), 1.0)))
+        for pose in stack
+    ]
+    return np.asarray(stack[int(np.argmin(sums))])
+
+
+def _bundle(
+    names: tuple[str, ...],
+    cameras: Mapping[str, Camera],
+    boards: Mapping[str, Checkerboard],
+    world_from_board: Mapping[str, FloatArray],
+    parts: Mapping[str, FloatArray],
+    double: DoubleBoard | None,
+    seen: _Seen,
+    poses: Mapping[str, FloatArray],
+    bodies: Mapping[int, FloatArray],
+    settings: NetworkSettings,
+) -> tuple[Bundle, tuple[BoardView, ...]]:
+    order = sorted(parts)
+    body_index = {number: 1 + i for i, number in enumerate(sorted(bodies))}
+    views: list[BoardView] = []
+    rows: list[tuple[int, int, int, int]] = []
+    for number, shot in enumerate(seen):
+        for view, _ in shot:
+            body = 0 if view.board in world_from_board else body_index[number]
+            rows.append(
+                (names.index(view.camera), body, order.index(view.board), len(view.corners))
+            )
+            views.append(view)
+    counts = [row[3] for row in rows]
+    index = [np.repeat([row[k] for row in rows], counts).astype(np.int64) for k in range(3)]
+    total = int(sum(counts))
+    points = ChainPoints(
+        index[0],
+        index[1],
+        index[2],
+        np.concatenate([boards[view.board].points for view in views]),
+        np.concatenate([view.corners for view in views]),
+        np.tile(settings.corner_sigma_px**2 * np.eye(2), (total, 1, 1)),
+    )
+    free_part = np.zeros(len(order), dtype=np.bool_)
+    priors: tuple[PosePrior, ...] = ()
+    if double is not None and _used(double.second, views):
+        free = double.offset is None or bool(np.any(double.covariance))
+        free_part[order.index(double.second)] = free
+        if free and double.offset is not None:
+            # Exactly known poses beside uncertain ones are held to a micrometre.
+            covariance = double.covariance + 1e-12 * np.eye(6)
+            priors = (PosePrior("part", order.index(double.second), double.offset, covariance),)
+    free_body = np.ones(1 + len(bodies), dtype=np.bool_)
+    free_body[0] = False
+    bundle = Bundle(
+        tuple(cameras[name] for name in names),
+        np.stack([poses[name] for name in names]),
+        np.stack([np.eye(4), *(bodies[number] for number in sorted(bodies))]),
+        np.stack([parts[name] for name in order]),
+        np.ones(len(names), dtype=np.bool_),
+        free_body,
+        free_part,
+        points,
+        np.repeat(np.arange(len(views)), counts),
+        priors,
+    )
+    return bundle, tuple(views)
+
+
+def _used(board: str, views: Iterable[BoardView]) -> bool:
+    return any(view.board == board for view in views)

@@ -1,0 +1,228 @@
+"""Relative poses of two markers: an estimate from each time that shows both, and a consensus.
+
+A square has two solutions, so each time gives four estimates of a pair. The right one is the same
+at all times; wrong ones depend on where the camera stood. The consensus is the estimate that the
+others agree with best, each time free to choose among its four.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.geometry.covariance import (
+    composed_covariance,
+    inverse_covariance,
+    mean_pose,
+)
+from redetect.groundtruth.geometry.transforms import inverse, log_se3
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Squared normalised distance (6 dof) above which an estimate does not agree.
+_AGREES = 30.0
+_HYPOTHESES = 60
+# Estimates are linearised: no distance counts as better known than this.
+_FLOOR_M, _FLOOR_RAD = 0.002, 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPose:
+    """A marker as seen at one time: its one or two solutions.
+
+    Attributes
+    ----------
+    poses : (K, 4, 4) float64
+        `reference_from_marker`, the reference a camera or the world.
+    covariances : (K, 6, 6) float64
+        Of the right perturbations.
+    costs : (K,) float64
+        Squared normalised residuals.
+    """
+
+    poses: FloatArray
+    covariances: FloatArray
+    costs: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PairConsensus:
+    """The pose of one marker relative to another.
+
+    Attributes
+    ----------
+    pair : (int, int)
+        Indices a, b.
+    a_from_b : (4, 4) float64
+    covariance : (6, 6) float64
+    estimates : (T, 4, 4) float64
+        Each time's estimate that is closest to the consensus.
+    agrees : (T,) bool
+        Which of them agree with it.
+    first : (T,) bool
+        Whether that is the combination of solutions that fit the image best.
+    """
+
+    pair: tuple[int, int]
+    a_from_b: FloatArray
+    covariance: FloatArray
+    estimates: FloatArray
+    agrees: NDArray[np.bool_]
+    first: NDArray[np.bool_]
+
+    @property
+    def support(self) -> int:
+        """At how many times the estimate agrees."""
+        return int(self.agrees.sum())
+
+
+def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
+    """Estimates of `a_from_b` from one time's solutions of both markers, every combination."""
+    poses, covariances, costs = [], [], []
+    for i in range(len(a.poses)):
+        a_from_reference = inverse(a.poses[i])
+        own = inverse_covariance(a.poses[i], a.covariances[i])
+        for j in range(len(b.poses)):
+            poses.append(a_from_reference @ b.poses[j])
+            covariances.append(composed_covariance(own, b.poses[j], b.covariances[j]))
+            costs.append(a.costs[i] + b.costs[j])
+    return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
+
+
+def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairConsensus:
+    """The transform that most times agree with.
+
+    Parameters
+    ----------
+    pair : (int, int)
+    times : one or more estimates
+        From `pair_estimates`, one for each time that shows both markers.
+
+    Returns
+    -------
+    PairConsensus
+    """
+    poses, covariances, costs, owner = _stacked(times)
+    # The surest estimates are hypotheses: those of a marker seen large and aslant.
+    spread = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+    surest = np.argsort(spread, kind="stable")[:_HYPOTHESES]
+    totals = []
+    for hypothesis in surest:
+        distance = _distances(poses[hypothesis], covariances[hypothesis], poses, covariances, costs)
+        totals.append(np.sum(np.minimum(_least(distance, owner, len(times))[0], _AGREES)))
+    chosen = surest[int(np.argmin(totals))]
+    consensus, covariance = poses[chosen], covariances[chosen]
+    for _ in range(10):
+        distance, best = _least(
+            _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
+        )
+        agreeing = best[distance < _AGREES]
+        if not len(agreeing):  # not even the hypothesis: its own covariance is the floor's
+            agreeing = np.array([chosen])
+        new, covariance, _ = mean_pose(poses[agreeing], covariances[agreeing] + _floor())
+        moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
+        consensus = new
+        if moved < 1e-10:
+            break
+    distance, best = _least(
+        _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
+    )
+    first = np.array([costs[b] <= costs[owner == t].min() for t, b in enumerate(best)])
+    return PairConsensus(pair, consensus, covariance, poses[best], distance < _AGREES, first)
+
+
+def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
+    """Each marker's parent in the tree over the best supported pairs (Prim).
+
+    Parameters
+    ----------
+    pairs : mapping of (a, b) to int
+        Support of each pair.
+    count : int
+        Number of markers.
+    root : int
+
+    Returns
+    -------
+    list of int
+        Parents; the root's is itself, -1 for unconnected ones.
+    """
+    parents = [-1] * count
+    parents[root] = root
+    while True:
+        reaching = [
+            (support, -inside, -outside)
+            for (a, b), support in pairs.items()
+            for inside, outside in ((a, b), (b, a))
+            if support > 0 and parents[inside] >= 0 > parents[outside]
+        ]
+        if not reaching:
+            return parents
+        _, inside, outside = max(reaching)
+        parents[-outside] = -inside
+
+
+def chained_poses(
+    consensus: Mapping[tuple[int, int], PairConsensus], parents: Sequence[int], root: int
+) -> FloatArray:
+    """(M, 4, 4) poses `root_from_marker` along a tree that reaches all markers.
+
+    Raises
+    ------
+    GroundTruthError
+        If a marker is not connected.
+    """
+    poses: dict[int, FloatArray] = {root: np.eye(4)}
+    while len(poses) < len(parents):
+        before = len(poses)
+        for marker, parent in enumerate(parents):
+            if marker not in poses and parent in poses:
+                known = consensus.get((parent, marker))
+                step = (
+                    known.a_from_b
+                    if known is not None
+                    else inverse(consensus[marker, parent].a_from_b)
+                )
+                poses[marker] = poses[parent] @ step
+        if len(poses) == before:
+            raise GroundTruthError("a marker is not connected to the others")
+    return np.stack([poses[marker] for marker in range(len(parents))])
+
+
+def _stacked(times: Sequence[MarkerPose]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    return (
+        np.concatenate([time.poses for time in times]),
+        np.concatenate([time.covariances for time in times]),
+        np.concatenate([time.costs - time.costs.min() for time in times]),
+        np.repeat(np.arange(len(times)), [len(time.poses) for time in times]),
+    )
+
+
+def _floor() -> FloatArray:
+    return np.diag(np.square([_FLOOR_M] * 3 + [_FLOOR_RAD] * 3))
+
+
+def _distances(
+    consensus: FloatArray,
+    covariance: FloatArray,
+    poses: FloatArray,
+    covariances: FloatArray,
+    costs: FloatArray,
+) -> FloatArray:
+    """Squared normalised distances of all estimates, and what they cost in the image."""
+    apart = log_se3(inverse(consensus) @ poses)
+    weighted = np.linalg.solve(covariances + covariance + _floor(), apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * weighted, axis=1) + costs)
+
+
+def _least(distance: FloatArray, owner: IntArray, times: int) -> tuple[FloatArray, IntArray]:
+    """Each time's smallest distance and which estimate that is."""
+    order = np.lexsort((distance, owner))
+    first = np.searchsorted(owner[order], np.arange(times))
+    best = order[first]
+    return distance[best], best

@@ -1,0 +1,281 @@
+"""The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
+
+The chosen solver gives initial poses, which are refined by least squares over all corners. If all
+markers agree, it remains to check whether the mirror image of the markers explains the corners as
+well. If not, each marker's own two solutions are hypotheses, and the one that most others agree
+with decides which markers are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.geometry.transforms import inverse, log_se3, rotation_angle
+from redetect.groundtruth.markers.pnp import robot_rms_px, solve_robot, view_poses
+from redetect.groundtruth.markers.refinement import (
+    PoseProblem,
+    RefinedPose,
+    predicted_errors,
+    refine_pose,
+)
+from redetect.groundtruth.markers.settings import PoseSettings
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
+_SAME_ANGLE_RAD = 0.01
+_SAME_PLACE_M = 0.005
+# A mirror image that explains all views is near what one view alone says of it.
+_FARTHEST_START_PX = 40.0
+_OWN_STARTS = 4
+# A robot that left the hall is no solution: least squares ran off.
+_FARTHEST_M = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCandidate:
+    """A pose that may be the robot's.
+
+    Attributes
+    ----------
+    refined : RefinedPose
+        Over the views that it explains.
+    views : (V,) bool
+        Which of all views those are.
+    """
+
+    refined: RefinedPose
+    views: BoolArray
+
+    @property
+    def world_from_robot(self) -> FloatArray:
+        """(4, 4) the pose."""
+        return self.refined.world_from_robot
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6) covariance of its right perturbation."""
+        return self.refined.covariance
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Pose estimate from the corners of one time.
+
+    Attributes
+    ----------
+    candidates : tuple of PoseCandidate
+        The best first; several if the markers are ambiguous or contradict each other.
+    log_odds : tuple of float
+        Natural logarithm of how much likelier the first is than each candidate: 0 for the first.
+    contradiction : bool
+        Equally many markers support poses that exclude each other.
+    """
+
+    candidates: tuple[PoseCandidate, ...]
+    log_odds: tuple[float, ...]
+    contradiction: bool
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether there is more than one candidate."""
+        return len(self.candidates) > 1
+
+
+def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
+    """All poses of a robot that its markers' corners allow.
+
+    Parameters
+    ----------
+    problem : PoseProblem
+        With at least one view.
+    settings : PoseSettings
+
+    Returns
+    -------
+    PoseEstimate
+
+    Raises
+    ------
+    GeometryError
+        If no pose explains any of the views.
+    """
+    if problem.views == 0:
+        raise GeometryError("no marker of the rig was seen")
+    everything = np.ones(problem.views, dtype=np.bool_)
+    found = _refined(problem, _starts(problem, settings)[:1], settings)
+    # Least squares may not have reached the right minimum from the solver's start.
+    if not (found and _all_agree(found[0], settings)):
+        found = _refined(problem, _starts(problem, settings) + _own_poses(problem), settings)
+    if found and _all_agree(found[0], settings):
+        sets, contradiction = [(everything, found)], False
+    else:
+        sets, contradiction = _consensus(problem, settings)
+    candidates: list[PoseCandidate] = []
+    for views, refined in sets:
+        alone = problem.only(views)
+        starts = _starts(alone, settings)[:1] + _mirrored(alone)
+        minima = _distinct(refined + _refined(alone, starts, settings))
+        candidates += [PoseCandidate(pose, views) for pose in _likely(minima, settings)]
+    if contradiction:
+        # Different views were explained: their costs are not comparable.
+        return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
+    best = candidates[0].refined
+    inflation = _inflation(best)
+    log_odds = tuple(0.5 * (c.refined.cost - best.cost) / inflation for c in candidates)
+    return PoseEstimate(tuple(candidates), log_odds, False)
+
+
+def _all_agree(refined: RefinedPose, settings: PoseSettings) -> bool:
+    return not np.any(_disagreeing(refined, settings))
+
+
+def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:
+    return np.asarray(
+        (refined.view_errors > settings.outlier_sigma) & (refined.view_rms_px > settings.outlier_px)
+    )
+
+
+def _starts(problem: PoseProblem, settings: PoseSettings) -> list[FloatArray]:
+    try:
+        return [solution.pose for solution in solve_robot(problem, settings.solver)]
+    except GeometryError:
+        return []
+
+
+def _own_poses(problem: PoseProblem) -> list[FloatArray]:
+    """Poses by single views: those that explain all views best."""
+    poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
+    return sorted(poses, key=lambda pose: robot_rms_px(problem, pose))[:_OWN_STARTS]
+
+
+def _mirrored(problem: PoseProblem) -> list[FloatArray]:
+    """Both solutions of each camera's largest view: starts from which a mirror image is found."""
+    largest = []
+    pixels = problem.seen.pixels
+    for camera in np.unique(problem.seen.camera):
+        views = np.unique(problem.view[problem.seen.camera == camera])
+        extent = [np.ptp(pixels[problem.view == view], axis=0).sum() for view in views]
+        largest.append(int(views[int(np.argmax(extent))]))
+    poses = [pose for view in largest for pose in view_poses(problem, view)]
+    return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
+
+
+def _refined(
+    problem: PoseProblem, starts: Sequence[FloatArray], settings: PoseSettings
+) -> list[RefinedPose]:
+    """Distinct minima below the starts, the best first."""
+    minima = []
+    for start in starts:
+        try:
+            minima.append(
+                refine_pose(problem, start, loss=settings.loss, loss_scale=settings.loss_scale)
+            )
+        except GeometryError:
+            continue
+    return _distinct(minima)
+
+
+def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
+    kept: list[RefinedPose] = []
+    for pose in sorted(minima, key=lambda pose: pose.cost):
+        if np.abs(pose.world_from_robot).max() < _FARTHEST_M and not any(
+            _same(pose.world_from_robot, other.world_from_robot) for other in kept
+        ):
+            kept.append(pose)
+    return kept
+
+
+def _same(a: FloatArray, b: FloatArray) -> bool:
+    apart = np.linalg.norm(a[:3, 3] - b[:3, 3])
+    return bool(apart < _SAME_PLACE_M and rotation_angle(inverse(a) @ b) < _SAME_ANGLE_RAD)
+
+
+def _inflation(best: RefinedPose) -> float:
+    """How much larger the residuals are than their covariances say; never less than 1."""
+    return max(1.0, best.cost / max(1, best.degrees_of_freedom))
+
+
+def _likely(minima: list[RefinedPose], settings: PoseSettings) -> list[RefinedPose]:
+    """The best minimum and those that it cannot exclude."""
+    best = minima[0]
+    limit = best.cost + 2.0 * np.log(settings.ambiguity_odds) * _inflation(best)
+    return [
+        pose
+        for pose in minima
+        if pose is best or (pose.cost <= limit and not _within_covariance(pose, best))
+    ]
+
+
+def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
+    """Whether a second minimum is a dimple that the best one's covariance covers anyway."""
+    apart = log_se3(inverse(best.world_from_robot) @ pose.world_from_robot)
+    return bool(apart @ np.linalg.solve(best.covariance, apart) < 4.0)
+
+
+def _consensus(
+    problem: PoseProblem, settings: PoseSettings
+) -> tuple[list[tuple[BoolArray, list[RefinedPose]]], bool]:
+    """The largest sets of views that agree, and whether there are several of one size."""
+    count = problem.views
+    found: dict[bytes, tuple[BoolArray, RefinedPose]] = {}
+    # A larger marker is the better hypothesis.
+    extents = [np.ptp(problem.seen.pixels[problem.view == v], axis=0).sum() for v in range(count)]
+    hypotheses = (
+        (view, start) for view in np.argsort(extents)[::-1] for start in view_poses(problem, view)
+    )
+    for view, start in hypotheses:
+        explained = _explained(problem, np.arange(count) == view, start, settings)
+        if explained is None:
+            continue
+        views, refined = explained
+        other = found.get(views.tobytes())
+        if other is None or refined.cost < other[1].cost:
+            found[views.tobytes()] = explained
+        if 3 * int(views.sum()) > 2 * count:  # no other candidate can have as many
+            break
+    if not found:
+        raise GeometryError("no pose explains any of the markers")
+    largest = max(int(views.sum()) for views, _ in found.values())
+    best = [entry for entry in found.values() if int(entry[0].sum()) == largest]
+    best.sort(key=lambda entry: entry[1].cost)
+    # Sets that share most of their views are the same story with another doubtful view.
+    apart = [entry for entry in best if 2 * int((entry[0] & best[0][0]).sum()) <= largest]
+    kept = [best[0], *apart]
+    return [(views, [refined]) for views, refined in kept], len(kept) > 1
+
+
+def _explained(
+    problem: PoseProblem, views: BoolArray, start: FloatArray, settings: PoseSettings
+) -> tuple[BoolArray, RefinedPose] | None:
+    """Views that agree with a hypothesis, grown and pruned until they stay; None if none does."""
+    pose = start
+    for _ in range(6):
+        try:
+            refined = refine_pose(
+                problem.only(views), pose, loss=settings.loss, loss_scale=settings.loss_scale
+            )
+        except GeometryError:
+            return None
+        wrong = _disagreeing(refined, settings)
+        if np.any(wrong):
+            if views.sum() == 1:
+                return None
+            worst = np.flatnonzero(views)[int(np.argmax(refined.view_errors))]
+            views = views.copy()
+            views[worst] = False
+            pose = refined.world_from_robot
+            continue
+        pose = refined.world_from_robot
+        predicted = predicted_errors(problem, pose, refined.covariance)
+        grown = views | (predicted < settings.outlier_sigma)
+        if np.array_equal(grown, views):
+            return views, refined
+        views = grown
+    return None

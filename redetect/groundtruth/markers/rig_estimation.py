@@ -1,0 +1,354 @@
+"""Where the markers sit on a robot, from images that show several of them.
+
+Pairs of markers seen together, a consensus for each pair, a tree over the best supported pairs
+(markers never seen together are bridged by a third), and one bundle adjustment of all markers and
+all times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.geometry.transforms import inverse
+from redetect.groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
+from redetect.groundtruth.markers.bundle import Bundle, PosePrior
+from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.markers.chain import project_chain
+from redetect.groundtruth.markers.pairs import (
+    MarkerPose,
+    PairConsensus,
+    chained_poses,
+    pair_consensus,
+    pair_estimates,
+    spanning_tree,
+)
+from redetect.groundtruth.markers.pnp import view_poses
+from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
+from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
+from redetect.groundtruth.markers.settings import RigSettings
+
+FloatArray = NDArray[np.float64]
+
+# Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
+_WRONG_PX = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class RigEstimate:
+    """A rig in the frame of one of its markers, and what it was made from.
+
+    Attributes
+    ----------
+    rig : Rig
+        `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the
+        residuals where those are larger than the corners' covariances say.
+    reference : int
+        The marker whose frame it is.
+    pairs : dict of (int, int) to PairConsensus
+        By indices of the rig.
+    parents : tuple of int
+        The tree: each marker's index of the marker that it was chained to.
+    adjusted : AdjustedBundle
+    views : tuple of View
+        The bundle's views.
+    times : int
+        How many times (images, without a network) were used.
+    left_out : dict of int to str
+        Markers that were found but are not in the rig, with the reason.
+    """
+
+    rig: Rig
+    reference: int
+    pairs: dict[tuple[int, int], PairConsensus]
+    parents: tuple[int, ...]
+    adjusted: AdjustedBundle
+    views: tuple[View, ...]
+    times: int
+    left_out: dict[int, str]
+
+
+def estimate_rig(
+    groups: Sequence[Sequence[MarkerFrame]],
+    cameras: tuple[Camera, ...],
+    world_from_camera: FloatArray,
+    widths_m: Mapping[int, float],
+    dictionary: str,
+    settings: RigSettings,
+    *,
+    reference: int | None = None,
+    camera_covariance: FloatArray | None = None,
+) -> RigEstimate:
+    """Estimate a rig.
+
+    Parameters
+    ----------
+    groups : sequence of sequences of MarkerFrame
+        Images taken at one time; single ones where the cameras are not calibrated to each other.
+    cameras : C cameras
+    world_from_camera : (C, 4, 4) array
+        Identities where the cameras are not calibrated to each other.
+    widths_m : mapping of int to float
+        Widths of the markers that may be in the rig, by ID.
+    dictionary : str
+    settings : RigSettings
+    reference : int, optional
+        The marker whose frame is the rig's; by default the one with the most support.
+    camera_covariance : (6 C, 6 C) array, optional
+        Covariance of the cameras' relative poses, a prior of their adjustment.
+
+    Returns
+    -------
+    RigEstimate
+
+    Raises
+    ------
+    GroundTruthError
+        If no two markers were seen together often enough, or the reference was not.
+    """
+    ids = tuple(sorted(widths_m))
+    candidates = _bare_rig(dictionary, ids, widths_m)
+    seen = [rig_views(group, candidates) for group in groups]
+    solved = [
+        [
+            (view, _solutions(view, candidates, cameras, world_from_camera, settings))
+            for view in views
+        ]
+        if len({view.rig_index for view in views}) > 1
+        else []
+        for views in seen
+    ]
+    pairs = _consensus_of_pairs(solved)
+    support = {pair: c.support for pair, c in pairs.items() if c.support >= settings.least_support}
+    if not support:
+        raise GroundTruthError(
+            f"no two markers were seen together {settings.least_support} times in agreement: "
+            "expected images that show two or more markers of the rig"
+        )
+    root = _root(ids, support, reference)
+    parents = spanning_tree(support, len(ids), root)
+    kept = [i for i in range(len(ids)) if parents[i] >= 0]
+    left_out = _reasons(ids, parents, seen, settings)
+    renumbered = {old: new for new, old in enumerate(kept)}
+    tree = tuple(renumbered[parents[i]] for i in kept)
+    pairs = {
+        (renumbered[a], renumbered[b]): PairConsensus(
+            (renumbered[a], renumbered[b]), c.a_from_b, c.covariance, c.estimates, c.agrees, c.first
+        )
+        for (a, b), c in pairs.items()
+        if a in renumbered and b in renumbered
+    }
+    start = chained_poses(pairs, tree, renumbered[root])
+    kept_ids = tuple(ids[i] for i in kept)
+    rig = _bare_rig(dictionary, kept_ids, widths_m)
+    bundle, views, times = _bundle(
+        solved, rig, renumbered, start, cameras, world_from_camera, renumbered[root], settings
+    )
+    if camera_covariance is not None and np.any(camera_covariance):
+        bundle = _with_free_cameras(bundle, camera_covariance)
+    try:
+        adjusted = adjust_bundle(
+            bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
+        )
+    except GeometryError as error:
+        raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
+    covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
+    return RigEstimate(
+        Rig(dictionary, kept_ids, rig.widths_m, adjusted.bundle.body_from_part, covariance),
+        ids[root],
+        pairs,
+        tree,
+        adjusted,
+        views,
+        times,
+        left_out,
+    )
+
+
+def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, float]) -> Rig:
+    count = len(ids)
+    return Rig(
+        dictionary,
+        ids,
+        np.array([widths_m[marker] for marker in ids]),
+        np.tile(np.eye(4), (count, 1, 1)),
+        np.zeros((6 * count, 6 * count)),
+    )
+
+
+def _solutions(
+    view: View,
+    rig: Rig,
+    cameras: tuple[Camera, ...],
+    world_from_camera: FloatArray,
+    settings: RigSettings,
+) -> MarkerPose | None:
+    """Both poses of a marker in an image, refined; None if it has none."""
+    size = 6 * len(cameras)
+    problem = PoseProblem(
+        cameras,
+        world_from_camera,
+        rig.robot_from_marker,  # identities: the marker itself is the body
+        np.zeros((size, size)),
+        rig.covariance,
+        chain_points([view], rig.widths_m.tolist(), settings.corner_floor_px),
+        np.zeros(4, dtype=np.int64),
+    )
+    found = []
+    for start in view_poses(problem, 0):
+        try:
+            found.append(refine_pose(problem, start))
+        except GeometryError:
+            continue
+    if not found:
+        return None
+    found.sort(key=lambda refined: refined.cost)
+    return MarkerPose(
+        np.stack([refined.world_from_robot for refined in found]),
+        np.stack([refined.covariance for refined in found]),
+        np.array([refined.cost for refined in found]),
+    )
+
+
+def _consensus_of_pairs(
+    solved: Sequence[Sequence[tuple[View, MarkerPose | None]]],
+) -> dict[tuple[int, int], PairConsensus]:
+    estimates: dict[tuple[int, int], list[MarkerPose]] = {}
+    for views in solved:
+        for view_a, a in views:
+            for view_b, b in views:
+                pair = (view_a.rig_index, view_b.rig_index)
+                if a is not None and b is not None and pair[0] < pair[1]:
+                    estimates.setdefault(pair, []).append(pair_estimates(a, b))
+    return {pair: pair_consensus(pair, times) for pair, times in sorted(estimates.items())}
+
+
+def _root(
+    ids: tuple[int, ...], support: Mapping[tuple[int, int], int], reference: int | None
+) -> int:
+    total = np.zeros(len(ids), dtype=np.int64)
+    for (a, b), count in support.items():
+        total[a] += count
+        total[b] += count
+    if reference is None:
+        return int(np.argmax(total))
+    if reference not in ids or not total[ids.index(reference)]:
+        raise GroundTruthError(
+            f"marker {reference} cannot be the reference: it was not seen with others often enough"
+        )
+    return ids.index(reference)
+
+
+def _reasons(
+    ids: tuple[int, ...],
+    parents: Sequence[int],
+    seen: Sequence[Sequence[View]],
+    settings: RigSettings,
+) -> dict[int, str]:
+    reasons = {}
+    for index, marker in enumerate(ids):
+        alone = sum(any(v.rig_index == index for v in views) for views in seen)
+        if parents[index] < 0 and alone:
+            reasons[marker] = (
+                f"seen at {alone} times, but not {settings.least_support} times in agreement with "
+                "a marker of the rig"
+            )
+    return reasons
+
+
+def _bundle(
+    solved: Sequence[Sequence[tuple[View, MarkerPose | None]]],
+    rig: Rig,
+    renumbered: Mapping[int, int],
+    start: FloatArray,
+    cameras: tuple[Camera, ...],
+    world_from_camera: FloatArray,
+    root: int,
+    settings: RigSettings,
+) -> tuple[Bundle, tuple[View, ...], int]:
+    """The bundle, its views, and the number of times, each of which is a body."""
+    views: list[View] = []
+    bodies: list[int] = []
+    poses: list[FloatArray] = []
+    for group in solved:
+        own = [
+            (View(view.frame, view.marker, renumbered[view.rig_index]), solutions)
+            for view, solutions in group
+            if view.rig_index in renumbered and solutions is not None
+        ]
+        if len({view.rig_index for view, _ in own}) < 2:
+            continue
+        pose = _best_start(own, rig, start, cameras, world_from_camera, settings)
+        if pose is None:
+            continue
+        views += [view for view, _ in own]
+        bodies += [len(poses)] * len(own)
+        poses.append(pose)
+    points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
+    seen = type(points)(
+        points.camera,
+        np.repeat(bodies, 4).astype(np.int64),
+        points.part,
+        points.points,
+        points.pixels,
+        points.covariances,
+    )
+    free_part = np.ones(len(rig.ids), dtype=np.bool_)
+    free_part[root] = False
+    bundle = Bundle(
+        cameras,
+        world_from_camera,
+        np.stack(poses),
+        start,
+        np.zeros(len(cameras), dtype=np.bool_),
+        np.ones(len(poses), dtype=np.bool_),
+        free_part,
+        seen,
+        np.repeat(np.arange(len(views)), 4),
+    )
+    return bundle, tuple(views), len(poses)
+
+
+def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
+    """The bundle with its cameras free, each with its own covariance as a prior."""
+    free = np.isin(np.arange(len(bundle.cameras)), bundle.seen.camera)
+    priors = tuple(
+        PosePrior(
+            "camera",
+            int(c),
+            bundle.world_from_camera[c],
+            covariance[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] + 1e-12 * np.eye(6),
+        )
+        for c in np.flatnonzero(free)
+    )
+    return replace(bundle, free_camera=free, priors=priors)
+
+
+def _best_start(
+    own: Sequence[tuple[View, MarkerPose]],
+    rig: Rig,
+    start: FloatArray,
+    cameras: tuple[Camera, ...],
+    world_from_camera: FloatArray,
+    settings: RigSettings,
+) -> FloatArray | None:
+    """The pose of the rig, among its markers' solutions, that explains most of a time's views."""
+    points = chain_points(
+        [view for view, _ in own], rig.widths_m.tolist(), settings.corner_floor_px
+    )
+    best, least = None, np.inf
+    for view, solutions in own:
+        for pose in solutions.poses @ inverse(start[view.rig_index]):
+            pixels = project_chain(cameras, world_from_camera, pose[None], start, points)
+            squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
+            if not np.all(np.isfinite(squares)):
+                continue
+            total = float(np.sum(np.minimum(squares, _WRONG_PX**2)))
+            if total < least:
+                best, least = pose, total
+    return best

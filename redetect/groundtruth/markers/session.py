@@ -1,0 +1,262 @@
+"""A session on disk: the images of several cameras, their times, and the markers found in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
+from redetect.groundtruth.markers.chain import ChainPoints
+from redetect.groundtruth.markers.floor import Floor
+from redetect.groundtruth.markers.refinement import PoseProblem
+from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.trajectories.streams import read_times
+from redetect.landmarks import MarkerLandmark, read_frames
+from redetect.storage.messages import excerpt
+
+DETECTED_NAME = "detected.markers"
+NETWORK_NAME = "network.json"
+RIG_NAME = "rig.json"
+
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True)
+class MarkerFrame:
+    """The markers found in one image.
+
+    Attributes
+    ----------
+    camera : int
+        Index of the camera.
+    prefix : str
+        The image's name.
+    time_s : float
+    markers : tuple of MarkerLandmark
+    """
+
+    camera: int
+    prefix: str
+    time_s: float
+    markers: tuple[MarkerLandmark, ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """A marker of the rig in an image."""
+
+    frame: MarkerFrame
+    marker: MarkerLandmark
+    rig_index: int
+
+
+def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Path], Path]:
+    """The run folders and the network file that a command line means.
+
+    Parameters
+    ----------
+    paths : one or more paths
+        A session (a folder with one run folder per camera), or the run folders themselves.
+    network_path : path, optional
+        By default ``network.json`` in the session, or beside the run folders.
+
+    Returns
+    -------
+    list of path
+        Run folders; for a session all that have found markers.
+    path
+        The network file.
+
+    Raises
+    ------
+    GroundTruthError
+        If a folder does not exist, or a session has no run with found markers.
+    """
+    for path in paths:
+        if not path.is_dir():
+            raise GroundTruthError(f"{path}: no such folder: expected a session or a run folder")
+    if len(paths) == 1 and not (paths[0] / DETECTED_NAME).is_file():
+        runs = sorted(p for p in paths[0].iterdir() if (p / DETECTED_NAME).is_file())
+        if not runs:
+            raise GroundTruthError(
+                f"{paths[0]}: no {DETECTED_NAME} in it or in its folders: "
+                "run `detect markers` on each camera's folder first"
+            )
+        return runs, network_path if network_path is not None else paths[0] / NETWORK_NAME
+    beside = paths[0].resolve().parent / NETWORK_NAME
+    return list(paths), network_path if network_path is not None else beside
+
+
+def read_marker_frames(
+    run: Path, camera: int, *, detected: Path | None = None, timed: bool = True
+) -> list[MarkerFrame]:
+    """Read the markers found in a run's images, and the images' times.
+
+    Parameters
+    ----------
+    run : path
+        Folder with ``detected.markers`` and ``<name>.times``.
+    camera : int
+        Index that the frames will carry.
+    detected : path, optional
+        The file of markers, if it is another one.
+    timed : bool
+        Whether times are needed; without, frames are numbered.
+
+    Returns
+    -------
+    list of MarkerFrame
+        In the file's order.
+
+    Raises
+    ------
+    GroundTruthError, redetect.landmarks.LandmarkFileError
+        If a file cannot be read, or an image has no time.
+    """
+    path = detected if detected is not None else run / DETECTED_NAME
+    times: dict[str, float] = {}
+    times_path = run / f"{run.resolve().name}.times"
+    if timed:
+        times = _times_by_name(times_path)
+    frames = []
+    for number, frame in enumerate(read_frames(path)):
+        name = _image_name(frame.step.prefix)
+        if timed and name not in times:
+            raise GroundTruthError(f"{times_path}: no time of image {frame.step.prefix}")
+        frames.append(
+            MarkerFrame(
+                camera, frame.step.prefix, times[name] if timed else float(number), frame.markers
+            )
+        )
+    return frames
+
+
+def group_by_time(
+    frames: Sequence[MarkerFrame], tolerance_s: float
+) -> list[tuple[MarkerFrame, ...]]:
+    """Put images of different cameras together whose times agree.
+
+    Parameters
+    ----------
+    frames : sequence of MarkerFrame
+    tolerance_s : float
+        A group's images lie within this of its first; each camera is in it once.
+
+    Returns
+    -------
+    list of groups
+        In the order of their times.
+    """
+    groups: list[list[MarkerFrame]] = []
+    for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
+        last = groups[-1] if groups else None
+        if (
+            last is not None
+            and frame.time_s - last[0].time_s <= tolerance_s
+            and all(frame.camera != other.camera for other in last)
+        ):
+            last.append(frame)
+        else:
+            groups.append([frame])
+    return [tuple(group) for group in groups]
+
+
+def rig_views(group: Sequence[MarkerFrame], rig: Rig) -> list[View]:
+    """The rig's markers among those of some images, in the images' order."""
+    index = {marker: i for i, marker in enumerate(rig.ids)}
+    return [
+        View(frame, marker, index[marker.id])
+        for frame in group
+        for marker in frame.markers
+        if marker.dictionary == rig.dictionary and marker.id in index
+    ]
+
+
+def chain_points(
+    views: Sequence[View], widths_m: Sequence[float], corner_floor_px: float
+) -> ChainPoints:
+    """Corners of views as points of a chain, with body 0 and the rig's markers as parts.
+
+    Raises
+    ------
+    GroundTruthError
+        If a corner's covariance, with the floor added, is none.
+    """
+    cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
+    parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
+    points = np.zeros((0, 3))
+    pixels, covariances = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    if views:
+        points = np.concatenate([marker_corners(widths_m[view.rig_index]) for view in views])
+        corners = [corner for view in views for corner in view.marker.corners]
+        pixels = np.array([[c.u, c.v] for c in corners])
+        covariances = np.array([[[c.cuu, c.cuv], [c.cuv, c.cvv]] for c in corners])
+        covariances += corner_floor_px**2 * np.eye(2)
+        determinants = covariances[:, 0, 0] * covariances[:, 1, 1] - covariances[:, 0, 1] ** 2
+        wrong = np.flatnonzero(~((covariances[:, 0, 0] > 0.0) & (determinants > 0.0)))
+        if wrong.size:
+            view = views[int(wrong[0]) // 4]
+            raise GroundTruthError(
+                f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
+                "is not positive definite: expected one, or a corner floor above 0"
+            )
+    return ChainPoints(
+        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
+    )
+
+
+def pose_problem(
+    views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
+) -> PoseProblem:
+    """The problem of the robot's pose at one time."""
+    floor = None
+    if settings.floor:
+        floor = Floor(
+            settings.floor_z_m,
+            settings.floor_sigma_z_m,
+            float(np.radians(settings.floor_sigma_tilt_deg)),
+        )
+    return PoseProblem(
+        network.cameras,
+        network.world_from_camera,
+        rig.robot_from_marker,
+        network.covariance,
+        rig.covariance,
+        chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px),
+        np.repeat(np.arange(len(views)), 4),
+        floor,
+    )
+
+
+def _times_by_name(path: Path) -> dict[str, float]:
+    """Times of images by their names without folder and ending, of which none may be there twice.
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read, or two of its images are called alike.
+    """
+    times: dict[str, float] = {}
+    prefixes: dict[str, str] = {}
+    for prefix, time_s in read_times(path).items():
+        name = _image_name(prefix)
+        if name in prefixes:
+            raise GroundTruthError(
+                f"{path}: images {excerpt(prefixes[name])} and {excerpt(prefix)} are both "
+                f"called {excerpt(name)} without folder and ending: expected different names"
+            )
+        prefixes[name], times[name] = prefix, time_s
+    return times
+
+
+def _image_name(prefix: str) -> str:
+    """An image's name without folder and ending, by which rows and times belong together."""
+    name = prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
+    for suffix in _IMAGE_SUFFIXES:
+        if name.lower().endswith(suffix):
+            return name[: -len(suffix)]
+    return name

@@ -1,0 +1,275 @@
+"""The report's inputs from a session; files missing or unreadable are noted, not raised."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.clocks.clock import ClockModel, read_clock
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.json_file import read_json_value
+from redetect.groundtruth.lasers.building import find_building, read_building
+from redetect.groundtruth.trajectories.alignment import align_poses
+from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.storage.bounded import read_bounded
+
+FloatArray = NDArray[np.float64]
+T = TypeVar("T")
+
+#: Streams in the order of the page, with what they are called there.
+STREAMS = {"laser": "laser", "camera": "cameras", "fused": "fused"}
+
+_GAP_S = 5.0
+_MOST_LINES_BYTES = 1 << 28
+_MOST_PICTURE_BYTES = 1 << 24
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A time in which the laser's track was not determined."""
+
+    status: str
+    from_s: float
+    to_s: float
+    sets: int
+
+
+@dataclass
+class Inputs:
+    """All that the page shows.
+
+    Attributes
+    ----------
+    name : str
+        Of the session.
+    building : (S, 4) float64 or None
+    streams : dict of str to PlanarPoses
+        By the names in `STREAMS`, as far as they are there.
+    odometry : PlanarPoses or None
+        On the ground truth's clock, moved rigidly onto the truth in each visit.
+    truth : PlanarPoses or None
+    clock : ClockModel or None
+    documents : dict of str to dict
+        Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`.
+    sets : dict of str to int
+        Numbers of sets of scans by status.
+    intervals : list of Interval
+        Where the laser's track was not determined within visits.
+    picture : bytes or None
+        Plots of the validation (PNG).
+    visits : list of (float, float)
+        Times between which the robot was in the covered area.
+    missing : list of str
+        Missing files.
+    problems : list of str
+        Files that cannot be read.
+    """
+
+    name: str
+    building: FloatArray | None = None
+    streams: dict[str, PlanarPoses] = field(default_factory=dict)
+    odometry: PlanarPoses | None = None
+    truth: PlanarPoses | None = None
+    clock: ClockModel | None = None
+    documents: dict[str, dict[str, Any]] = field(default_factory=dict)
+    sets: dict[str, int] = field(default_factory=dict)
+    intervals: list[Interval] = field(default_factory=list)
+    picture: bytes | None = None
+    visits: list[tuple[float, float]] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def gather(session: Path, truth: Path | None = None) -> Inputs:
+    """Read the files of a session.
+
+    Parameters
+    ----------
+    session : Path
+    truth : Path, optional
+        True poses; by default ``truth.csv`` in the session, if there.
+
+    Returns
+    -------
+    Inputs
+
+    Raises
+    ------
+    GroundTruthError
+        If there is no such folder, or the requested truth cannot be read.
+    """
+    if not session.is_dir():
+        raise GroundTruthError(f"{session}: no such folder: expected a session")
+    inputs = Inputs(session.resolve().name)
+    inputs.building = _building(session, inputs)
+    for name in STREAMS:
+        stream = _read(inputs, session / f"{name}.csv", read_planar_poses)
+        if stream is not None:
+            inputs.streams[name] = stream
+    if truth is not None:
+        inputs.truth = read_planar_poses(truth)
+    else:
+        inputs.truth = _read(inputs, session / "truth.csv", read_planar_poses)
+    inputs.clock = _read(inputs, session / "clock.json", read_clock)
+    for path in (
+        session / "aligned.json",
+        session / "laser.json",
+        session / "clock.json",
+        session / "fused.json",
+        session / "validation" / "validation.json",
+    ):
+        document = _read(inputs, path, _document, quiet=path.name == "clock.json")
+        if document is not None:
+            inputs.documents[path.name] = document
+    inputs.visits = _visits(inputs)
+    lines = _read(inputs, session / "laser.jsonl", _sets_of_scans)
+    if lines is not None:
+        inputs.sets, inputs.intervals = lines
+        inputs.intervals = [i for i in inputs.intervals if _within(i, inputs.visits)]
+    inputs.picture = _read(inputs, session / "validation" / "errors.png", _picture)
+    inputs.odometry = _odometry(session, inputs)
+    return inputs
+
+
+def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPoses:
+    """The poses between the beginnings and ends of visits; all, if there is no visit."""
+    if not visits:
+        return poses
+    inside = np.zeros(len(poses), dtype=np.bool_)
+    for first, last in visits:
+        inside |= (poses.times_s >= first) & (poses.times_s <= last)
+    return PlanarPoses(
+        poses.times_s[inside],
+        poses.poses[inside],
+        None if poses.covariances is None else poses.covariances[inside],
+    )
+
+
+def _read(
+    inputs: Inputs, path: Path, reader: Callable[[Path], T], *, quiet: bool = False
+) -> T | None:
+    """The result of a reader for a file, or None and a note."""
+    place = path.name if path.parent.name != "validation" else f"validation/{path.name}"
+    try:
+        if path.is_file():
+            return reader(path)
+        if not quiet:
+            inputs.missing.append(place)
+    except (ValueError, OSError) as error:
+        if not quiet:
+            inputs.problems.append(str(error).replace(os.fspath(path), place))
+    return None
+
+
+def _building(session: Path, inputs: Inputs) -> FloatArray | None:
+    try:
+        path = find_building(session)
+    except GroundTruthError:
+        inputs.missing.append("building.csv or building.dxf")
+        return None
+    building = _read(inputs, path, read_building)
+    return None if building is None else building.segments
+
+
+def _document(path: Path) -> dict[str, Any]:
+    content = read_json_value(path)
+    if not isinstance(content, dict):
+        raise GroundTruthError(f"{path}: expected an object")
+    return content
+
+
+def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
+    """How many sets there are of each status, and stretches of those that are not determined."""
+    counts: dict[str, int] = {}
+    intervals: list[Interval] = []
+    before = ""
+    for number, line in enumerate(io.BytesIO(_content(path, _MOST_LINES_BYTES)), 1):
+        try:
+            entry = json.loads(line.decode("utf-8"))
+            status, time = str(entry["status"]), float(entry["t"])
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise GroundTruthError(
+                f"{path}:{number}: expected an object with t and status"
+            ) from None
+        counts[status] = counts.get(status, 0) + 1
+        if status not in ("ok", "reacquired"):
+            if status == before:
+                last = intervals[-1]
+                intervals[-1] = Interval(status, last.from_s, time, last.sets + 1)
+            else:
+                intervals.append(Interval(status, time, time, 1))
+        before = status
+    return counts, intervals
+
+
+def _picture(path: Path) -> bytes:
+    content = _content(path, _MOST_PICTURE_BYTES)
+    if not content.startswith(_PNG):
+        raise GroundTruthError(f"{path}: is no PNG")
+    return content
+
+
+def _content(path: Path, largest_bytes: int) -> bytes:
+    try:
+        return read_bounded(path, largest_bytes)
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _visits(inputs: Inputs) -> list[tuple[float, float]]:
+    """When ground truth was measured, pauses left out; what was fused goes on through them."""
+    measured = [inputs.streams[name].times_s for name in ("laser", "camera") if name in
+                inputs.streams]  # fmt: skip
+    if not measured and inputs.truth is not None:
+        measured = [inputs.truth.times_s]
+    if not measured and "fused" in inputs.streams:
+        measured = [inputs.streams["fused"].times_s]
+    if not measured:
+        return []
+    times = np.sort(np.concatenate(measured))
+    breaks = np.flatnonzero(np.diff(times) > _GAP_S)
+    first, last = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(times) - 1]])
+    return [(float(times[i]), float(times[j])) for i, j in zip(first, last)]
+
+
+def _within(interval: Interval, visits: list[tuple[float, float]]) -> bool:
+    return any(a < interval.from_s and interval.to_s < b for a, b in visits)
+
+
+def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
+    """Odometry that can be compared: on the ground truth's clock, moved onto the truth by visit."""
+    odometry = _read(inputs, session / "odometry.csv", read_planar_poses)
+    if odometry is None or inputs.truth is None:
+        return None
+    try:
+        times = odometry.times_s
+        if inputs.clock is not None:
+            times = inputs.clock.groundtruth_times(times)
+        odometry = PlanarPoses(times, odometry.poses)
+    except GroundTruthError as error:
+        inputs.problems.append(f"odometry.csv: {error}")
+        return None
+    parts = []
+    for visit in inputs.visits:
+        part = in_visits(odometry, [visit])
+        try:
+            mine, theirs, _ = matched_streams(part, inputs.truth)
+            parts.append(align_poses(mine, theirs))
+        except GroundTruthError:
+            continue  # a visit without odometry, or without truth
+    if not parts:
+        return None
+    return PlanarPoses(
+        np.concatenate([part.times_s for part in parts]),
+        np.concatenate([part.poses for part in parts]),
+    )

@@ -1,0 +1,384 @@
+"""The report as one HTML page: no scripts, nothing loaded, everything from files escaped."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
+from redetect.groundtruth.report.parts import Part, Section, figure, page, paragraph, picture, table
+from redetect.groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
+from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.validation.scoring import PoseScore, score_poses
+from redetect.groundtruth.validation.validate import PUBLISHED
+from redetect.landmarks import wrap_angle
+
+# Differences remain without colour: dashes.
+_LOOKS = {
+    "laser": ("#1f5f99", ""),
+    "camera": ("#b8560f", "6 3"),
+    "fused": ("#2b7a3a", "10 3 2 3"),
+    "odometry": ("#7a4fa0", "2 3"),
+    "truth": ("#222222", "1 3"),
+}
+_MOST_ROWS = 40
+_ELLIPSES = 60
+
+
+def report_page(inputs: Inputs, version: str) -> bytes:
+    """The whole page, UTF-8; the same inputs give the same bytes.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    version : str
+        Of the program, for the page's foot.
+    """
+    sections = [
+        Section("state", "What there is", _state(inputs)),
+        Section("map", "Map and path", _maps(inputs)),
+        Section("errors", "Errors against the truth", _errors(inputs)),
+        Section("validation", "Validation at reference poses", _validation(inputs)),
+        Section("clock", "Clocks", _clock(inputs)),
+        Section("rejected", "Rejected and lost", _rejected(inputs)),
+        Section("settings", "Settings and versions", _settings(inputs, version)),
+    ]
+    return page(f"Ground truth: {inputs.name}", sections)
+
+
+def _state(inputs: Inputs) -> list[Part]:
+    rows = []
+    for name, label in STREAMS.items():
+        poses = inputs.streams.get(name)
+        if poses is not None:
+            rows.append((label, *_extent(poses)))
+    if inputs.truth is not None:
+        rows.append(("truth", *_extent(inputs.truth)))
+    content: list[Part] = []
+    if rows:
+        head = ("stream", "poses", "from / s", "to / s", "covariances")
+        content.append(table("Streams of poses", head, rows, text=(4,)))
+    if inputs.visits:
+        spans = ", ".join(f"{b - a:.0f} s" for a, b in inputs.visits[:_MOST_ROWS])
+        content.append(paragraph(f"{len(inputs.visits)} visits to the covered area: {spans}."))
+    for problem in inputs.problems:
+        content.append(paragraph(f"Cannot be read: {problem}", kind="problem"))
+    if inputs.missing:
+        content.append(
+            paragraph("Not in the session: " + ", ".join(inputs.missing) + ".", kind="note")
+        )
+    return content
+
+
+def _extent(poses: PlanarPoses) -> tuple[str, str, str, str]:
+    with_them = "yes" if poses.covariances is not None else "no"
+    if not len(poses):
+        return "0", "-", "-", with_them
+    first, last = f"{poses.times_s[0]:.3f}", f"{poses.times_s[-1]:.3f}"
+    return str(len(poses)), first, last, with_them
+
+
+def _track(name: str, poses: PlanarPoses, inputs: Inputs) -> Track:
+    colour, dashes = _LOOKS[name]
+    return Track(STREAMS.get(name, name), colour, dashes, in_visits(poses, inputs.visits))
+
+
+def _maps(inputs: Inputs) -> list[Part]:
+    tracks = [_track(name, poses, inputs) for name, poses in inputs.streams.items()]
+    everything = list(tracks)
+    if inputs.odometry is not None:
+        everything.append(_track("odometry", inputs.odometry, inputs))
+    if inputs.truth is not None:
+        everything.append(_track("truth", inputs.truth, inputs))
+    if not everything and inputs.building is None:
+        return [
+            paragraph("Neither a building nor a stream of poses: nothing to draw.", kind="note")
+        ]
+    drawing, _ = draw_map("The building and all paths", everything, inputs.building)
+    words = "The building" if inputs.building is not None else "No building map in the session"
+    words += f" and the paths during the visits ({', '.join(t.label for t in everything)})."
+    if inputs.odometry is not None:
+        words += " Odometry is moved onto the truth in each visit."
+    key = legend([(t.label, t.colour, t.dashes) for t in everything])
+    content = [figure(words, key, drawing)]
+    for track in tracks:
+        if track.poses.covariances is None or not len(track.poses):
+            content.append(paragraph(f"{track.label}: no covariances, no ellipses.", kind="note"))
+            continue
+        drawing, factor = draw_map(
+            f"3 sigma ellipses: {track.label}", [track], inputs.building, width=560.0,
+            ellipses=_ELLIPSES,
+        )  # fmt: skip
+        size = f"drawn {factor:g} times as large" if factor > 1.0 else "true to scale"
+        content.append(figure(f"{track.label}: path and 3\u03c3 ellipses, {size}.", drawing))
+    return content
+
+
+def _errors(inputs: Inputs) -> list[Part]:
+    if inputs.truth is None:
+        words = "No truth in the session: give one by --truth to see errors over time."
+        return [paragraph(words, kind="note")]
+    rows: list[tuple[str, ...]] = []
+    place, turn, faults = [], [], []
+    named = {name: (STREAMS[name], poses) for name, poses in inputs.streams.items()}
+    if inputs.odometry is not None:
+        named["odometry"] = ("odometry", inputs.odometry)
+    for name, (label, poses) in named.items():
+        inside = in_visits(poses, inputs.visits)
+        try:
+            mine, theirs, _ = matched_streams(inside, inputs.truth)
+        except ValueError as fault:
+            rows.append((label, "0", *("-",) * 9))
+            faults.append(paragraph(f"{label}: {fault}", kind="problem"))
+            continue
+        rows.append((label, *_score_words(score_poses(mine, theirs))))
+        error = mine.poses - theirs.poses
+        colour, dashes = _LOOKS[name]
+        far = 1e3 * np.hypot(error[:, 0], error[:, 1])
+        bent = np.degrees(np.abs(wrap_angle(error[:, 2])))
+        short = STREAMS.get(name, name)
+        place.append(Series(short, colour, dashes, mine.times_s, far))
+        turn.append(Series(short, colour, dashes, mine.times_s, bent))
+    fused = inputs.streams.get("fused")
+    if place and fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
+        try:
+            mine, theirs, _ = matched_streams(fused, inputs.truth)
+            rows.append(("fused, pauses included", *_score_words(score_poses(mine, theirs))))
+        except ValueError as fault:
+            faults.append(paragraph(f"fused, pauses included: {fault}", kind="problem"))
+    head = (
+        "stream", "poses", "mean / mm", "sigma", "rmse", "worst", "mean / deg", "sigma", "worst",
+        "NEES / 3", "poses with it",
+    )  # fmt: skip
+    caption = "Errors during the visits: of the position (mm) and, signed, of the heading (deg)"
+    if inputs.odometry is not None:
+        caption += "; odometry is moved onto the truth in each visit"
+    content = [table(caption, head, rows), *faults]
+    content.append(
+        paragraph(
+            "NEES / 3 is 1 where covariances are right. Errors of neighbouring poses go together, "
+            "so that it scatters more than the number of poses suggests.",
+            kind="note",
+        )
+    )
+    key = [(s.label, s.colour, s.dashes) for s in place]
+    words = "Each point is the largest error in its stretch of time; pauses are cut out."
+    content.append(
+        figure(
+            f"Position error over time. {words}",
+            legend(key),
+            draw_series("Position error over time", "mm", place, inputs.visits),
+        )
+    )
+    content.append(
+        figure(
+            "Heading error over time, without sign.",
+            legend(key),
+            draw_series("Heading error over time", "deg", turn, inputs.visits),
+        )
+    )
+    return content
+
+
+def _score_words(score: PoseScore) -> tuple[str, ...]:
+    return (
+        str(score.poses),
+        *(f"{1e3 * v:.2f}" for v in (score.position_mean_m, score.position_sigma_m,
+                                     score.position_rmse_m, score.position_max_m)),
+        f"{math.degrees(score.angle_mean_rad):+.3f}",
+        f"{math.degrees(score.angle_sigma_rad):.3f}",
+        f"{math.degrees(score.angle_max_rad):.3f}",
+        f"{score.normalised_error:.3f}" if score.normalised else "-",
+        str(score.normalised),
+    )  # fmt: skip
+
+
+def _validation(inputs: Inputs) -> list[Part]:
+    document = inputs.documents.get("validation.json")
+    if document is None:
+        words = "No validation in the session: groundtruth validate writes it."
+        return [paragraph(words, kind="note")]
+    figures = _entry(document, "figures", dict)
+    rows = [
+        (
+            str(document.get("poses", "ground truth")),
+            *(_number(figures.get(k), 1e3) for k in
+              ("linear_mean_m", "linear_sigma_m", "linear_worst_m")),
+            *(_number(figures.get(k), 180.0 / math.pi, 3) for k in
+              ("angular_mean_rad", "angular_sigma_rad", "angular_worst_rad")),
+        )
+    ]  # fmt: skip
+    for p in PUBLISHED:
+        linear = (f"{1e3 * p.position_mean_m:.0f}", f"{1e3 * p.position_sigma_m:.0f}", "-")
+        rows.append(
+            (f"{p.name} (published)", *linear, f"{p.angle_mean_deg:+.2f}",
+             f"{p.angle_sigma_deg:.2f}", "-")
+        )  # fmt: skip
+    head = ("ground truth", "mean / mm", "sigma", "worst", "mean / deg", "sigma", "worst")
+    content = [table("Linear and angular errors at reference poses", head, rows)]
+    content.append(
+        paragraph(
+            f"{_number(figures.get('poses'), 1.0, 0)} reference poses. NEES / 3 with both "
+            f"covariances: {_number(figures.get('nees'), 1.0, 3)}; 95 % of right ones lie between "
+            f"{_number(figures.get('nees_low'), 1.0, 3)} and "
+            f"{_number(figures.get('nees_high'), 1.0, 3)}."
+        )
+    )
+    if inputs.picture is not None:
+        source = "data:image/png;base64," + base64.b64encode(inputs.picture).decode("ascii")
+        alt = "Plots of the linear and angular errors at each reference pose"
+        content.append(picture("Errors pose by pose.", source, alt))
+    refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
+    if refused:
+        content.append(
+            table(
+                "Poses that are no reference, or without ground truth",
+                ("pose", "t / s", "status", "reason"),
+                [
+                    (str(r.get("index")), _number(r.get("time_s"), 1.0, 3), str(r.get("status")),
+                     str(r.get("reason")))
+                    for r in refused[:_MOST_ROWS]
+                ],
+                text=(2, 3),
+            )
+        )  # fmt: skip
+    return content
+
+
+def _clock(inputs: Inputs) -> list[Part]:
+    if inputs.clock is None:
+        words = "No clock.json: all times are taken to be of one clock."
+        return [paragraph(words, kind="note")]
+    rows = []
+    for s in inputs.clock.segments[:_MOST_ROWS]:
+        rows.append(
+            (
+                f"{s.from_s:.2f}",
+                f"{s.to_s:.2f}",
+                f"{1e3 * s.offset_s:+.2f}",
+                _number(s.sigma_offset_s, 1e3),
+                f"{1e6 * (s.rate - 1.0):+.1f}",
+                _number(s.sigma_rate, 1e6, 1),
+                f"{math.degrees(s.angle_rad):+.3f}",
+                f"{math.degrees(s.turned_rad):.0f}",
+                s.status,
+            )
+        )
+    head = (
+        "from / s", "to / s", "offset / ms", "sigma", "drift / ppm", "sigma", "angle / deg",
+        "turned / deg", "status",
+    )  # fmt: skip
+    caption = "The robot's clock minus the ground truth's, by segment"
+    content = [table(caption, head, rows, text=(8,))]
+    for note in dict.fromkeys(s.note for s in inputs.clock.segments[:_MOST_ROWS] if s.note):
+        content.append(paragraph(f"Note: {note}.", kind="note"))
+    left_out = len(inputs.clock.segments) - len(rows)
+    if left_out > 0:
+        content.append(paragraph(f"{left_out} more segments are in clock.json.", kind="note"))
+    ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
+    if isinstance(ptpd, dict):
+        content.append(
+            paragraph("ptpd: " + ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items()) + ".")
+        )
+    return content
+
+
+def _rejected(inputs: Inputs) -> list[Part]:
+    content: list[Part] = []
+    if inputs.sets:
+        counts = ", ".join(f"{number} {status}" for status, number in sorted(inputs.sets.items()))
+        content.append(
+            paragraph(f"Sets of scans: {counts}. Lost includes the pauses between visits.")
+        )
+    if inputs.intervals:
+        longest = sorted(inputs.intervals, key=lambda i: (i.from_s - i.to_s, i.from_s))
+        rows = [
+            (f"{i.from_s:.3f}", f"{i.to_s:.3f}", str(i.sets), i.status)
+            for i in sorted(longest[:_MOST_ROWS], key=lambda i: i.from_s)
+        ]
+        caption = (
+            f"Within visits the laser's track was not determined {len(inputs.intervals)} times"
+        )
+        if len(inputs.intervals) > _MOST_ROWS:
+            caption += f"; the {_MOST_ROWS} longest"
+        content.append(table(caption, ("from / s", "to / s", "sets", "status"), rows, text=(3,)))
+    suspects = [
+        str(s.get("name"))
+        for s in _entry(inputs.documents.get("laser.json", {}), "scanners", list)
+        if isinstance(s, dict) and s.get("suspect")
+    ]
+    if suspects:
+        words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
+        content.append(paragraph(words, kind="problem"))
+    fused = inputs.documents.get("fused.json")
+    if fused is None:
+        content.append(paragraph("No account of a fusion (fused.json).", kind="note"))
+        return content
+    rejected = [r for r in _entry(fused, "rejected", list) if isinstance(r, dict)]
+    used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
+    restarts = _entry(fused, "restarts_s", list)
+    words = f"Fusion used {used or 'nothing'}; rejected {len(rejected)}; {len(restarts)} restarts."
+    content.append(paragraph(words))
+    if rejected:
+        worst = sorted(rejected, key=lambda r: -_float(r.get("squared_innovation")))[:_MOST_ROWS]
+        entries = [
+            (_number(r.get("time_s"), 1.0, 3), str(r.get("stream")),
+             _number(r.get("squared_innovation"), 1.0, 1))
+            for r in sorted(worst, key=lambda r: _float(r.get("time_s")))
+        ]  # fmt: skip
+        caption = "Poses that fusion rejected"
+        if len(rejected) > _MOST_ROWS:
+            caption += f": the {_MOST_ROWS} farthest of {len(rejected)}"
+        head = ("t / s", "stream", "squared normalised distance")
+        content.append(table(caption, head, entries, text=(1,)))
+    return content
+
+
+def _settings(inputs: Inputs, version: str) -> list[Part]:
+    rows = []
+    for name, document in inputs.documents.items():
+        # A file of scanners has the version of its form there.
+        rows.append((name, "version", _value(document.get("version"))))
+        for key, value in _flat(_entry(document, "settings", dict)):
+            rows.append((name, key, _value(value)))
+    content = []
+    if rows:
+        caption = "Effective settings of what the page shows"
+        content.append(table(caption, ("file", "setting", "value"), rows, text=(1, 2)))
+    content.append(paragraph(f"Page written by groundtruth report, version {version}."))
+    return content
+
+
+def _entry(document: dict[str, Any], key: str, kind: type) -> Any:
+    """An entry of a file that others may have written, or an empty one of the kind expected."""
+    value = document.get(key)
+    return value if isinstance(value, kind) else kind()
+
+
+def _flat(settings: dict[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, dict) and value and above.count(".") < 8:
+            yield from _flat(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def _value(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)[:2000]
+
+
+def _float(value: Any) -> float:
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if good else 0.0
+
+
+def _number(value: Any, factor: float, decimals: int = 2) -> str:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return "-"
+    return f"{factor * value:.{decimals}f}"

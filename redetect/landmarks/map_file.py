@@ -1,0 +1,252 @@
+"""Landmark maps and paths on disk: comma-separated, with a head that says where they come from."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.landmarks.errors import LandmarkFileError
+from redetect.storage import write_whole
+from redetect.storage.bounded import read_bounded
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+FilePath = str | os.PathLike[str]
+N = TypeVar("N", int, float)
+
+MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
+#: Of a map of discs whose places are exact.
+SHORT_MAP_COLUMNS = ("id", "x_m", "y_m", "rows")
+PATH_COLUMNS = (
+    *("prefix", "x_m", "y_m", "theta_rad"),
+    *(f"c{row}{column}" for row in ("x", "y", "theta") for column in ("x", "y", "theta")),
+)
+#: Of a path without covariances.
+SHORT_PATH_COLUMNS = PATH_COLUMNS[:4]
+_LARGEST_FILE_BYTES = 1 << 28
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Landmarks of one kind in the map.
+
+    Attributes
+    ----------
+    ids : (M,) int64
+        Identifiers, each once.
+    xy : (M, 2) float64
+        Places in the map (m).
+    covariance : (M, 2, 2) float64
+        Of `xy` (m^2).
+    rows : (M,) int64
+        Number of rows that each was estimated from.
+    """
+
+    ids: IntArray
+    xy: FloatArray
+    covariance: FloatArray
+    rows: IntArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Discs and vertical lines in one map."""
+
+    discs: Landmarks
+    lines: Landmarks
+
+
+@dataclass(frozen=True, eq=False)
+class Path2D:
+    """The poses of a run: the start, and one after each step.
+
+    Attributes
+    ----------
+    prefixes : tuple of N str
+        Name of each pose; of the start ``start``.
+    poses : (N, 3) float64
+        x, y (m), theta (rad).
+    covariance : (N, 3, 3) float64 or None
+        Of the poses.
+    """
+
+    prefixes: tuple[str, ...]
+    poses: FloatArray
+    covariance: FloatArray | None = None
+
+
+def no_landmarks() -> Landmarks:
+    """A map of nothing."""
+    return _landmarks({})
+
+
+def write_map(
+    path: FilePath,
+    landmark_map: LandmarkMap,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
+
+    Parameters
+    ----------
+    path : path
+    landmark_map : LandmarkMap
+    comments : sequence of str
+        Lines for the head.
+    overwrite : bool
+        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
+        raised.
+    """
+    rows = [
+        (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
+        for kind, some in (("disc", landmark_map.discs), ("line", landmark_map.lines))
+        for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
+    ]
+    _write(path, MAP_COLUMNS, rows, comments, overwrite)
+
+
+def read_map(path: FilePath) -> LandmarkMap:
+    """Read a map that `write_map` wrote, or one made by hand with the same columns.
+
+    The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be read, a row is malformed, a landmark is listed twice or a covariance
+        is negative; names file and line.
+    """
+    found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
+    what = "a map: map.csv of `slam map`"
+    for line, words in _read(path, what, MAP_COLUMNS, SHORT_MAP_COLUMNS):
+        if len(words) == len(SHORT_MAP_COLUMNS):
+            words = ["disc", *words[:3], "0", "0", "0", words[3]]
+        kind = words[0]
+        if kind not in found:
+            raise LandmarkFileError(path, line, f"kind is {kind[:20]!r}: expected disc or line")
+        number = _number(path, line, "id", words[1], int)
+        values = _finite(path, line, MAP_COLUMNS[2:7], words[2:7])
+        rows = _number(path, line, "rows", words[7], int)
+        if number in found[kind]:
+            raise LandmarkFileError(path, line, f"{kind} {number} is in the map already")
+        _, _, cxx, cxy, cyy = values
+        if cxx < 0.0 or cyy < 0.0 or cxy * cxy > 1.000001 * cxx * cyy:
+            raise LandmarkFileError(path, line, f"{kind} {number}: covariance is negative")
+        found[kind][number] = (values, rows)
+    return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
+
+
+def write_path(
+    path: FilePath,
+    poses: Path2D,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a path: columns as `PATH_COLUMNS`, the covariance row by row where there is one."""
+    columns, table = SHORT_PATH_COLUMNS, poses.poses
+    if poses.covariance is not None:
+        columns = PATH_COLUMNS
+        table = np.hstack([table, poses.covariance.reshape(-1, 9)])
+    rows = [(prefix, *row) for prefix, row in zip(poses.prefixes, table.tolist())]
+    _write(path, columns, rows, comments, overwrite)
+
+
+def read_path(path: FilePath) -> Path2D:
+    """Read a path that `write_path` wrote; errors are those of `read_map`."""
+    prefixes, numbers = [], []
+    what = "a path, path.csv, of `slam map`"
+    for line, words in _read(path, what, PATH_COLUMNS, SHORT_PATH_COLUMNS):
+        prefixes.append(words[0])
+        numbers.append(_finite(path, line, PATH_COLUMNS[1:], words[1:]))
+    table = np.array(numbers, dtype=np.float64)
+    return Path2D(
+        prefixes=tuple(prefixes),
+        poses=table[:, :3].copy(),
+        covariance=table[:, 3:].reshape(-1, 3, 3) if table.shape[1] > 3 else None,
+    )
+
+
+def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
+    table = np.array([values for values, _ in found.values()], dtype=np.float64).reshape(-1, 5)
+    return Landmarks(
+        ids=np.array(list(found), dtype=np.int64),
+        xy=table[:, :2].copy(),
+        covariance=table[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
+        rows=np.array([rows for _, rows in found.values()], dtype=np.int64),
+    )
+
+
+def _write(
+    path: FilePath,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    comments: Sequence[str],
+    overwrite: bool,
+) -> None:
+    text = io.StringIO()
+    text.writelines(f"# {comment}\n" for comment in comments)
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
+
+
+def _read(
+    path: FilePath, what: str, columns: Sequence[str], fewer: Sequence[str]
+) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a file with their line numbers, under a head of either set of columns."""
+    try:
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
+    except OSError as error:
+        reason = error.strerror or error
+        raise LandmarkFileError(path, None, f"cannot be read: {reason}: expected {what}") from None
+    head: list[str] = []
+    empty = True
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = next(csv.reader([line]))
+        if not head:
+            if tuple(words) not in (columns, fewer):
+                raise LandmarkFileError(path, number, f"expected the columns {','.join(columns)}")
+            head = words
+            continue
+        if len(words) != len(head):
+            raise LandmarkFileError(path, number, f"{len(words)} values: expected {len(head)}")
+        empty = False
+        yield number, words
+    if empty:
+        raise LandmarkFileError(
+            path, None, f"no rows: expected at least one under {','.join(columns)}"
+        )
+
+
+def _finite(path: FilePath, line: int, names: Sequence[str], words: Sequence[str]) -> list[float]:
+    return [_number(path, line, name, word, float) for name, word in zip(names, words)]
+
+
+def _number(path: FilePath, line: int, name: str, word: str, kind: type[N]) -> N:
+    """A finite float, or an integer of 64 bits."""
+    limit, expected = (2**63, "whole") if kind is int else (math.inf, "finite")
+    try:
+        value = kind(word)
+    except ValueError:
+        value = None
+    if value is None or not abs(value) < limit:
+        raise LandmarkFileError(
+            path, line, f"{name} is {word[:30]!r}: expected a {expected} number"
+        )
+    return value

@@ -1,0 +1,243 @@
+"""Reading landmark files: ``.circles``, ``.lines``, ``.markers``, and the STEP rows of ``.txt``.
+
+A file is read row by row on demand, so that its size does not matter. Line ends may be
+LF or CRLF. ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but
+not a comment: that would swallow the row after it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import takewhile
+from pathlib import Path
+from typing import BinaryIO
+
+from redetect.landmarks.errors import LandmarkError, LandmarkFileError
+from redetect.landmarks.records import (
+    CIRCLE_NUMBERS,
+    LINE_NUMBERS,
+    MARKER_CORNER_NUMBERS,
+    STEP_NUMBERS,
+    CircleLandmark,
+    Frame,
+    Landmark,
+    LineLandmark,
+    MarkerCorner,
+    MarkerLandmark,
+    Record,
+    Row,
+    Step,
+)
+from redetect.storage.messages import excerpt
+
+_LONGEST_ROW_BYTES = 1 << 16
+_LONGEST_ID_DIGITS = 20
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+# Narrower than `float`, which also takes nan, infinity and 1_000.
+_NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
+_NUMBER = re.compile(_NUMBER_PATTERN)
+_WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
+# A comment, so that other programs can read the file as well.
+_LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
+
+
+def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
+    """Read a landmark file row by row, comments and blank lines included.
+
+    Written back with `write_rows`, unchanged rows are byte-identical.
+
+    Parameters
+    ----------
+    path : path
+        The file. It is opened when the first row is requested.
+
+    Yields
+    ------
+    Row
+        Each row with its text and its record: None for comments, blank lines and the settings of a
+        detector, as the data set's files have them at their head.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be opened, a row is malformed, or a landmark precedes the first STEP; the
+        message names the file, the line and what was expected.
+    """
+    with opened(path, "landmark file") as stream:
+        yield from parse_rows(stream, name=os.fspath(path))
+
+
+def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
+    """Read a landmark file frame by frame: each STEP with the landmarks after it.
+
+    Parameters, errors and laziness are those of `read_rows`.
+    """
+    return frames_of_rows(read_rows(path))
+
+
+def read_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
+    """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
+
+    Parameters, errors and laziness are those of `read_rows`: landmarks are checked and left out.
+    """
+    return (row.record for row in read_rows(path) if isinstance(row.record, Step))
+
+
+def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
+    """Gather rows to frames; comments are left out, but ``# levelled``."""
+    step: Step | None = None
+    landmarks: list[Landmark] = []
+    levelled_by: tuple[float, float] | None = None
+    for row in rows:
+        if isinstance(row.record, Step):
+            if step is not None:
+                yield Frame(step, tuple(landmarks), levelled_by)
+            step, landmarks, levelled_by = row.record, [], None
+        elif isinstance(row.record, Landmark):
+            landmarks.append(row.record)
+        elif row.source is not None and (found := _LEVELLED.fullmatch(row.source)):
+            levelled_by = float(found[1]), float(found[2])
+    if step is not None:
+        yield Frame(step, tuple(landmarks), levelled_by)
+
+
+def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
+    """Read rows from a binary stream; errors name the file `name` (see `read_rows`)."""
+    seen_step = False
+    for words, source, line in rows_of_words(stream, name):
+        try:
+            record = _record(words)
+        except LandmarkError as error:
+            raise LandmarkFileError(name, line, str(error)) from None
+        if isinstance(record, Step):
+            seen_step = True
+        elif isinstance(record, Landmark) and not seen_step:
+            raise LandmarkFileError(name, line, "landmark before any STEP: expected a STEP first")
+        yield Row(record, source, line)
+
+
+def parse_record(text: str) -> Record | None:
+    """Make a record of one row's text; None for a comment, a blank line or detector settings.
+
+    Raises
+    ------
+    LandmarkError
+        If the row is malformed; the message says what was expected.
+    """
+    return _record(_words(text.encode("utf-8", "surrogateescape")))
+
+
+@contextmanager
+def opened(path: str | os.PathLike[str], kind: str) -> Iterator[BinaryIO]:
+    """Open a file of a kind for reading; an error of the system becomes a `LandmarkFileError`."""
+    try:
+        with Path(path).open("rb") as stream:
+            yield stream
+    except FileNotFoundError:
+        raise LandmarkFileError(path, None, f"no such {kind}") from None
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LandmarkFileError(path, None, f"cannot be read as a {kind}: {reason}") from None
+
+
+def rows_of_words(stream: BinaryIO, name: str) -> Iterator[tuple[list[bytes], bytes, int]]:
+    """The words of each row of a file, its text and the number of its first line."""
+    source = text = b""
+    first, number = 1, 0
+    while line := stream.readline(_LONGEST_ROW_BYTES + 1):
+        number += 1
+        source += line
+        if len(source) > _LONGEST_ROW_BYTES:
+            raise LandmarkFileError(
+                name, number, f"longer than {_LONGEST_ROW_BYTES} bytes: expected a row of text"
+            )
+        text += line.rstrip(b"\r\n")
+        if number == 1:
+            text = text.removeprefix(_BYTE_ORDER_MARK)
+        if text.endswith(b"\\") and not text.lstrip().startswith(b"#"):
+            text = text[:-1]
+            continue
+        yield _words(text), source, first
+        source = text = b""
+        first = number + 1
+    if source:
+        raise LandmarkFileError(name, number, "ends with \\: expected a line to follow")
+
+
+def decode(word: bytes) -> str:
+    """A word of a file; bytes that are not UTF-8 become surrogates, as in Python's file names."""
+    return word.decode("utf-8", "surrogateescape")
+
+
+def _words(text: bytes) -> list[bytes]:
+    """The words of a row without its comment."""
+    return list(takewhile(lambda word: not word.startswith(b"#"), text.split()))
+
+
+def _record(words: list[bytes]) -> Record | None:
+    if not words:
+        return None
+    keyword = words[0]
+    if keyword == b"STEP":
+        _demand_count(words, 1 + len(STEP_NUMBERS), "prefix", *STEP_NUMBERS)
+        return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
+    # LANDMARK is what the comments at the head of the data set's files of circles call the row.
+    if keyword in (b"LANDMARK_C", b"LANDMARK"):
+        px, py, quality, cxx, cxy, cyy = _numbers_before_ids(words, CIRCLE_NUMBERS)
+        return CircleLandmark(px, py, quality, cxx, cxy, cyy, _ids(words[7:]))
+    if keyword == b"LANDMARK_L":
+        xt, yt, xb, yb, alpha, beta, quality, sigma = _numbers_before_ids(words, LINE_NUMBERS)
+        return LineLandmark(xt, yt, xb, yb, alpha, beta, quality, sigma, _ids(words[9:]))
+    if keyword == b"LANDMARK_M":
+        named = " ".join(MARKER_CORNER_NUMBERS)
+        _demand_count(words, 23, "dictionary ID quality and four times", named)
+        (identifier,), (quality,) = _ids(words[2:3]), _numbers(words[3:], ("quality",))
+        first, second, third, fourth = (
+            MarkerCorner(*_numbers(words[start:], MARKER_CORNER_NUMBERS))
+            for start in range(4, 24, 5)
+        )
+        return MarkerLandmark(decode(words[1]), identifier, quality, (first, second, third, fourth))
+    # The data set has ``CIRCLEMARKDETECTOR <camfile> nohalf|half <radius> <threshold>``.
+    if keyword.endswith(b"DETECTOR"):
+        return None
+    raise LandmarkError(
+        f"row starts with {excerpt(decode(keyword))}: expected STEP, LANDMARK_C, LANDMARK_L, "
+        "LANDMARK_M or a # comment"
+    )
+
+
+def _demand_count(words: list[bytes], count: int, *names: str) -> None:
+    if len(words) != 1 + count:
+        raise LandmarkError(
+            f"{decode(words[0])} with {len(words) - 1} values: expected {count}: {' '.join(names)}"
+        )
+
+
+def _numbers_before_ids(words: list[bytes], names: tuple[str, ...]) -> list[float]:
+    if len(words) < 1 + len(names):
+        raise LandmarkError(
+            f"{decode(words[0])} with {len(words) - 1} values: expected at least {len(names)}: "
+            f"{' '.join(names)} and any IDs"
+        )
+    return _numbers(words[1:], names)
+
+
+def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
+    """The numbers at the beginning of some words, as many as names."""
+    for word, name in zip(words, names):
+        if not _NUMBER.fullmatch(word):
+            raise LandmarkError(f"{name} is {excerpt(decode(word))}: expected a finite number")
+    return [float(word) for word in words[: len(names)]]
+
+
+def _ids(words: list[bytes]) -> tuple[int, ...]:
+    for word in words:
+        if not _WHOLE_NUMBER.fullmatch(word) or len(word) > _LONGEST_ID_DIGITS:
+            raise LandmarkError(
+                f"ID is {excerpt(decode(word))}: expected a whole number, -1 if unknown"
+            )
+    return tuple(map(int, words))

@@ -1,0 +1,266 @@
+"""The rows of landmark files as values.
+
+Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
+metres and radians. The field names are the format's own. A record that could not be read back from
+a file raises `LandmarkError`: numbers that are not finite, identifiers of more than 64 bits, names
+that are not one word.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from math import isfinite
+
+from redetect.landmarks.errors import LandmarkError
+from redetect.storage.messages import excerpt
+
+STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
+CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
+LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
+
+MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
+MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
+
+_LARGEST_ID = 2**63 - 1
+_WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A movement of the robot and the image taken after it.
+
+    Attributes
+    ----------
+    prefix : str
+        The image's name, usually without extension. Bytes of the file that are not UTF-8 are kept
+        as surrogates, as in Python's file names.
+    dx, dy, dphi : float
+        Pose after the movement in the robot frame before it (m, m, rad).
+    cxx, cxy, cyy, cxphi, cyphi, cphiphi : float
+        Covariance of (dx, dy, dphi) (m^2, m rad, rad^2).
+    """
+
+    prefix: str
+    dx: float
+    dy: float
+    dphi: float
+    cxx: float
+    cxy: float
+    cyy: float
+    cxphi: float
+    cyphi: float
+    cphiphi: float
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, STEP_NUMBERS)
+        _demand_word(self.prefix, "image prefix")
+
+
+@dataclass(frozen=True, slots=True)
+class CircleLandmark:
+    """A disc on the floor as seen in one image.
+
+    Attributes
+    ----------
+    px, py : float
+        The disc's centre in the robot frame (m).
+    quality : float
+        The detector's confidence, 0 (bad) to 1 (good).
+    cxx, cxy, cyy : float
+        Covariance of (px, py) (m^2).
+    ids : tuple of int
+        The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none.
+    """
+
+    px: float
+    py: float
+    quality: float
+    cxx: float
+    cxy: float
+    cyy: float
+    ids: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, CIRCLE_NUMBERS)
+        _demand_ids(self.ids)
+
+    @property
+    def identified(self) -> bool:
+        """Whether the disc's identifier is known."""
+        return any(identifier >= 0 for identifier in self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class LineLandmark:
+    """A vertical line of the building as seen in one image.
+
+    Attributes
+    ----------
+    xtop, ytop, xbottom, ybottom : float
+        The line's ends in undistorted normalised image coordinates.
+    alpha : float
+        Bearing of the line, 0 forward and positive to the left (rad).
+    beta : float
+        Inclination of the plane through the camera's centre and the line (rad).
+    quality : float
+        The detector's confidence; always 0 in the data set's own files.
+    sigma : float
+        Standard deviation of `alpha` (rad).
+    ids : tuple of int
+        The line's identifiers, as in `CircleLandmark`.
+    """
+
+    xtop: float
+    ytop: float
+    xbottom: float
+    ybottom: float
+    alpha: float
+    beta: float
+    quality: float
+    sigma: float
+    ids: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, LINE_NUMBERS)
+        _demand_ids(self.ids)
+
+    @property
+    def identified(self) -> bool:
+        """Whether the line's identifier is known."""
+        return any(identifier >= 0 for identifier in self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerCorner:
+    """A corner of a square marker in an image.
+
+    Attributes
+    ----------
+    u, v : float
+        Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0).
+    cuu, cuv, cvv : float
+        Covariance of (u, v) (px^2).
+    """
+
+    u: float
+    v: float
+    cuu: float
+    cuv: float
+    cvv: float
+
+    def __post_init__(self) -> None:
+        _demand_finite(self, MARKER_CORNER_NUMBERS)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerLandmark:
+    """A square marker as seen in one image.
+
+    Attributes
+    ----------
+    dictionary : str
+        Which set of markers it is from; an identifier means nothing without it.
+    id : int
+        The marker's number in that set.
+    quality : float
+        How well the marker's cells agree with the pattern: 1 is perfect.
+    corners : tuple of 4 MarkerCorner
+        Top left, top right, bottom right, bottom left of the marker as it is printed.
+    """
+
+    dictionary: str
+    id: int
+    quality: float
+    corners: tuple[MarkerCorner, MarkerCorner, MarkerCorner, MarkerCorner]
+
+    def __post_init__(self) -> None:
+        _demand_word(self.dictionary, "dictionary of markers")
+        if not 0 <= self.id <= _LARGEST_ID:
+            raise LandmarkError(f"marker's ID is {excerpt(self.id)}: expected 0 or more, 64 bits")
+        _demand_finite(self, ("quality",))
+        if len(self.corners) != len(MARKER_CORNERS):
+            raise LandmarkError(f"marker has {len(self.corners)} corners: expected 4")
+
+
+Landmark = CircleLandmark | LineLandmark | MarkerLandmark
+Record = Step | Landmark
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A step and the landmarks in the image taken after it.
+
+    Attributes
+    ----------
+    step : Step
+    landmarks : tuple of Landmark
+    levelled_by : (float, float) or None
+        Pitch and roll (rad) by which the positions of its discs were levelled; None if they are
+        where the camera as calibrated sees them.
+    """
+
+    step: Step
+    landmarks: tuple[Landmark, ...] = ()
+    levelled_by: tuple[float, float] | None = None
+
+    @property
+    def circles(self) -> tuple[CircleLandmark, ...]:
+        """The discs among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, CircleLandmark))
+
+    @property
+    def lines(self) -> tuple[LineLandmark, ...]:
+        """The lines among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, LineLandmark))
+
+    @property
+    def markers(self) -> tuple[MarkerLandmark, ...]:
+        """The square markers among the landmarks, in the file's order."""
+        return tuple(row for row in self.landmarks if isinstance(row, MarkerLandmark))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of a landmark file together with the text it was read from.
+
+    Attributes
+    ----------
+    record : Record or None
+        None for comments, blank lines and settings of a detector.
+    source : bytes or None
+        The row's text in the file, continuation lines and line end included; None for a row that
+        was not read from a file, or was changed since.
+    line : int
+        The number of the row's first line in its file, counted from 1; 0 without a file.
+    """
+
+    record: Record | None
+    source: bytes | None = None
+    line: int = 0
+
+    def with_record(self, record: Record) -> Row:
+        """The row with another record; it keeps its text if the record is equal."""
+        return self if record == self.record else Row(record, line=self.line)
+
+
+def _demand_finite(record: object, names: tuple[str, ...]) -> None:
+    for name in names:
+        value = getattr(record, name)
+        if not isfinite(value):
+            raise LandmarkError(f"{name} is {value}: expected a finite number")
+
+
+def _demand_word(word: str, name: str) -> None:
+    """Refuse text that would not be read back from a file as one word."""
+    if not _WORD.fullmatch(word):
+        raise LandmarkError(
+            f"{name} is {excerpt(word)}: expected one word that starts with no # and ends with no "
+            "backslash"
+        )
+
+
+def _demand_ids(ids: tuple[int, ...]) -> None:
+    for identifier in ids:
+        if not -_LARGEST_ID <= identifier <= _LARGEST_ID:
+            raise LandmarkError(f"ID is {excerpt(identifier)}: expected at most 64 bits")

@@ -1,0 +1,126 @@
+"""Tilt files: pitch and roll of each frame, as the building's verticals show it.
+
+One row per frame, ``#`` comments and blank lines skipped:
+
+    TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>
+    NOTILT <image> <lines>
+    TILT_D <image> <pitch> <roll> <cPP> <cPR> <cRR> <discs>
+
+Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
+that turns measured directions level; then its covariance and the number of verticals that agree
+with it. A frame with too few of them has a NOTILT row. A TILT_D row after either is what the
+outlines of discs show of the same frame; readers of tilts skip it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from redetect.landmarks.errors import LandmarkFileError
+from redetect.landmarks.reading import decode, opened, rows_of_words
+from redetect.storage.messages import excerpt
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTilt:
+    """The tilt of one frame.
+
+    Attributes
+    ----------
+    prefix : str
+        The frame's image.
+    pitch, roll : float
+        Rotation vector about the robot's X and Y that turns measured directions level (rad).
+    cpp, cpr, crr : float
+        Its covariance (rad^2).
+    lines : int
+        Verticals that agree with it, or discs that show it.
+    """
+
+    prefix: str
+    pitch: float
+    roll: float
+    cpp: float
+    cpr: float
+    crr: float
+    lines: int
+
+
+def format_tilt(tilt: FrameTilt) -> str:
+    """The row of a frame that has a tilt, without line end."""
+    return (
+        f"TILT {tilt.prefix} {tilt.pitch:.6f} {tilt.roll:.6f} "
+        f"{tilt.cpp:.6g} {tilt.cpr:.6g} {tilt.crr:.6g} {tilt.lines}"
+    )
+
+
+def format_outline_tilt(tilt: FrameTilt) -> str:
+    """The row of the tilt by the outlines of a frame's discs, without line end."""
+    return f"TILT_D{format_tilt(tilt).removeprefix('TILT')}"
+
+
+def format_no_tilt(prefix: str, lines: int) -> str:
+    """The row of a frame that has none, without line end."""
+    return f"NOTILT {prefix} {lines}"
+
+
+def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
+    """The tilt rounded to the digits that its row has."""
+    pitch, roll, cpp, cpr, crr = map(float, format_tilt(tilt).rsplit(" ", 6)[1:-1])
+    return replace(tilt, pitch=pitch, roll=roll, cpp=cpp, cpr=cpr, crr=crr)
+
+
+def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
+    """Read a tilt file.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    dict
+        The frames that have a tilt, by their image prefix.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be read or a row is malformed; names file and line.
+    """
+    return {tilt.prefix: tilt for _, tilt in numbered_tilts(path)}
+
+
+def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTilt]]:
+    """The tilts of a file with the numbers of their frames, counted from 0; see `read_tilts`."""
+    frame = -1
+    name = os.fspath(path)
+    with opened(path, "tilt file") as stream:
+        for words, _, line in rows_of_words(stream, name):
+            if not words or words[0] == b"TILT_D":
+                continue
+            frame += 1
+            if words[0] != b"NOTILT":
+                yield frame, _tilt([decode(word) for word in words], name, line)
+
+
+def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
+    if words[0] != "TILT" or len(words) != 8:
+        raise LandmarkFileError(
+            name,
+            line,
+            f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count",
+        )
+    try:
+        pitch, roll, cpp, cpr, crr = map(float, words[2:7])
+        lines = int(words[7])
+    except ValueError:
+        pitch = roll = cpp = cpr = crr = math.nan
+        lines = 0
+    if not all(map(math.isfinite, (pitch, roll, cpp, cpr, crr))) or not 0 <= lines < 1 << 31:
+        raise LandmarkFileError(name, line, "expected 5 finite numbers and a whole one")
+    if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):
+        raise LandmarkFileError(name, line, "the tilt's covariance is not positive definite")
+    return FrameTilt(words[1], pitch, roll, cpp, cpr, crr, lines)

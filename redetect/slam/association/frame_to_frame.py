@@ -1,0 +1,283 @@
+"""Association from frame to frame, against a small map that travels with the robot.
+
+The map is robot-centred (`redetect.slam.association.local_map`): a row measures its landmark
+directly. So nothing depends on how far the robot has drifted, the linearisation is about what is in
+view, and the innovations of a frame carry the correlation that joint compatibility needs. A
+vertical line, of which a row measures only the bearing, is kept as bearing and inverse distance,
+which is near Gaussian from the first sight on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.landmarks import wrap_angle
+from redetect.slam.association.compatibility import Pairing, joint_compatible, nearest_compatible
+from redetect.slam.association.local_map import LocalMap, kept, line_places, moved, tilt_jacobian
+from redetect.slam.errors import SlamError
+from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.storage.bounds import ABOVE_0, LIMIT, PROBABILITY, Bounds, demand, whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Method = Literal["nearest", "joint"]
+
+# Of the first sight of a line: half a metre to infinity within two standard deviations.
+_INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
+
+
+_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
+
+
+@dataclass(frozen=True)
+class LocalSettings:
+    """How rows are associated from frame to frame.
+
+    Attributes
+    ----------
+    method : str
+        `nearest` or `joint`; see `redetect.slam.association.compatibility`.
+    gate_probability : float
+        Share of right rows (or sets of rows) that pass the gate.
+    sigma_scale : float
+        Factor on the discs' standard deviations: tilt and calibration move a frame's discs
+        together by more than the file says. Bearings are compensated for tilt.
+    tilt_sigma_rad : float
+        Standard deviation of the robot's tilt about both axes of the floor, which moves all discs
+        of a frame together.
+    camera_height_m : float
+        Height of the camera above the floor, which scales the displacement by tilt.
+    forget_frames : int
+        A landmark unseen for longer is forgotten.
+    forget_sigma_m : float
+        So is a disc whose position relative to the robot has become less certain than this, beyond
+        4 m in proportion to its distance.
+    most_landmarks : int
+        At most this many landmarks of each kind are kept, those seen last.
+    most_nodes : int
+        Bound of the joint search; see `redetect.slam.association.compatibility.joint_compatible`.
+    """
+
+    method: Method = "joint"
+    gate_probability: float = 0.999
+    sigma_scale: float = 1.4
+    tilt_sigma_rad: float = 0.0035
+    camera_height_m: float = 1.5
+    forget_frames: int = 60
+    forget_sigma_m: float = 0.35
+    most_landmarks: int = 40
+    most_nodes: int = 30_000
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            gate_probability=PROBABILITY,
+            sigma_scale=ABOVE_0,
+            tilt_sigma_rad=_SWAY_RAD,
+            camera_height_m=ABOVE_0,
+            forget_frames=whole(0),
+            forget_sigma_m=LIMIT,
+            most_landmarks=whole(1),
+            most_nodes=whole(1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LocalAssociation:
+    """Result of the association from frame to frame.
+
+    Attributes
+    ----------
+    circle_labels, line_labels : (n,) int64
+        The landmark of each row, numbered from 0 in order of first sight.
+    line_places : (L, 2) float64
+        The last estimate of each line's position in the robot frame (m); NaN if that was behind the
+        camera or beyond 50 m.
+    line_frames : (L,) int64
+        After which step.
+    incomplete : int
+        Frames whose joint search was cut short.
+    """
+
+    circle_labels: IntArray
+    line_labels: IntArray
+    line_places: FloatArray
+    line_frames: IntArray
+    incomplete: int
+
+
+def associate_locally(
+    recording: Recording,
+    settings: LocalSettings | None = None,
+    *,
+    camera_xy: tuple[float, float] = (0.0, 0.0),
+    progress: Callable[[int], None] | None = None,
+) -> LocalAssociation:
+    """Label the rows of a run, frame by frame, ignoring IDs in the file.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    settings : LocalSettings, optional
+        By default as `LocalSettings` says.
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m): bearings of lines are from there.
+    progress : callable, optional
+        Called with the number of frames done.
+
+    Returns
+    -------
+    LocalAssociation
+    """
+    setting = settings or LocalSettings()
+    circles, lines = recording.circles, recording.lines
+    circle_labels = np.full(len(circles), -1, dtype=np.int64)
+    line_labels = np.full(len(lines), -1, dtype=np.int64)
+    circle_starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
+    line_starts = np.searchsorted(lines.frame, np.arange(len(recording) + 1))
+    places: list[FloatArray] = []
+    frames: list[int] = []
+    local = LocalMap.empty()
+    counts = [0, 0]
+    incomplete = 0
+    for frame in range(len(recording)):
+        local = moved(local, recording.steps[frame], recording.step_covariance[frame], camera_xy)
+        local = kept(
+            local,
+            frame,
+            forget_frames=setting.forget_frames,
+            forget_sigma_m=setting.forget_sigma_m,
+            most_landmarks=setting.most_landmarks,
+        )
+        for is_line, starts, labels in (
+            (False, circle_starts, circle_labels),
+            (True, line_starts, line_labels),
+        ):
+            first, last = starts[frame], starts[frame + 1]
+            if first == last:
+                continue
+            seen, noise = _measured(circles, lines, slice(first, last), is_line, setting)
+            local, found, complete = _observed(local, frame, seen, noise, is_line, counts, setting)
+            incomplete += not complete
+            labels[first:last] = found
+        frames += [frame] * (counts[1] - len(frames))
+        places += [np.full(2, np.nan)] * (counts[1] - len(places))
+        for place, number in zip(*line_places(local, frame, camera_xy)):
+            places[number], frames[number] = place, frame
+        if progress:
+            progress(frame + 1)
+    return LocalAssociation(
+        circle_labels,
+        line_labels,
+        np.array(places).reshape(-1, 2),
+        np.array(frames, dtype=np.int64),
+        incomplete,
+    )
+
+
+def _measured(
+    circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Measurements of a frame's rows (n, d), and their covariances (n, d, d)."""
+    if is_line:
+        variance = lines.sigma_rad[rows] ** 2
+        return lines.bearing_rad[rows][:, None], variance[:, None, None]
+    return circles.xy[rows], setting.sigma_scale**2 * circles.covariance[rows]
+
+
+def _observed(
+    local: LocalMap,
+    frame: int,
+    seen: FloatArray,
+    noise: FloatArray,
+    is_line: bool,
+    counts: list[int],
+    setting: LocalSettings,
+) -> tuple[LocalMap, IntArray, bool]:
+    """The map after rows of one kind, and their labels; new landmarks raise `counts`."""
+    width = seen.shape[1]
+    candidates = np.flatnonzero(local.is_line == is_line)
+    index = (2 * candidates[:, None] + np.arange(width)).reshape(-1)
+    innovations = seen[:, None] - local.mean[candidates, :width][None]
+    if is_line:
+        innovations = wrap_angle(innovations)
+    # A tilt is the same for all rows of the frame: it correlates their measurements.
+    sway = np.zeros((len(index), 2))
+    sway_of_rows = np.zeros((len(seen), width, 2))
+    if not is_line:
+        sway = setting.tilt_sigma_rad * tilt_jacobian(
+            local.mean[candidates], setting.camera_height_m
+        ).reshape(-1, 2)
+        sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen, setting.camera_height_m)
+    predicted = local.covariance[np.ix_(index, index)] + sway @ sway.T
+    pairing = _pairing(innovations, predicted, noise, setting)
+    rows = np.flatnonzero(pairing.landmark >= 0)
+    paired = pairing.landmark[rows]
+    mean, covariance = local.mean, local.covariance
+    last_frame = local.last_frame.copy()
+    if len(rows):
+        chosen = (2 * candidates[paired][:, None] + np.arange(width)).reshape(-1)
+        moving = sway.reshape(-1, width, 2)[paired].reshape(-1, 2)
+        innovation_covariance = covariance[np.ix_(chosen, chosen)] + moving @ moving.T
+        for k, row in enumerate(rows):
+            block = slice(k * width, (k + 1) * width)
+            innovation_covariance[block, block] += noise[row]
+        gain = np.linalg.solve(innovation_covariance, covariance[chosen]).T
+        change = gain @ innovations[rows, paired].reshape(-1)
+        mean = mean + change.reshape(-1, 2)
+        covariance = covariance - gain @ covariance[chosen]
+        covariance = 0.5 * (covariance + covariance.T)
+        last_frame[candidates[paired]] = frame
+
+    fresh = np.flatnonzero(pairing.landmark < 0)
+    kind = int(is_line)
+    labels = np.empty(len(seen), dtype=np.int64)
+    labels[rows] = local.number[candidates[paired]]
+    labels[fresh] = counts[kind] + np.arange(len(fresh))
+    counts[kind] += len(fresh)
+    m, k = len(mean), len(fresh)
+    grown = np.zeros((2 * (m + k), 2 * (m + k)))
+    grown[: 2 * m, : 2 * m] = covariance
+    added = np.empty((k, 2))
+    added[:, :width] = seen[fresh]
+    if is_line:
+        added[:, 1] = _INVERSE_DISTANCE_PRIOR[0]
+    for number, row in enumerate(fresh):
+        at = 2 * (m + number)
+        grown[at : at + width, at : at + width] = (
+            noise[row] + sway_of_rows[row] @ sway_of_rows[row].T
+        )
+        if is_line:
+            grown[at + 1, at + 1] = _INVERSE_DISTANCE_PRIOR[1] ** 2
+    local = LocalMap(
+        np.concatenate([mean, added]),
+        grown,
+        np.concatenate([local.is_line, np.full(k, is_line)]),
+        np.concatenate([local.number, labels[fresh]]),
+        np.concatenate([last_frame, np.full(k, frame)]),
+    )
+    return local, labels, pairing.complete
+
+
+def _pairing(
+    innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: LocalSettings
+) -> Pairing:
+    if setting.method == "nearest":
+        return nearest_compatible(
+            innovations, predicted, noise, gate_probability=setting.gate_probability
+        )
+    return joint_compatible(
+        innovations,
+        predicted,
+        noise,
+        gate_probability=setting.gate_probability,
+        most_nodes=setting.most_nodes,
+    )

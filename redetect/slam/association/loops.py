@@ -1,0 +1,381 @@
+"""Loops: which parts of a run's map are one place, found by the landmarks' mutual distances.
+
+Landmarks seen in a short stretch of the run form a constellation that odometry's drift bends by
+little. Two constellations of one place are aligned by a rigid motion that pairs of landmarks vote
+for. A match is accepted if as many landmarks agree as would by chance in less than one of a
+thousand runs. The criterion is the expected number of matches at least as good among random
+constellations, over all motions tried ("number of false alarms", A. Desolneux, L. Moisan,
+J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 40, 2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.stats import binom
+
+from redetect.slam.association.loops_kernels import best_motion
+from redetect.slam.errors import SlamError
+from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+# A constellation covers the area within this distance of its landmarks.
+_COVER_M = 0.6
+_GRID_M = 0.15
+#: Stretches that share at least this many landmarks are known to be the same place.
+SHARED_BY_ONE_PLACE = 3
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Settings of the search for loops.
+
+    Attributes
+    ----------
+    stretch_frames : int
+        Frames whose landmarks form a constellation.
+    stride_frames : int
+        Frames from one constellation to the next.
+    length_tolerance_m : float
+        By how much the lengths of two pairs of landmarks may differ to vote.
+    least_length_m : float
+        Pairs shorter than this do not vote.
+    reach_m : float
+        Largest distance of landmarks that agree.
+    most_turn_rad, most_shift_m : float
+        Largest motion that brings one constellation onto the other.
+    least_agreeing : int
+        Least number of agreeing landmarks, whatever the number of false alarms.
+    false_alarms : float
+        Largest number of matches at least as good that are expected by chance in the whole search.
+    later_step, earlier_step : int
+        Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
+        `earlier_step`-th of these.
+    attached_frames : int
+        A stretch that shares landmarks with one at least this many frames earlier is part of the
+        map already and not matched again; 0 to match all.
+    """
+
+    stretch_frames: int = 50
+    stride_frames: int = 10
+    length_tolerance_m: float = 0.08
+    least_length_m: float = 0.8
+    reach_m: float = 0.12
+    most_turn_rad: float = 0.8
+    most_shift_m: float = 8.0
+    least_agreeing: int = 7
+    false_alarms: float = 1e-3
+    later_step: int = 1
+    earlier_step: int = 2
+    attached_frames: int = 0
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            stretch_frames=whole(1),
+            stride_frames=whole(1),
+            length_tolerance_m=ABOVE_0,
+            least_length_m=NOT_NEGATIVE,
+            reach_m=ABOVE_0,
+            most_turn_rad=LIMIT,
+            most_shift_m=LIMIT,
+            least_agreeing=whole(2),
+            false_alarms=ABOVE_0,
+            later_step=whole(1),
+            earlier_step=whole(1),
+            attached_frames=whole(0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Landmarks seen in a stretch of frames.
+
+    Attributes
+    ----------
+    middle_frame : int
+    labels : (n,) int64
+        Ascending.
+    xy : (n, 2) float64
+        Their places in the map (m).
+    """
+
+    middle_frame: int
+    labels: IntArray
+    xy: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Two stretches that show one place.
+
+    Attributes
+    ----------
+    earlier_frame, later_frame : int
+        Middle frames of the two.
+    pairs : (k, 2) int64
+        Labels of the earlier and of the later stretch that are one landmark.
+    turn_rad : float
+    shift : (2,) float64
+        Motion that brings the later stretch's landmarks, in the map, onto the earlier one's:
+        x -> R(turn) x + shift.
+    log10_false_alarms : float
+        Logarithm of the number of matches as good that chance would bring about.
+    """
+
+    earlier_frame: int
+    later_frame: int
+    pairs: IntArray
+    turn_rad: float
+    shift: FloatArray
+    log10_false_alarms: float
+
+
+def stretches_of(
+    frames: IntArray, labels: IntArray, xy: FloatArray, count: int, settings: LoopSettings
+) -> list[Stretch]:
+    """The constellations along a run.
+
+    Parameters
+    ----------
+    frames, labels : (n,) int64
+        Frame and landmark of each row, by frame.
+    xy : (M, 2) float64
+        Places of the landmarks by label (m); those that are NaN are left out.
+    count : int
+        Frames of the run.
+    settings : LoopSettings
+
+    Returns
+    -------
+    list of Stretch
+        Those with enough landmarks for a match.
+    """
+    found = []
+    for start in range(0, max(count - settings.stretch_frames // 2, 1), settings.stride_frames):
+        first, last = np.searchsorted(frames, [start, start + settings.stretch_frames])
+        seen = np.unique(labels[first:last])
+        seen = seen[np.isfinite(xy[seen, 0])]
+        if len(seen) >= settings.least_agreeing:
+            middle = min(start + settings.stretch_frames // 2, count - 1)
+            found.append(Stretch(middle, seen, xy[seen]))
+    return found
+
+
+def sightings(stretches: Sequence[Stretch]) -> csr_array:
+    """(S, M) sparse int64, 1 where a stretch shows a label."""
+    sizes = np.array([len(s.labels) for s in stretches], dtype=np.int64)
+    labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    shape = (len(sizes), int(labels.max(initial=-1)) + 1)
+    return csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
+
+
+def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
+    """(S, S) sparse int64, how many landmarks each two stretches have in common."""
+    seen = sightings(stretches)
+    return csr_array(seen @ seen.T)
+
+
+def find_matches(
+    stretches: list[Stretch], settings: LoopSettings, progress: Callable[[str], None] | None = None
+) -> list[Match]:
+    """All pairs of stretches that show one place more surely than by chance.
+
+    Landmarks that two stretches share already are left out; stretches that share three or more
+    need no match.
+
+    Parameters
+    ----------
+    stretches : list of Stretch
+        In the order of the run.
+    settings : LoopSettings
+    progress : callable, optional
+        Called with the progress of the search.
+
+    Returns
+    -------
+    list of Match
+        The surest first.
+    """
+    candidates: list[tuple[Stretch, Stretch, BoolArray, BoolArray, float, FloatArray]] = []
+    tried = 0
+    centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
+    extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in stretches])
+    together = shared_landmarks(stretches)
+    for k, later in enumerate(stretches):
+        if k % settings.later_step:
+            continue
+        if progress:
+            progress(f"stretch {k + 1} of {len(stretches)}")
+        shared = together[[k], :k].toarray()[0]
+        gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
+        apart = (gap >= settings.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
+        if settings.attached_frames and np.any(~apart & (gap >= settings.attached_frames)):
+            continue
+        near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (
+            settings.most_shift_m + extents[:k] + extents[k]
+        )
+        near[np.arange(k) % settings.earlier_step != 0] = False
+        for i in np.flatnonzero(near & apart):
+            earlier = stretches[i]
+            fixed = ~np.isin(earlier.labels, later.labels)
+            moved = ~np.isin(later.labels, earlier.labels)
+            if min(fixed.sum(), moved.sum()) < settings.least_agreeing:
+                continue
+            turn, x, y, agreeing, _, hypotheses = best_motion(
+                later.xy[moved],
+                earlier.xy[fixed],
+                settings.length_tolerance_m,
+                settings.least_length_m,
+                settings.reach_m,
+                settings.most_turn_rad,
+                settings.most_shift_m,
+                settings.least_agreeing,
+            )
+            tried += hypotheses
+            if agreeing >= settings.least_agreeing:
+                candidates.append((earlier, later, fixed, moved, turn, np.array([x, y])))
+    matches = []
+    for earlier, later, fixed, moved, turn, offset in candidates:
+        match = _refined(earlier, later, fixed, moved, turn, offset, tried, settings)
+        if match is not None and match.log10_false_alarms <= np.log10(settings.false_alarms):
+            matches.append(match)
+    order = sorted(
+        range(len(matches)),
+        key=lambda n: (
+            matches[n].log10_false_alarms,
+            matches[n].later_frame,
+            matches[n].earlier_frame,
+        ),
+    )
+    return [matches[n] for n in order]
+
+
+def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]:
+    """The rigid motion of least squares between paired points of the plane.
+
+    Parameters
+    ----------
+    moved, fixed : (n, 2) float64
+        Points and where they go (m).
+
+    Returns
+    -------
+    turn_rad : float
+    shift : (2,) float64
+        x -> R(turn) x + shift.
+    """
+    first, second = moved.mean(axis=0), fixed.mean(axis=0)
+    a, b = moved - first, fixed - second
+    turn = float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
+    return turn, second - _turned(first, turn)
+
+
+def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
+    """Points of two sets that are each other's nearest, and near.
+
+    Parameters
+    ----------
+    first, second : (n, 2), (m, 2) float64
+        Points (m).
+    reach_m : float
+        Largest distance of a pair.
+
+    Returns
+    -------
+    (k, 2) int64
+        Indices into both.
+    """
+    if len(first) == 0 or len(second) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    distance = np.linalg.norm(first[:, None] - second[None], axis=2)
+    to_second, to_first = distance.argmin(axis=1), distance.argmin(axis=0)
+    index = np.arange(len(first))
+    mutual = (to_first[to_second] == index) & (distance[index, to_second] <= reach_m)
+    return np.stack([index[mutual], to_second[mutual]], axis=1).astype(np.int64)
+
+
+def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -> float:
+    """How many matches as good chance would bring about, as a logarithm.
+
+    Two of the landmarks agree because the motion was made from them; of the others each agrees by
+    chance with probability `chance`.
+
+    Parameters
+    ----------
+    agreeing : int
+        Landmarks that agree.
+    present : int
+        Landmarks that could have.
+    chance : float
+        Probability that a landmark at random falls near one of the other constellation.
+    tried : int
+        Number of motions tried.
+
+    Returns
+    -------
+    float
+    """
+    tail = float(binom.logsf(agreeing - 3, max(present - 2, 0), min(chance, 1.0)))
+    return float(np.log10(max(tried, 1)) + tail / np.log(10.0))
+
+
+def _refined(
+    earlier: Stretch,
+    later: Stretch,
+    fixed: BoolArray,
+    moved: BoolArray,
+    turn: float,
+    offset: FloatArray,
+    tried: int,
+    settings: LoopSettings,
+) -> Match | None:
+    """Match by least squares over all landmarks that agree; None if too few agree then."""
+    place, target = later.xy[moved], earlier.xy[fixed]
+    centre = place.mean(axis=0)
+    shift = centre + offset - _turned(centre, turn)
+    for _ in range(5):
+        pairs = mutual_pairs(target, _turned(place, turn) + shift, settings.reach_m)
+        if len(pairs) < settings.least_agreeing:
+            return None
+        turn, shift = fit_motion(place[pairs[:, 1]], target[pairs[:, 0]])
+    after = _turned(place, turn) + shift
+    nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
+    present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
+    chance = len(target) * np.pi * settings.reach_m**2 / _covered_area(target)
+    return Match(
+        earlier.middle_frame,
+        later.middle_frame,
+        np.stack([earlier.labels[fixed][pairs[:, 0]], later.labels[moved][pairs[:, 1]]], axis=1),
+        turn,
+        shift,
+        log10_false_alarms(len(pairs), present, chance, tried),
+    )
+
+
+def _covered_area(xy: FloatArray) -> float:
+    """Area within the cover distance of any point (m^2), on a grid."""
+    low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
+    xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
+    squared = (xs[None, :, None] - xy[:, 0, None, None]) ** 2 + (
+        ys[None, None, :] - xy[:, 1, None, None]
+    ) ** 2
+    return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
+
+
+def _turned(xy: FloatArray, turn: float) -> FloatArray:
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.stack([cos * xy[..., 0] - sin * xy[..., 1], sin * xy[..., 0] + cos * xy[..., 1]], -1)

@@ -1,0 +1,350 @@
+"""Which rows of a run show the same landmark: frame to frame, then from place to place.
+
+First, every row is associated with recently seen landmarks
+(`redetect.slam.association.frame_to_frame`). The result is nearly always right, but a landmark that
+is seen again later has several labels. Then loops are detected (`redetect.slam.association.loops`)
+and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_path`) in
+rounds. The first round searches within the possible drift of the odometry, later rounds everywhere,
+since each closed loop reduces the map's distortion. Verticals, which the local association often
+confuses, are then associated again along the path that the discs give
+(`redetect.slam.association.line_points`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from redetect.landmarks import wrap_angle
+from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally
+from redetect.slam.association.line_points import PointSettings, lines_by_points
+from redetect.slam.association.local_map import tilt_jacobian
+from redetect.slam.association.loop_closing import (
+    closed_path,
+    in_order,
+    merge_labels,
+    pairs_by_votes,
+    pairs_in_place,
+)
+from redetect.slam.association.loop_path import Solution, intersect_bearings, solve_path
+from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
+from redetect.slam.errors import SlamError
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
+from redetect.slam.models.motion import chain_steps, rotation
+from redetect.slam.recording import Recording
+from redetect.storage.bounds import PROBABILITY, demand, whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Progress = Callable[[str], None]
+
+# Share of the labels of one landmark that are compatible by position.
+_SAME_PLACE = 0.999
+# Edges of one door frame may be 0.1 m apart.
+_LINE_REACH_M = 0.05
+# Longer than a landmark is in view or waited for by the local map.
+_ATTACHED_FRAMES = 200
+
+
+@dataclass(frozen=True)
+class AssociateSettings:
+    """How a run is associated.
+
+    Attributes
+    ----------
+    local : LocalSettings
+        From frame to frame.
+    map_level : bool
+        Whether loops are detected.
+    loops : LoopSettings
+        Settings of the first round.
+    points : PointSettings
+        How verticals are then associated along the path that the discs give.
+    most_rounds : int
+        Largest number of rounds.
+    kept_probability : float
+        Share of a disc's right rows that keep its label at the end, by their covariances as stated;
+        those farther from its place in the map lose it.
+    fewest_rows : int
+        A disc of fewer such rows is taken for clutter.
+    """
+
+    local: LocalSettings = field(default_factory=LocalSettings)
+    map_level: bool = True
+    loops: LoopSettings = field(default_factory=LoopSettings)
+    points: PointSettings = field(default_factory=PointSettings)
+    most_rounds: int = 6
+    kept_probability: float = 0.99
+    fewest_rows: int = 3
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            most_rounds=whole(1),
+            kept_probability=PROBABILITY,
+            fewest_rows=whole(1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RunAssociation:
+    """Labels of a run's rows, numbered from 0 in the order of first sight.
+
+    Attributes
+    ----------
+    circle_labels, line_labels : (n,) int64
+        Of each row at the end; -1 where a row of a disc fits none, or none that is seen often.
+    local_circle_labels, local_line_labels : (n,) int64
+        From frame to frame only.
+    matches : tuple of Match
+        The loops that were closed.
+    path : (N + 1, 3) float64 or None
+        The path that goes with them; None without map level.
+    incomplete_frames : int
+        Frames whose joint search was cut short.
+    """
+
+    circle_labels: IntArray
+    line_labels: IntArray
+    local_circle_labels: IntArray
+    local_line_labels: IntArray
+    matches: tuple[Match, ...]
+    path: FloatArray | None
+    incomplete_frames: int
+
+
+def associate_run(
+    recording: Recording,
+    settings: AssociateSettings | None = None,
+    *,
+    camera_xy: tuple[float, float] = (0.0, 0.0),
+    progress: Progress | None = None,
+) -> RunAssociation:
+    """Find which rows show the same landmark, ignoring IDs in the file.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    settings : AssociateSettings, optional
+    camera_xy : (2,)
+        The camera's centre in the robot frame (m); only bearings of lines need it.
+    progress : callable, optional
+        Called with a description of the current stage.
+
+    Returns
+    -------
+    RunAssociation
+    """
+    setting = settings or AssociateSettings()
+    report = progress or (lambda _: None)
+    both = len(recording.circles) > 0 and len(recording.lines) > 0
+    local = associate_locally(
+        recording,
+        # Bearings say more of a frame's heading than discs, whose sway would only blur it.
+        replace(setting.local, tilt_sigma_rad=0.0) if both else setting.local,
+        camera_xy=camera_xy,
+        progress=lambda done: report(f"frame {done} of {len(recording)}"),
+    )
+    incomplete = local.incomplete
+    if both:
+        # Discs help to associate lines; lines are often confused and would only harm the discs.
+        discs_alone = associate_locally(_without_lines(recording), setting.local)
+        local = replace(local, circle_labels=discs_alone.circle_labels)
+    circle_labels, line_labels = local.circle_labels, local.line_labels
+    matches: list[Match] = []
+    path = None
+    if setting.map_level:
+        # The map is built from discs if there are any: their rows give positions.
+        by_discs = len(recording.circles) > 0
+        rows = recording.circles if by_discs else recording.lines
+        labels = circle_labels if by_discs else line_labels
+        solution = _solved(recording, by_discs, labels, None, setting, camera_xy)
+        loops = setting.loops
+        swayed = _swayed(recording, setting.local)
+        for number in range(setting.most_rounds):
+            xy = solution.circle_xy if by_discs else solution.line_xy
+            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
+            found = find_matches(
+                stretches,
+                loops,
+                lambda text, n=number: report(f"round {n + 1}: {text}"),  # type: ignore[misc]
+            )
+            labels, matched = merge_labels(rows.frame, labels, pairs_by_votes(found))
+            path = closed_path(solution.path, found) if found else solution.path
+            solution = _solved(recording, by_discs, labels, path, setting, camera_xy)
+            xy = solution.circle_xy if by_discs else solution.line_xy
+            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
+            spread = _isotropic(len(xy), loops.reach_m)
+            if by_discs:
+                spread = _spread(swayed, solution.path, labels, setting.local.sigma_scale)
+            pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
+            labels, in_place = merge_labels(rows.frame, labels, pairs)
+            if in_place:
+                solution = _solved(recording, by_discs, labels, solution.path, setting, camera_xy)
+            matches += found
+            everywhere = replace(
+                loops,
+                most_turn_rad=np.pi,
+                most_shift_m=np.inf,
+                later_step=2,
+                earlier_step=3,
+                attached_frames=_ATTACHED_FRAMES,
+            )
+            if matched + in_place == 0 and loops == everywhere:
+                break
+            loops = everywhere
+        path = solution.path
+        if by_discs:
+            circle_labels = _without_clutter(recording, labels, path, setting)
+            if len(line_labels):
+                report("verticals on the path of the discs")
+                line_labels, path_of_both = lines_by_points(
+                    recording,
+                    path,
+                    labels,
+                    line_labels,
+                    setting.points,
+                    camera_xy=camera_xy,
+                    disc_sigma_scale=setting.local.sigma_scale,
+                )
+                line_labels = _merged_lines(
+                    recording, path_of_both, line_labels, setting, camera_xy
+                )
+        else:
+            line_labels = labels
+    return RunAssociation(
+        in_order(circle_labels),
+        in_order(line_labels),
+        in_order(local.circle_labels),
+        in_order(local.line_labels),
+        tuple(matches),
+        path,
+        incomplete,
+    )
+
+
+def _solved(
+    recording: Recording,
+    by_discs: bool,
+    labels: IntArray,
+    path: FloatArray | None,
+    setting: AssociateSettings,
+    camera_xy: tuple[float, float],
+) -> Solution:
+    """Path and map by discs, or by lines where there are no discs."""
+    line_xy = None
+    if not by_discs:
+        start = chain_steps(recording.steps) if path is None else path
+        line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+    none = np.zeros(len(recording.lines), dtype=np.int64)
+    return solve_path(
+        _swayed(recording, setting.local),
+        labels if by_discs else none[:0],
+        none if by_discs else labels,
+        path,
+        line_xy,
+        camera_xy=camera_xy,
+        sigma_scale=setting.local.sigma_scale,
+    )
+
+
+def _without_lines(recording: Recording) -> Recording:
+    none = recording.lines
+    empty = replace(
+        none, frame=none.frame[:0], bearing_rad=none.bearing_rad[:0], sigma_rad=none.sigma_rad[:0]
+    )
+    return replace(recording, lines=replace(empty, ids=()))
+
+
+def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
+    """The run with the robot's sway in its discs' covariances."""
+    if setting.tilt_sigma_rad == 0.0:
+        return recording
+    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy, setting.camera_height_m)
+    covariance = recording.circles.covariance + moving @ moving.swapaxes(1, 2)
+    return replace(recording, circles=replace(recording.circles, covariance=covariance))
+
+
+def _without_clutter(
+    recording: Recording, labels: IntArray, path: FloatArray, setting: AssociateSettings
+) -> IntArray:
+    """Labels of discs, -1 for rows that fit none, and for those of discs that too few rows fit."""
+    gate = chi2.ppf(setting.kept_probability, 2)
+    circles = recording.circles
+    kept = np.ones(len(labels), dtype=np.bool_)
+    none = np.zeros(0, dtype=np.int64)
+    # The second time without the rows that the first one found.
+    for _ in range(2):
+        known, numbers = np.unique(labels[kept], return_inverse=True)
+        fitting = replace(
+            circles,
+            frame=circles.frame[kept],
+            xy=circles.xy[kept],
+            covariance=circles.covariance[kept],
+        )
+        solution = solve_path(
+            _without_lines(replace(recording, circles=fitting)), numbers, none, path
+        )
+        path = solution.path
+        places = np.full((int(labels.max(initial=-1)) + 1, 2), np.nan)
+        places[known] = solution.circle_xy
+        off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
+        whitened = np.linalg.solve(circles.covariance, off[..., None])[..., 0]
+        kept = np.sum(off * whitened, axis=1) <= gate
+        kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= setting.fewest_rows
+    return np.where(kept, labels, -1)
+
+
+def _spread(
+    recording: Recording, path: FloatArray, labels: IntArray, sigma_scale: float
+) -> FloatArray:
+    """(M, 2, 2) how far labels of one disc may lie from each other in the map, as covariances.
+
+    The mean information of a label's rows: their errors are common (calibration, lean, one side of
+    the disc), so that many rows are hardly better than one.
+    """
+    circles = recording.circles
+    turn = rotation(path[circles.frame + 1, 2])
+    information = np.linalg.inv(sigma_scale**2 * turn @ circles.covariance @ turn.swapaxes(1, 2))
+    count = np.bincount(labels)
+    total = np.zeros((len(count), 2, 2))
+    np.add.at(total, labels, information)
+    return np.asarray(count[:, None, None] * np.linalg.inv(total))
+
+
+def _isotropic(count: int, reach_m: float) -> FloatArray:
+    """(count, 2, 2) covariances with which positions are compatible up to a distance."""
+    return np.tile(0.5 * reach_m**2 / chi2.ppf(_SAME_PLACE, 2) * np.eye(2), (count, 1, 1))
+
+
+def _merged_lines(
+    recording: Recording,
+    path: FloatArray,
+    labels: IntArray,
+    setting: AssociateSettings,
+    camera_xy: tuple[float, float],
+) -> IntArray:
+    """Labels of lines, those at the same position in the map merged, -1 for clutter."""
+    if len(labels) == 0:
+        return labels
+    for _ in range(setting.most_rounds):
+        xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
+        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording), setting.loops)
+        pairs = pairs_in_place(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
+        labels, merged = merge_labels(recording.lines.frame, labels, pairs)
+        if merged == 0:
+            break
+    lines = recording.lines
+    xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)[labels]
+    off = bearing_of_vertical(path[lines.frame + 1], xy, camera_xy) - lines.bearing_rad
+    # Lines without a place have nothing that their rows could contradict.
+    gate = lines.sigma_rad * np.sqrt(chi2.ppf(setting.kept_probability, 1))
+    kept = ~(np.abs(wrap_angle(off)) > gate)
+    kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= setting.fewest_rows
+    return np.where(kept, labels, -1)

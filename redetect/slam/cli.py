@@ -1,0 +1,33 @@
+"""The command ``slam``.
+
+Exit codes: 0 all went well; 1 the command could not be carried out; 2 the command line was wrong;
+130 it was interrupted, and wrote nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from redetect.slam.options import Associate, Audit, Ekf, Export, Import, Localize, Map, Noise
+from redetect.storage.command_line import Program
+
+PROGRAM = Program(
+    "slam",
+    "Uses of landmarks: map, localisation, SLAM, association, noise.\n\n"
+    "Example: slam map images/e --circles --lines -o /tmp/e-map",
+    {
+        Map: "redetect.slam.commands.map",
+        Audit: "redetect.slam.commands.audit",
+        Localize: "redetect.slam.commands.localize",
+        Ekf: "redetect.slam.commands.ekf",
+        Associate: "redetect.slam.commands.associate",
+        Noise: "redetect.slam.commands.noise",
+        Export: "redetect.slam.commands.export",
+        Import: "redetect.slam.commands.export",
+    },
+)
+
+main, parsed = PROGRAM.main, PROGRAM.parsed
+
+if __name__ == "__main__":
+    sys.exit(main())

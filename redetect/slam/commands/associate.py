@@ -1,0 +1,242 @@
+"""``slam associate``: identifiers for a run's rows, and how well they agree with the file's own."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from redetect import slam
+from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
+from redetect.slam.association.frame_to_frame import LocalSettings
+from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
+from redetect.slam.association.score import AssociationScore, score_association
+from redetect.slam.commands.filter_input import read_run_of
+from redetect.slam.errors import SlamError
+from redetect.slam.noise import with_relative_noise
+from redetect.slam.options import Associate
+from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
+from redetect.storage import OutputExistsError, write_whole
+from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, demand, from_to, whole
+
+#: Of each kind's rows those before and those after the map level.
+Scores = dict[str, dict[str, AssociationScore]]
+
+
+def perform(options: Associate) -> int:
+    """Carry the command out; returns the exit code.
+
+    Raises
+    ------
+    SlamError, redetect.landmarks.LandmarkFileError, redetect.storage.OutputExistsError, OSError
+        If the run cannot be read, a setting makes no sense or an output exists.
+    """
+    demand(
+        options,
+        SlamError,
+        gate_probability=PROBABILITY,
+        kept_probability=PROBABILITY,
+        fewest_rows=whole(1),
+        sigma_scale=ABOVE_0,
+        tilt_sigma_deg=from_to(0.0, 45.0),
+        noise=NOT_NEGATIVE,
+        seed=whole(0),
+    )
+    circles = options.circles or not options.lines
+    settings = AssociateSettings(
+        local=LocalSettings(
+            method=options.method,
+            gate_probability=options.gate_probability,
+            sigma_scale=options.sigma_scale,
+            tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
+        ),
+        map_level=options.map_level,
+        kept_probability=options.kept_probability,
+        fewest_rows=options.fewest_rows,
+    )
+    sources = _sources(options, circles)
+    targets = [_target(options.output, source, len(sources) > 1) for source in sources]
+    report = targets[0].with_suffix(".json")
+    for path in (*targets, report):
+        if path.exists() and not options.force:
+            raise OutputExistsError(path)
+    recording, centre = read_run_of(options)
+    camera_xy = (float(centre[0]), float(centre[1]))
+
+    runs: list[dict[str, Any]] = []
+    for factor in (0.0, *options.noise):
+        noisy = with_relative_noise(recording, factor, options.seed) if factor else recording
+        # The rows' own gate grows with their covariances.
+        began = time.perf_counter()
+        found = associate_run(noisy, settings, camera_xy=camera_xy, progress=_progress)
+        seconds = time.perf_counter() - began
+        _progress("")
+        scores = score_run(recording, found)
+        runs.append(
+            {
+                "noise": factor,
+                "seconds": round(seconds, 2),
+                "loop_matches": len(found.matches),
+                "incomplete_frames": found.incomplete_frames,
+                "scores": {
+                    kind: {stage: asdict(score) for stage, score in stages.items()}
+                    for kind, stages in scores.items()
+                },
+            }
+        )
+        print("\n".join(score_lines(factor, seconds, scores)))
+        if factor == 0.0:
+            result = found
+
+    for source, target in zip(sources, targets):
+        rows = list(read_rows(source))
+        write_rows(target, identified_rows(rows, result, source), overwrite=options.force)
+        print(f"{target}: {_counted(rows, result)}")
+    content = {
+        "version": slam.__version__,
+        "run": str(options.run),
+        "settings": asdict(settings),
+        "seed": options.seed,
+        "runs": runs,
+    }
+    with write_whole(report, overwrite=options.force) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    return 0
+
+
+def score_run(recording: Recording, found: RunAssociation) -> Scores:
+    """Score the association with the file's own IDs.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run with its IDs.
+    found : RunAssociation
+        Of the same rows.
+
+    Returns
+    -------
+    dict
+        ``scores["circles"]["local"]`` and so on, for kinds of which a row has an ID; the stages
+        are ``local`` and, after the map level, ``map``.
+    """
+    discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
+    scores: Scores = {}
+    for kind, ids, local, final in (
+        ("circles", discs, found.local_circle_labels, found.circle_labels),
+        ("lines", list(recording.lines.ids), found.local_line_labels, found.line_labels),
+    ):
+        if any(ids):
+            scores[kind] = {"local": score_association(local, ids)}
+            if found.path is not None:
+                scores[kind]["map"] = score_association(final, ids)
+    return scores
+
+
+def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
+    """The scores as lines of a table for the terminal.
+
+    Parameters
+    ----------
+    noise : float
+        Factor of the noise that was added.
+    seconds : float
+        What the association took.
+    scores : dict
+        See `score_run`.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = [f"noise {noise:g}: {seconds:.1f} s" + ("" if scores else ", no IDs to score against")]
+    for kind, stages in scores.items():
+        for stage, s in stages.items():
+            lines.append(
+                f"  {kind:7} {stage:5}  pairs: precision {s.pair_precision:.4f} recall "
+                f"{s.pair_recall:.4f}  rows right {s.right_rows:.4f}  landmarks "
+                f"{s.found_landmarks} of {s.true_landmarks}  wrong merges {s.wrong_merges}  "
+                f"splits {s.splits}  without label {s.unlabelled_rows}"
+            )
+    return lines
+
+
+def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
+    """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        The file's.
+    found : RunAssociation
+        Its discs or lines, in the order of the file.
+    source : Path
+        The file, for the message.
+
+    Yields
+    ------
+    Row
+
+    Raises
+    ------
+    SlamError
+        If the file has other rows than those associated.
+    """
+    counts = {
+        kind: sum(isinstance(row.record, kind) for row in rows)
+        for kind in (CircleLandmark, LineLandmark)
+    }
+    expected = (len(found.circle_labels), len(found.line_labels))
+    for count, size in zip(counts.values(), expected):
+        if count not in (0, size):
+            raise SlamError(f"{source}: {count} rows of a kind: expected the {size} associated")
+    circle, line = (
+        iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
+        for labels in (found.circle_labels, found.line_labels)
+    )
+    for row in rows:
+        if isinstance(row.record, CircleLandmark):
+            yield row.with_record(replace(row.record, ids=(next(circle),)))
+        elif isinstance(row.record, LineLandmark):
+            yield row.with_record(replace(row.record, ids=(next(line),)))
+        else:
+            yield row
+
+
+def _counted(rows: Sequence[Row], found: RunAssociation) -> str:
+    """How many landmarks of each kind in a file were found."""
+    parts = []
+    for kind, labels, name in (
+        (CircleLandmark, found.circle_labels, "discs"),
+        (LineLandmark, found.line_labels, "lines"),
+    ):
+        if any(isinstance(row.record, kind) for row in rows):
+            parts.append(f"{labels.max() + 1} {name}")
+            if np.any(labels < 0):
+                parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that show none of them"
+    return ", ".join(parts) or "no landmarks"
+
+
+def _sources(options: Associate, circles: bool) -> list[Path]:
+    if not options.run.is_dir():
+        return [options.run]
+    wanted = [*([".circles"] if circles else []), *([".lines"] if options.lines else [])]
+    return [landmark_file(options.run, suffix, options.stem) for suffix in wanted]
+
+
+def _target(output: Path | None, source: Path, several: bool) -> Path:
+    if output is None:
+        return source.with_name(f"associated{source.suffix}")
+    return output.with_suffix(source.suffix) if several else output
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)

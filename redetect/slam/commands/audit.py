@@ -1,0 +1,186 @@
+"""``slam audit``: rows whose identifier contradicts the rest, and the run without them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from camera import Camera
+from redetect import slam
+from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.commands.run_rows import recording_of
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.audit import Audit, Group, audit_run
+from redetect.slam.models.mounted_discs import rotation_exp
+from redetect.slam.options import Audit as Options
+from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
+from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
+from redetect.storage import OutputExistsError, write_whole
+from redetect.storage.bounds import ABOVE_0, demand
+
+_COLUMNS = (
+    *("frame", "prefix", "line", "id", "kind", "new_id", "x_m", "y_m"),
+    *("from_own_m", "row_chi_squared", "chi_squared", "mended_chi_squared"),
+)
+# Keyword and numbers of a row before its identifiers.
+_WORDS_BEFORE_IDS = 7
+_WORD = re.compile(rb"\S+")
+
+
+def perform(options: Options) -> int:
+    """Carry the command out; returns the exit code."""
+    demand(options, SlamError, gate=ABOVE_0)
+    source = options.run
+    if source.is_dir():
+        source = landmark_file(source, ".circles", options.stem)
+    target = options.output or source.with_name("audited.circles")
+    for path in (target, target.with_suffix(".csv")):
+        if path.exists() and not options.force:
+            raise OutputExistsError(path)
+    recording = recording_of(options)
+    camera = None
+    if options.calibrate or options.pictures:
+        camera = camera_of_run(options.images or options.run, options.camera)
+    audit = audit_run(
+        recording,
+        camera if options.calibrate else None,
+        calibrate=options.calibrate,
+        gate=options.gate,
+        name=str(options.run),
+    )
+    rows = list(read_rows(source))
+    write_rows(target, audited_rows(rows, audit, options.apply), overwrite=options.force)
+    with write_whole(target.with_suffix(".csv"), overwrite=options.force) as stream:
+        stream.write(_table(recording, audit, rows, source.name).encode("utf-8", "surrogateescape"))
+    for line in _report(recording, audit):
+        print(line)
+    print(f"{target}, {target.with_suffix('.csv').name}")
+    if options.pictures is not None and camera is not None:
+        images = options.images or source.parent
+        _draw(options, images, camera, audit, list(read_frames(source)))
+    return 0
+
+
+def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
+    """Rows of a file, those that contradict mended or left out; all other bytes as they were.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        The file's.
+    audit : Audit
+        Of its discs.
+    apply : "mend" or "drop"
+        Give rows their new identifier (-1 where nothing explains them), or leave them out.
+
+    Yields
+    ------
+    Row
+    """
+    new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
+    disc = -1
+    for row in rows:
+        disc += isinstance(row.record, CircleLandmark)
+        if not isinstance(row.record, CircleLandmark) or disc not in new_id:
+            yield row
+        elif apply == "mend":
+            yield _with_id(row, row.record, new_id[disc])
+
+
+def _with_id(row: Row, record: CircleLandmark, number: int) -> Row:
+    """A row whose first known identifier is another; the rest of its text remains."""
+    place = next(k for k, i in enumerate(record.ids) if i >= 0)
+    ids = (*record.ids[:place], number, *record.ids[place + 1 :])
+    if number == UNKNOWN_ID:
+        ids = (UNKNOWN_ID,)
+    changed = replace(record, ids=ids)
+    # Continuation lines may break a word; rows with them are laid out anew.
+    if row.source is None or b"\\" in row.source or len(ids) != len(record.ids):
+        return row.with_record(changed)
+    word = list(_WORD.finditer(row.source))[_WORDS_BEFORE_IDS + place]
+    source = row.source[: word.start()] + b"%d" % number + row.source[word.end() :]
+    return Row(changed, source, row.line)
+
+
+def _table(recording: Recording, audit: Audit, rows: Iterable[Row], name: str) -> str:
+    """The list of rows that contradict, as CSV."""
+    line = [row.line for row in rows if isinstance(row.record, CircleLandmark)]
+    text = io.StringIO()
+    text.write(f"# slam audit {slam.__version__}: {name}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for group in audit.groups:
+        for k, (x, y), own in zip(group.rows, group.xy, group.row_chi_squared):
+            frame = int(recording.circles.frame[k])
+            numbers = (group.own_m, own, group.chi_squared, group.mended_chi_squared)
+            writer.writerow(
+                [frame, recording.prefixes[frame], line[k], group.id, group.kind, group.new_id]
+                + [f"{value:.3f}" for value in (x, y)]
+                + ["" if np.isnan(value) else f"{value:.2f}" for value in numbers]
+            )
+    return text.getvalue()
+
+
+def _frames_of(recording: Recording, group: Group) -> str:
+    first, last = recording.circles.frame[group.rows[[0, -1]]]
+    return f"{first}" if first == last else f"{first}-{last}"
+
+
+def _report(recording: Recording, audit: Audit) -> list[str]:
+    head = f"{'frames':<12}{'rows':>5}{'ID':>7}  {'at (m)':<18}{'off by':>8}{'chi-squared':>13}"
+    lines = [f"{head}  shows"]
+    for group in audit.groups:
+        shows = {
+            "exchange": f"{group.new_id}: chi-squared {group.mended_chi_squared:.1f}",
+            "split": f"one of its own, {group.new_id}: chi-squared {group.mended_chi_squared:.1f}",
+            "drop": "no landmark",
+        }[group.kind]
+        x, y = np.median(group.xy, axis=0)
+        lines.append(
+            f"{_frames_of(recording, group):<12}{len(group.rows):>5}{group.id:>7}  "
+            f"{f'{x:.2f}, {y:.2f}':<18}{group.own_m:>6.2f} m{group.chi_squared:>13,.1f}  {shows}"
+        )
+    lines.append(f"{'':<12}{'rows':>8}{'discs':>8}{'chi-squared':>14}{'expected':>10}{'factor':>8}")
+    for name, table in (
+        ("as written", audit.before),
+        ("dropped", audit.dropped),
+        ("mended", audit.mended),
+    ):
+        lines.append(
+            f"{name:<12}{table.measurements:>8,}{table.landmarks:>8,}{table.chi_squared:>14,.2f}"
+            f"{table.expected:>10,}{table.factor:>8.2f}"
+        )
+    return lines
+
+
+def _draw(
+    options: Options, images: Path, camera: Camera, audit: Audit, frames: list[Frame]
+) -> None:
+    """Crops of the images at the rows of each group."""
+    assert options.pictures is not None
+    seen = [(k, disc) for k, frame in enumerate(frames) for disc in frame.circles]
+    drawn = 0
+    for group in audit.groups:
+        crops = []
+        for row in group.rows:
+            k, disc = seen[row]
+            file = picture_of_frame(images, frames[k].step.prefix)
+            if file is not None:
+                # Levelled positions are turned back to where the camera saw them.
+                turn, _ = rotation_exp(np.array([*(frames[k].levelled_by or (0.0, 0.0)), 0.0]))
+                u, v = camera.project_robot(np.array([disc.px, disc.py, 0.0]) @ turn)
+                crops.append(Crop(file, (float(u), float(v)), f"{k}"))
+        if crops:
+            options.pictures.mkdir(parents=True, exist_ok=True)
+            name = f"frame-{seen[group.rows[0]][0]:04d}-id-{group.id}.png"
+            title = f"ID {group.id}: {group.kind}"
+            draw_crops(options.pictures / name, crops, title=title, overwrite=options.force)
+            drawn += 1
+    print(f"{options.pictures}: pictures of {drawn} of {len(audit.groups)} groups")

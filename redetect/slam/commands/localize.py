@@ -1,0 +1,83 @@
+"""The command ``slam localize``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from redetect import slam
+from redetect.landmarks.map_file import read_map, write_path
+from redetect.slam.commands.filter_input import default_output, read_reference, read_run_of
+from redetect.slam.commands.filter_output import (
+    ERROR_PICTURE,
+    MAP_PICTURE,
+    PATH_NAME,
+    demand_free,
+    draw_results,
+    timed,
+    write_json,
+)
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.association import Associator
+from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
+from redetect.slam.filters.report import path_distance, summary, table
+from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
+from redetect.slam.options import Localize
+from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
+
+JSON_NAME = "localize.json"
+
+
+def perform(command: Localize) -> int:
+    """Localise in a run; returns the exit code."""
+    output = command.output or default_output(command.run, "localize")
+    names = (PATH_NAME, JSON_NAME, MAP_PICTURE, *([ERROR_PICTURE] if command.reference else []))
+    associator = Associator(command.association, command.gate_probability)
+    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
+    landmark_map = read_map(command.map)
+    map_errors = _map_errors(command)
+    considered = map_errors == "considered"
+    joint = read_joint_covariance(command.map, landmark_map) if considered else None
+    recording, camera_xy = read_run_of(command)
+    demand_free(output, names, overwrite=command.force)
+    localizer = Localizer(
+        landmark_map,
+        command.start,
+        np.diag(np.square(command.start_sigma)),
+        camera_xy,
+        map_errors=map_errors,
+        joint_covariance=joint,
+    )
+    run, time_line = timed(lambda: run_localizer(recording, localizer, associator))
+    if not run.count.discs and not run.count.lines:
+        raise SlamError(
+            f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
+            "same run, or --association joint"
+        )
+    reference = read_reference(command.reference, run.path) if command.reference else None
+    distance = path_distance(run.path, reference.poses) if reference else None
+    write_path(
+        output / PATH_NAME,
+        run.path,
+        [f"slam localize {slam.__version__}: {command.run} in {command.map}"],
+        overwrite=command.force,
+    )
+    content = summary(run, command, distance)
+    content["map_errors"] = map_errors if joint is None else f"{map_errors}, jointly"
+    write_json(output / JSON_NAME, content, overwrite=command.force)
+    print("\n".join(table(run, distance)))
+    if considered and joint is None:
+        print(f"errors of the map taken as independent: no {covariance_file(command.map).name}")
+    print(time_line)
+    draw_results(
+        output, landmark_map, run.path, reference, f"{command.run.name}: localised", command
+    )
+    return 0
+
+
+def _map_errors(command: Localize) -> MapErrors:
+    """How the map's errors are treated, where that is not said."""
+    if command.map_errors != "auto":
+        return command.map_errors
+    # Considering them makes the filter slow to pull itself back onto the map, which costs little
+    # as long as the pairs are right, and the track if they are to be found.
+    return "considered" if command.association == "known" else "ignored"

@@ -1,0 +1,192 @@
+"""The command ``slam map``: files in, map, path, table and picture out."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from redetect import slam
+from redetect.landmarks.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
+from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.commands.run_rows import recording_of
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.chi_squared import as_json, table_lines
+from redetect.slam.mapping.covariance_file import (
+    covariance_file,
+    joint_covariance,
+    write_joint_covariance,
+)
+from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.run_map import (
+    LeftOut,
+    MappedRun,
+    Mounting,
+    landmark_map,
+    map_run,
+    path_of,
+)
+from redetect.slam.options import Map
+from redetect.slam.pictures import draw_map
+from redetect.slam.recording import Recording
+from redetect.storage import OutputExistsError, write_whole
+from redetect.storage.bounds import FINITE, demand
+
+MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
+
+
+#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
+MOST_LANDMARKS_TOGETHER = 5000
+
+
+def perform(command: Map) -> int:
+    """Carry the command out; 0 if all went well."""
+    _check(command)
+    output = (
+        command.output or (command.run if command.run.is_dir() else command.run.parent) / "slam"
+    )
+    joint_name = covariance_file(Path(MAP_NAME)).name
+    for name in (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME):
+        if (output / name).exists() and not command.force:
+            raise OutputExistsError(output / name)
+    recording = recording_of(command)
+    weighting = Weighting(
+        loss=command.loss,
+        loss_scale=command.loss_scale,
+        calibrate=command.calibrate,
+        row_errors=command.row_errors,
+        tilt_sigma_rad=math.radians(command.tilt_deg),
+    )
+    camera = None
+    if command.calibrate or command.tilt_deg or len(recording.lines):
+        camera = camera_of_run(command.run, command.camera)
+    begin = time.perf_counter()
+    mapped = map_run(
+        recording,
+        camera,
+        weighting,
+        start=command.start,
+        solver=command.solver,
+        name=str(command.run),
+    )
+    seconds = time.perf_counter() - begin
+
+    output.mkdir(parents=True, exist_ok=True)
+    head = [f"slam map {slam.__version__}: {command.run.resolve().name}"]
+    final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
+    path = path_of(recording, mapped.estimate, mapped.covariance)
+    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
+    if few:
+        joint = joint_covariance(mapped.graph, mapped.estimate, weighting)
+        write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
+    else:
+        # One of another map must not stay beside this one.
+        (output / joint_name).unlink(missing_ok=True)
+    write_path(output / PATH_NAME, path, head, overwrite=command.force)
+    with write_whole(output / TABLE_NAME, overwrite=command.force) as stream:
+        stream.write((json.dumps(_results(mapped, command), indent=1) + "\n").encode())
+    for line in _report(mapped, seconds):
+        print(line)
+    if not few:
+        print(
+            f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
+            "localize` takes their errors to be independent"
+        )
+    _draw(mapped, final, path, recording, output, command)
+    print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
+    return 0
+
+
+def _check(command: Map) -> None:
+    demand(command, SlamError, start=FINITE)
+    if not (math.isfinite(command.loss_scale) and command.loss_scale > 0.0):
+        raise SlamError(f"--loss-scale {command.loss_scale:g}: expected above 0")
+    if not (0.0 <= command.tilt_deg < 45.0):
+        raise SlamError(f"--tilt-deg {command.tilt_deg:g}: expected from 0 to below 45")
+    if command.tilt_deg and command.row_errors != "recorded":
+        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
+
+
+def _report(mapped: MappedRun, seconds: float) -> list[str]:
+    lines = table_lines(mapped.table)
+    if mapped.cost < mapped.table.chi_squared * (1.0 - 1e-9):
+        lines.append(f"{'minimised, under the loss':<28}{mapped.cost:>12,.2f}")
+    if mapped.mounting is not None:
+        lines += _mounting_lines(mapped.mounting)
+    lines += _left_out_lines(mapped.left_out)
+    lines.append(f"{mapped.steps} steps, {seconds:.2f} s")
+    return lines
+
+
+def _mounting_lines(mounting: Mounting) -> list[str]:
+    sigma = np.sqrt(np.diag(mounting.covariance))
+    names = ("rotation about x", "rotation about y", "rotation about z", "height")
+    units = ("rad", "rad", "rad", "m")
+    lines = [
+        f"{name:<28}{value:>12.4f} +- {spread:.4f} {unit}"
+        for name, value, spread, unit in zip(names, mounting.change, sigma, units)
+    ]
+    return [*lines, f"{'gained by the mounting':<28}{mounting.gain:>12,.2f}"]
+
+
+def _left_out_lines(left_out: LeftOut) -> list[str]:
+    said = [
+        (left_out.rows_without_id, "rows without an identifier were not used"),
+        (left_out.discs_seen_once, "discs were seen once"),
+        (left_out.lines_without_parallax, "lines had too little parallax and are left out"),
+        (left_out.line_rows, "rows of lines show one of those and are left out"),
+    ]
+    return [f"{count} {what}" for count, what in said if count]
+
+
+def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:
+    configuration = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in asdict(command).items()
+        if name not in ("output", "force", "interactive")
+    }
+    results: dict[str, Any] = {
+        "version": slam.__version__,
+        "configuration": configuration,
+        "table": as_json(mapped.table),
+        "minimised": mapped.cost,
+        "steps": mapped.steps,
+        "left_out": asdict(mapped.left_out),
+    }
+    if mapped.mounting is not None:
+        results["mounting"] = {
+            "rotation_rad": mapped.mounting.change[:3].tolist(),
+            "height_m": float(mapped.mounting.change[3]),
+            "covariance": mapped.mounting.covariance.tolist(),
+            "robot_from_camera": mapped.mounting.robot_from_camera.tolist(),
+            "chi_squared_gained": mapped.mounting.gain,
+        }
+    return results
+
+
+def _draw(
+    mapped: MappedRun,
+    final: LandmarkMap,
+    path: Path2D,
+    recording: Recording,
+    output: Path,
+    command: Map,
+) -> None:
+
+    first = landmark_map(mapped.graph, mapped.start, None)
+    draw_map(
+        output / PICTURE_NAME,
+        final,
+        path,
+        before=path_of(recording, mapped.start, None),
+        before_map=LandmarkMap(discs=first.discs, lines=no_landmarks()),
+        title=command.run.resolve().name,
+        overwrite=command.force,
+        interactive=command.interactive,
+    )

@@ -1,0 +1,223 @@
+"""Position of a vertical line from bearings at several poses: delayed initialisation.
+
+A line joins the state of EKF-SLAM with all the bearings that were kept of it at once. Their
+linearised equations, in standard deviations,
+
+    r = X dx + L dl + n,    L = (Q1 Q2) (U; 0)
+
+fall into two rows Q1^T that give dl from dx, and the others, Q2^T, in which dl does not appear:
+these are an ordinary measurement of the poses. As Q1 and Q2 are orthogonal, both are independent,
+and each bearing is used once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.landmarks import wrap_angle
+from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map, disc_in_robot
+
+FloatArray = NDArray[np.float64]
+
+_MOST_ITERATIONS = 10
+_CONVERGED_M = 1e-6
+# Of the normal matrix of unit rays: about the square of the angle between them.
+_LEAST_DETERMINANT = 1e-6
+# Nearer to the camera than this a bearing says nothing (m).
+_NEAREST_M = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class LineStart:
+    """A line that joins the state, and what its bearings say of the poses.
+
+    Attributes
+    ----------
+    xy : (2,) float64
+        Its most likely position in the map (m); the equations are linearised there.
+    correction : (2,) float64
+        What the place is off from where Q1's two equations alone have it (m): to be added to it
+        before the residual is used, which takes it back.
+    by_poses : (2, 3 k) float64
+        Its derivative by the k poses.
+    noise : (2, 2) float64
+        Covariance that the bearings add (m^2).
+    residual : (k - 2,) float64
+        Measured less predicted, in standard deviations, of what the bearings say of the poses.
+    residual_by_poses : (k - 2, 3 k) float64
+        Jacobian of that.
+    """
+
+    xy: FloatArray
+    correction: FloatArray
+    by_poses: FloatArray
+    noise: FloatArray
+    residual: FloatArray
+    residual_by_poses: FloatArray
+
+
+def triangulate(
+    poses: FloatArray,
+    bearing_rad: FloatArray,
+    sigma_rad: FloatArray,
+    camera_xy: FloatArray,
+    pose_covariance: FloatArray | None = None,
+) -> FloatArray | None:
+    """The most likely place of a line that bearings from several poses show.
+
+    Parameters
+    ----------
+    poses : (k, 3) float64
+        Poses of the robot in the map, two or more.
+    bearing_rad, sigma_rad : (k,) float64
+        Bearings and their standard deviations.
+    camera_xy : (2,) float64
+        The camera's centre in the robot frame (m).
+    pose_covariance : (3 k, 3 k) float64, optional
+        Of the poses; by default they are exact.
+
+    Returns
+    -------
+    (2,) float64, or None
+        None if the rays have no parallax, or do not meet in front of the camera.
+    """
+    origin = disc_in_map(poses, camera_xy)
+    angle = poses[:, 2] + bearing_rad
+    # A ray looks along (sin, -cos) of its angle; this is across it.
+    across = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    normal = across.T @ across
+    if np.linalg.det(normal) < _LEAST_DETERMINANT:
+        return None
+    xy: FloatArray = np.linalg.solve(normal, across.T @ np.sum(across * origin, axis=1))
+    ahead = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
+    noise = np.diag(sigma_rad**2)
+    for _ in range(_MOST_ITERATIONS):
+        if np.any(np.sum((xy - origin) * ahead, axis=1) < _NEAREST_M):
+            return None
+        by_pose, by_line = bearing_rows(poses, poses, xy, xy, camera_xy)
+        error = wrap_angle(bearing_rad - bearing_of_vertical(poses, xy, camera_xy))
+        covariance = noise
+        if pose_covariance is not None:
+            by_poses = _by_all_poses(by_pose)
+            covariance = by_poses @ pose_covariance @ by_poses.T + noise
+        weighted = np.linalg.solve(covariance, by_line)
+        normal = weighted.T @ by_line
+        if np.linalg.det(normal) <= 1e-12 * np.trace(normal) ** 2:
+            return None
+        change = np.linalg.solve(normal, weighted.T @ error)
+        xy = xy + change
+        if np.hypot(*change) < _CONVERGED_M:
+            return xy
+    return None
+
+
+def _by_all_poses(by_pose: FloatArray) -> FloatArray:
+    """Jacobians of k bearings by their own poses, (k, 3), as one by all of them: (k, 3 k)."""
+    count = len(by_pose)
+    by_poses = np.zeros((count, count, 3))
+    by_poses[np.arange(count), np.arange(count)] = by_pose
+    return by_poses.reshape(count, 3 * count)
+
+
+def bearing_rows(
+    poses: FloatArray,
+    poses_at: FloatArray,
+    line_xy: FloatArray,
+    line_at: FloatArray,
+    camera_xy: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of one line's bearings by the poses and by its place.
+
+    Parameters
+    ----------
+    poses, line_xy : (k, 3), (2,) float64
+        Latest estimates.
+    poses_at, line_at : (k, 3), (2,) float64
+        Where the offset of the line from the robot, which the heading turns, is taken from: the
+        same, or first estimates.
+    camera_xy : (2,) float64
+        The camera's centre in the robot frame (m).
+
+    Returns
+    -------
+    by_pose : (k, 3) float64
+    by_line : (k, 2) float64
+    """
+    seen = disc_in_robot(poses, line_xy) - camera_xy
+    by_seen = np.stack([-seen[:, 1], seen[:, 0]], axis=-1) / np.sum(seen**2, axis=1)[:, None]
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    by_line = np.stack(
+        [by_seen[:, 0] * cos - by_seen[:, 1] * sin, by_seen[:, 0] * sin + by_seen[:, 1] * cos],
+        axis=-1,
+    )
+    offset = line_at - poses_at[:, :2]
+    by_heading = by_line[:, 0] * offset[:, 1] - by_line[:, 1] * offset[:, 0]
+    return np.column_stack([-by_line, by_heading]), by_line
+
+
+def start_line(
+    poses: FloatArray,
+    poses_at: FloatArray,
+    bearing_rad: FloatArray,
+    sigma_rad: FloatArray,
+    camera_xy: FloatArray,
+    pose_covariance: FloatArray,
+) -> LineStart | None:
+    """Place a line by bearings from several poses.
+
+    Parameters
+    ----------
+    poses, poses_at : (k, 3) float64
+        Latest estimates of the poses, and where Jacobians are evaluated.
+    bearing_rad, sigma_rad : (k,) float64
+        The bearings.
+    camera_xy : (2,) float64
+        The camera's centre in the robot frame (m).
+    pose_covariance : (3 k, 3 k) float64
+        Of the poses.
+
+    Returns
+    -------
+    LineStart, or None
+        None if they do not meet; see `triangulate`.
+    """
+    xy = triangulate(poses, bearing_rad, sigma_rad, camera_xy, pose_covariance)
+    if xy is None:
+        return None
+    by_pose, by_line = bearing_rows(poses, poses_at, xy, xy, camera_xy)
+    by_poses = _by_all_poses(by_pose / sigma_rad[:, None])
+    error = wrap_angle(bearing_rad - bearing_of_vertical(poses, xy, camera_xy)) / sigma_rad
+    both, upper = np.linalg.qr(by_line / sigma_rad[:, None], mode="complete")
+    inverse = np.linalg.inv(upper[:2])
+    return LineStart(
+        xy=xy,
+        correction=inverse @ both[:, :2].T @ error,
+        by_poses=-inverse @ both[:, :2].T @ by_poses,
+        noise=inverse @ inverse.T,
+        residual=both[:, 2:].T @ error,
+        residual_by_poses=both[:, 2:].T @ by_poses,
+    )
+
+
+def relative_range_sigma(pose: FloatArray, line_xy: FloatArray, covariance: FloatArray) -> float:
+    """Standard deviation of a line's distance from the robot, over that distance.
+
+    Parameters
+    ----------
+    pose, line_xy : (3,), (2,) float64
+        Of the robot and of the line.
+    covariance : (5, 5) float64
+        Of both.
+
+    Returns
+    -------
+    float
+    """
+    offset = line_xy - pose[:2]
+    distance = float(np.hypot(*offset))
+    sight = offset / distance
+    along = np.array([-sight[0], -sight[1], 0.0, sight[0], sight[1]])
+    return float(np.sqrt(max(along @ covariance @ along, 0.0))) / distance

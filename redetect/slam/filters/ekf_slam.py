@@ -1,0 +1,371 @@
+"""EKF-SLAM: the pose and all landmarks with one joint covariance, updated frame by frame in place.
+
+Landmarks join the state when they are first seen, with the correlations that follow from the pose
+they were seen from (Smith, Self, Cheeseman: Estimating uncertain spatial relationships in robotics,
+1990). All rows of a frame are one measurement, so that all of them are linearised at the pose the
+odometry leads to.
+
+A vertical line is seen by its bearing only. As long as its bearings have too little parallax,
+copies of the poses they were seen from are kept in the state (stochastic cloning); then the line
+joins the state by all of them at once (`redetect.slam.filters.delayed_lines`). Each row is used
+once.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import count
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.association import Associator
+from redetect.slam.filters.delayed_lines import relative_range_sigma, start_line
+from redetect.slam.filters.frames import (
+    NO_CAMERA,
+    FilterRun,
+    FrameRows,
+    RowCount,
+    frames_of,
+    unknown,
+)
+from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
+from redetect.slam.filters.views import View, WaitingLines
+from redetect.slam.recording import Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+JacobiansAt = Literal["first", "latest"]
+
+#: A line joins the state when its distance is known to this share, so that bearings are nearly
+#: linear in its place.
+LARGEST_RANGE_SIGMA = 0.05
+
+_GIVEN_UP = "line without parallax"
+_POSE = np.arange(POSE_SIZE)
+
+
+class EkfSlam:
+    """The filter.
+
+    Parameters
+    ----------
+    start : (3,) array_like
+        Pose at the start (m, m, rad).
+    start_covariance : (3, 3) array_like
+        Its covariance; none by default, as the start defines the map.
+    camera_xy : (2,) array_like
+        The camera's centre in the robot frame (m); only lines need it.
+    jacobians : str
+        `first`: evaluate them at the first estimate of each landmark and at the poses as predicted
+        (Huang, Mourikis, Roumeliotis: Observability-based rules for designing consistent EKF SLAM
+        estimators, 2010), so that landmarks that the filter has initialised itself give it no
+        spurious information about its heading. `latest`: at the latest estimates, as the textbook
+        filter does.
+    """
+
+    def __init__(
+        self,
+        start: ArrayLike = (0.0, 0.0, 0.0),
+        start_covariance: ArrayLike | None = None,
+        camera_xy: ArrayLike = NO_CAMERA,
+        *,
+        jacobians: JacobiansAt = "first",
+    ) -> None:
+        spread = np.zeros((3, 3)) if start_covariance is None else np.asarray(start_covariance)
+        self.covariance = JointCovariance(spread)
+        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        self.disc_slots: dict[int, int] = {}
+        self.line_slots: dict[int, int] = {}
+        self.disc_rows: Counter[int] = Counter()
+        self.line_rows: Counter[int] = Counter()
+        self.count = RowCount()
+        self.frame = -1
+        self._state = np.array(start, dtype=np.float64)
+        # The same array unless Jacobians are evaluated elsewhere.
+        self._linearised = self._state.copy() if jacobians == "first" else self._state
+        self._waiting = WaitingLines()
+        self._free_slots: list[int] = []
+
+    @property
+    def state(self) -> FloatArray:
+        """The pose, then landmarks and kept poses, as the slots say: (n,)."""
+        return self._state[: self.covariance.size]
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns `index` of the state's covariance."""
+        return self.covariance.block(index)
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> None:
+        """The robot moves by an odometry step.
+
+        Parameters
+        ----------
+        step : (3,) array
+            dx, dy (m), dphi (rad).
+        noise : (3, 3) array
+            Its covariance.
+        """
+        state, at = self._state, self._linearised
+        cos, sin = np.cos(state[2]), np.sin(state[2])
+        x = state[0] + cos * step[0] - sin * step[1]
+        y = state[1] + sin * step[0] + cos * step[1]
+        by_pose = np.array([[1.0, 0.0, at[1] - y], [0.0, 1.0, x - at[0]], [0.0, 0.0, 1.0]])
+        by_step = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        self.covariance.move_pose(by_pose, by_step @ noise @ by_step.T)
+        state[0], state[1], state[2] = x, y, state[2] + step[2]
+        at[:POSE_SIZE] = state[:POSE_SIZE]
+        self.frame += 1
+
+    def measure(self, rows: FrameRows) -> None:
+        """Update with the rows of the frame: known landmarks first, then new ones.
+
+        Rows without ID are left out, and so are rows of several lines of which not all are in the
+        map yet. A row of several lines measures the mean of their bearings.
+
+        Parameters
+        ----------
+        rows : FrameRows
+        """
+        discs, lines = [], []
+        new_discs: dict[int, int] = {}
+        again: list[int] = []
+        single: list[int] = []
+        for k, number in enumerate(rows.disc_ids):
+            if unknown(number):
+                self.count.left_out["disc without ID"] += 1
+            elif number in self.disc_slots:
+                discs.append(k)
+            elif number in new_discs:
+                again.append(k)
+            else:
+                new_discs[number] = k
+        for k, numbers in enumerate(rows.line_ids):
+            if not numbers:
+                self.count.left_out["line without ID"] += 1
+            elif all(number in self.line_slots for number in numbers):
+                lines.append(k)
+            elif len(numbers) > 1:
+                self.count.left_out["row of lines not in the map yet"] += 1
+            else:
+                single.append(k)
+        if discs or lines:
+            self._update(rows, discs, lines)
+        for number, k in new_discs.items():
+            self._add_disc(number, rows.disc_xy[k], rows.disc_covariance[k])
+        if again:
+            self._update(rows, again, [])
+        if single or self._waiting.slots:
+            self._view_lines(rows, single)
+
+    def finish(self) -> None:
+        """The run is over: lines that were not initialised are dropped."""
+        given_up = self._waiting.forget_all()
+        if given_up:
+            self.count.left_out[_GIVEN_UP] += given_up
+        self._free_slots.extend(self._waiting.release())
+
+    def landmark_map(self) -> LandmarkMap:
+        """The landmarks that are in the state, with their marginal covariances."""
+        return LandmarkMap(
+            discs=self._landmarks(self.disc_slots, self.disc_rows),
+            lines=self._landmarks(self.line_slots, self.line_rows),
+        )
+
+    def map_covariance(self) -> FloatArray:
+        """Joint covariance of `landmark_map`: discs, then lines; (2 M, 2 M), m^2."""
+        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
+        return self.covariance.block((slots[:, None] + np.arange(2)).ravel())
+
+    def _update(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
+        innovation, jacobian, noise, index = rows.innovation(
+            discs,
+            lines,
+            self.disc_slots,
+            self.line_slots,
+            self._state,
+            self._linearised,
+            self.camera_xy,
+        )
+        self._apply(innovation, jacobian, noise, index)
+        self.count.discs += len(discs)
+        self.count.lines += len(lines)
+        self.disc_rows.update([rows.disc_ids[k] for k in discs])
+        self.line_rows.update([i for k in lines for i in rows.line_ids[k]])
+
+    def _apply(
+        self, innovation: FloatArray, jacobian: FloatArray, noise: FloatArray, index: IntArray
+    ) -> None:
+        """Update the state by measurements that depend on the numbers `index` of it."""
+        projected = self.covariance.projected(index, jacobian)
+        change, squared = self.covariance.measure(
+            projected, jacobian @ projected[index] + noise, innovation
+        )
+        self._state[: len(change)] += change
+        self.count.innovation_squared += squared
+        self.count.innovation_numbers += len(innovation)
+
+    def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
+        pose, at = self._state, self._linearised
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        by_seen = np.array([[cos, -sin], [sin, cos]])
+        xy = pose[:2] + by_seen @ seen_xy
+        by_pose = np.array([[1.0, 0.0, at[1] - xy[1]], [0.0, 1.0, xy[0] - at[0]]])
+        self.disc_slots[number] = self._append(_POSE, by_pose, by_seen @ noise @ by_seen.T, xy, xy)
+        self.disc_rows[number] = 1
+        self.count.discs += 1
+
+    def _view_lines(self, rows: FrameRows, single: list[int]) -> None:
+        """Lines that are not in the state yet: they join it, or wait."""
+        waiting, reasons = self._waiting, self.count.left_out
+        given_up = waiting.forget_absent(self.frame)
+        kept = False
+        for k in single:
+            number = rows.line_ids[k][0]
+            view = View(self.frame, float(rows.bearing_rad[k]), float(rows.sigma_rad[k]))
+            if number in self.line_slots or any(
+                other.frame == self.frame for other in waiting.views(number)
+            ):
+                reasons["further row of a new line"] += 1
+            elif not self._start_line(number, [*waiting.views(number), view]):
+                waiting.keep(number, view)
+                kept = True
+        if kept:
+            waiting.slots[self.frame] = self._keep_pose()
+            given_up += waiting.thin()
+        if given_up:
+            reasons[_GIVEN_UP] += given_up
+        self._free_slots.extend(waiting.release())
+
+    def _start_line(self, number: int, views: list[View]) -> bool:
+        """Add a line by all its views, the last from the present pose, if that places it well."""
+        if len(views) < 2:
+            return False
+        slots = [*(self._waiting.slots[view.frame] for view in views[:-1]), 0]
+        index = (np.array(slots)[:, None] + _POSE).ravel()
+        bearing = np.array([view.bearing_rad for view in views])
+        sigma = np.array([view.sigma_rad for view in views])
+        poses = self._state[index].reshape(-1, POSE_SIZE)
+        if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
+            return False
+        known = self.covariance.block(index)
+        poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
+        start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
+        if start is None:
+            return False
+        both = np.zeros((5, 5))
+        both[:3, :3] = known[-3:, -3:]
+        both[:3, 3:] = known[-3:] @ start.by_poses.T
+        both[3:, :3] = both[:3, 3:].T
+        both[3:, 3:] = start.by_poses @ known @ start.by_poses.T + start.noise
+        if relative_range_sigma(poses[-1], start.xy, both) > LARGEST_RANGE_SIGMA:
+            return False
+        self.line_slots[number] = self._append(
+            index, start.by_poses, start.noise, start.xy + start.correction, start.xy
+        )
+        if len(views) > 2:
+            self._apply(start.residual, start.residual_by_poses, np.eye(len(start.residual)), index)
+        self._waiting.take(number)
+        self.line_rows[number] = len(views)
+        self.count.lines += len(views)
+        return True
+
+    def _keep_pose(self) -> int:
+        """Put a copy of the pose into the state; returns where."""
+        copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
+        pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
+        if not self._free_slots:
+            return self._append(_POSE, copy, none, pose, at)
+        slot = self._free_slots.pop()
+        self.covariance.replace(slot, _POSE, copy, none)
+        self._linearised[slot : slot + POSE_SIZE] = at
+        self._state[slot : slot + POSE_SIZE] = pose
+        return slot
+
+    def _append(
+        self,
+        index: IntArray,
+        jacobian: FloatArray,
+        noise: FloatArray,
+        value: FloatArray,
+        linearised: FloatArray,
+    ) -> int:
+        slot = self.covariance.append(index, jacobian, noise)
+        if self.covariance.size > len(self._state):
+            separate = self._linearised is not self._state
+            self._state = np.resize(self._state, 2 * self.covariance.size)
+            self._linearised = (
+                np.resize(self._linearised, len(self._state)) if separate else self._state
+            )
+        self._linearised[slot : slot + len(value)] = linearised
+        self._state[slot : slot + len(value)] = value
+        return slot
+
+    def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
+        place = np.array(list(slots.values()), dtype=np.int64)
+        return Landmarks(
+            ids=np.array(list(slots), dtype=np.int64),
+            xy=np.stack([self._state[place], self._state[place + 1]], axis=-1),
+            covariance=self.covariance.blocks(place),
+            rows=np.array([rows[number] for number in slots], dtype=np.int64),
+        )
+
+
+def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
+    """Take a filter through a run.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    ekf : EkfSlam
+        A filter at the start; holds the map afterwards.
+    associator : Associator, optional
+        How rows are paired with landmarks; by default by their identifiers. If it is found out,
+        discs that are far from all others are new ones, numbered from 1 in the order of their
+        first sight; lines have no place before there is parallax, so that they can't be found
+        again by it: their rows must be known.
+
+    Returns
+    -------
+    FilterRun
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible, the message names the step; or if lines without identifiers
+        are to be mapped.
+    """
+    pairing = associator or Associator()
+    if pairing.method != "known" and len(recording.lines):
+        raise SlamError(
+            f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
+            "only; expected known association, or a run without lines"
+        )
+    new_id = count(1).__next__
+    disc_ids: list[int] = []
+    line_ids: list[tuple[int, ...]] = []
+    poses = np.empty((len(recording) + 1, POSE_SIZE))
+    covariance = np.empty((len(recording) + 1, POSE_SIZE, POSE_SIZE))
+    poses[0], covariance[0] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
+    for k, rows in enumerate(frames_of(recording)):
+        try:
+            ekf.predict(recording.steps[k], recording.step_covariance[k])
+            identified = pairing.identified(rows, ekf, new_id)
+            ekf.measure(identified)
+        except SlamError as error:
+            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
+        disc_ids.extend(identified.disc_ids)
+        line_ids.extend(identified.line_ids)
+        poses[k + 1], covariance[k + 1] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
+    ekf.finish()
+    return FilterRun(
+        path=Path2D(("start", *recording.prefixes), poses, covariance),
+        count=ekf.count,
+        disc_ids=np.array(disc_ids, dtype=np.int64),
+        line_ids=tuple(line_ids),
+    )

@@ -1,0 +1,169 @@
+"""A recording frame by frame, as input of filters, and the result of a filter."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.landmarks.map_file import Path2D
+from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.recording import UNKNOWN_ID, Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NO_CAMERA = np.zeros(2)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRows:
+    """Measurements of one frame.
+
+    Attributes
+    ----------
+    disc_ids : tuple of d int
+        -1 where unknown.
+    disc_xy : (d, 2) float64
+        In the robot frame (m).
+    disc_covariance : (d, 2, 2) float64
+    line_ids : tuple of l tuples of int
+        All lines that a row shows; empty where unknown.
+    bearing_rad : (l,) float64
+    sigma_rad : (l,) float64
+    """
+
+    disc_ids: tuple[int, ...]
+    disc_xy: FloatArray
+    disc_covariance: FloatArray
+    line_ids: tuple[tuple[int, ...], ...]
+    bearing_rad: FloatArray
+    sigma_rad: FloatArray
+
+    def identified(
+        self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
+    ) -> FrameRows:
+        """The same rows under other identifiers."""
+        return FrameRows(
+            disc_ids, self.disc_xy, self.disc_covariance, line_ids, self.bearing_rad, self.sigma_rad
+        )
+
+    def innovation(
+        self,
+        discs: Sequence[int],
+        lines: Sequence[int],
+        disc_slots: Mapping[int, int],
+        line_slots: Mapping[int, int],
+        state: FloatArray,
+        linearised_at: FloatArray,
+        camera_xy: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """Innovation of some of the rows.
+
+        Parameters
+        ----------
+        discs, lines : sequences of int
+            The rows, by their places here; all of known landmarks.
+        disc_slots, line_slots : mappings of int to int
+            Where in the state each landmark begins.
+        state, linearised_at : (n,) float64
+            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
+        camera_xy : (2,) float64
+            The camera's centre in the robot frame (m).
+
+        Returns
+        -------
+        innovation, jacobian, noise, index
+            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
+        """
+        line_ids = [self.line_ids[k] for k in lines]
+        return frame_innovation(
+            state,
+            linearised_at,
+            MeasuredDiscs(
+                np.array([disc_slots[self.disc_ids[k]] for k in discs], dtype=np.int64),
+                self.disc_xy[discs],
+                self.disc_covariance[discs],
+            ),
+            MeasuredLines(
+                np.array([line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
+                np.cumsum([0, *map(len, line_ids)]),
+                self.bearing_rad[lines],
+                self.sigma_rad[lines],
+            ),
+            camera_xy,
+        )
+
+
+@dataclass
+class RowCount:
+    """How a run's rows were used.
+
+    Attributes
+    ----------
+    discs, lines : int
+        Rows that were used.
+    left_out : Counter of str
+        Rows that were not, by the reason.
+    innovation_squared : float
+        Sum of the squared innovations, normalised by their covariances.
+    innovation_numbers : int
+        Their degrees of freedom: if the covariances are right, what the sum is expected to be.
+    """
+
+    discs: int = 0
+    lines: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    innovation_squared: float = 0.0
+    innovation_numbers: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FilterRun:
+    """Poses of a run as a filter had them at the time, and what became of the rows.
+
+    Attributes
+    ----------
+    path : Path2D
+        The start, and the pose after each step and its frame, with covariances; theta is not
+        wrapped.
+    count : RowCount
+    disc_ids : (n,) int64
+        The disc that each row was taken to show, -1 where none: the file's, or what association
+        found.
+    line_ids : tuple of tuples of int
+        The same of lines; empty where none.
+    """
+
+    path: Path2D
+    count: RowCount
+    disc_ids: IntArray
+    line_ids: tuple[tuple[int, ...], ...]
+
+
+def frames_of(recording: Recording) -> Iterator[FrameRows]:
+    """The rows of each frame of a run, in order."""
+    circles, lines = recording.circles, recording.lines
+    frames = np.arange(len(recording) + 1)
+    disc_start = np.searchsorted(circles.frame, frames)
+    line_start = np.searchsorted(lines.frame, frames)
+    disc_ids = circles.ids.tolist()
+    for k in range(len(recording)):
+        discs = slice(disc_start[k], disc_start[k + 1])
+        some = slice(line_start[k], line_start[k + 1])
+        yield FrameRows(
+            disc_ids=tuple(disc_ids[discs]),
+            disc_xy=circles.xy[discs],
+            disc_covariance=circles.covariance[discs],
+            line_ids=lines.ids[some],
+            bearing_rad=lines.bearing_rad[some],
+            sigma_rad=lines.sigma_rad[some],
+        )
+
+
+def unknown(number: int) -> bool:
+    """Whether an identifier says that the landmark is not known."""
+    return number == UNKNOWN_ID

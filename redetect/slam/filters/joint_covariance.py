@@ -1,0 +1,213 @@
+"""The joint covariance of EKF-SLAM, changed in place.
+
+It is kept as P = B - W W^T. An update by a frame's rows subtracts a product of low rank, K S K^T,
+from all of P; here its factor only becomes further columns of W, and is subtracted from B once W is
+full, by one symmetric product of high rank (BLAS dsyrk). That is exact, and several times
+quicker: a product of high rank keeps the processor busy, one of low rank waits for the memory. What
+a frame needs of P (the columns of its landmarks) is computed from B and W.
+
+Of B only the lower triangle is kept, so that P is symmetric whatever is done to it; and P changes
+by congruences (F P F^T) and by symmetric products alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dtrtrs
+
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.joint_covariance_kernels import (
+    set_symmetric_rows,
+    symmetric_block,
+    symmetric_columns,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+POSE_SIZE = 3
+
+# Rows are added in chunks of this many; a chunk too many costs less than moving the matrix often.
+_CHUNK = 64
+# Columns of W before they are subtracted from B.
+_PENDING = 128
+
+
+class JointCovariance:
+    """Covariance of a pose and of a growing number of landmarks.
+
+    Parameters
+    ----------
+    pose_covariance : (3, 3) array
+        Of the pose at the start.
+    """
+
+    def __init__(self, pose_covariance: FloatArray) -> None:
+        self._subtract: Callable[..., FloatArray] = dsyrk
+        self._solve: Callable[..., tuple[FloatArray, int]] = dtrtrs
+        self.size = POSE_SIZE
+        self._base = np.zeros((_CHUNK, _CHUNK), order="F")
+        self._base[:POSE_SIZE, :POSE_SIZE] = pose_covariance
+        self._factor = np.zeros((_CHUNK, _PENDING), order="F")
+        self._pending = 0
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns `index` of the covariance: (k, k)."""
+        factor = self._factor[index, : self._pending]
+        return np.asarray(symmetric_block(self._base, index) - factor @ factor.T)
+
+    def pose(self) -> FloatArray:
+        """Covariance of the pose: (3, 3)."""
+        factor = self._factor[:POSE_SIZE, : self._pending]
+        return np.asarray(self._base[:POSE_SIZE, :POSE_SIZE] - factor @ factor.T)
+
+    def blocks(self, slots: IntArray) -> FloatArray:
+        """Covariances of pairs of numbers that begin at `slots`: (k, 2, 2)."""
+        self._settle()
+        found = np.empty((len(slots), 2, 2))
+        found[:, 0, 0] = self._base[slots, slots]
+        found[:, 1, 1] = self._base[slots + 1, slots + 1]
+        found[:, 0, 1] = found[:, 1, 0] = self._base[slots + 1, slots]
+        return found
+
+    def dense(self) -> FloatArray:
+        """The whole covariance: (size, size)."""
+        self._settle()
+        lower = np.tril(self._base[: self.size, : self.size])
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+    def projected(self, index: IntArray, jacobian: FloatArray) -> FloatArray:
+        """Covariance of the state with a measurement: P[:, index] @ jacobian.T, (size, m)."""
+        columns = np.empty((self.size, len(index)), order="F")
+        symmetric_columns(self._base, self.size, index, columns)
+        product = columns @ jacobian.T
+        if self._pending:
+            factor = self._factor[: self.size, : self._pending]
+            product -= factor @ (factor[index].T @ jacobian.T)
+        return np.asarray(product)
+
+    def move_pose(self, by_pose: FloatArray, noise: FloatArray) -> None:
+        """The pose moves: P becomes F P F^T + Q, F the identity except for the pose.
+
+        Parameters
+        ----------
+        by_pose : (3, 3) array
+            F's block of the pose.
+        noise : (3, 3) array
+            Q's block of the pose.
+        """
+        base, size = self._base, self.size
+        base[POSE_SIZE:size, :POSE_SIZE] = base[POSE_SIZE:size, :POSE_SIZE] @ by_pose.T
+        moved = by_pose @ base[:POSE_SIZE, :POSE_SIZE] @ by_pose.T + noise
+        base[:POSE_SIZE, :POSE_SIZE] = 0.5 * (moved + moved.T)
+        factor = self._factor[:POSE_SIZE, : self._pending]
+        factor[:] = by_pose @ factor
+
+    def measure(
+        self, projected: FloatArray, innovation_covariance: FloatArray, innovation: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """Subtract K S K^T.
+
+        Parameters
+        ----------
+        projected : (size, m) array
+            P H^T, see `projected`.
+        innovation_covariance : (m, m) array
+            S = H P H^T + R.
+        innovation : (m,) array
+            Measured minus predicted.
+
+        Returns
+        -------
+        change : (size,) float64
+            K times the innovation: what the state changes by.
+        squared : float
+            The innovation squared, normalised by S.
+
+        Raises
+        ------
+        SlamError
+            If S is not positive definite.
+        """
+        try:
+            root = np.linalg.cholesky(innovation_covariance)
+        except np.linalg.LinAlgError:
+            raise SlamError(
+                "the covariance of the innovation is not positive definite: rows or steps with "
+                "covariances that contradict each other"
+            ) from None
+        rows = len(innovation)
+        if self._pending + rows > self._factor.shape[1]:
+            self._settle()
+            if rows > self._factor.shape[1]:
+                self._factor = np.zeros((self._factor.shape[0], rows), order="F")
+        right = np.empty((self.size + 1, rows))
+        right[:-1], right[-1] = projected, innovation
+        whitened = self._solve(root, right.T, lower=1, overwrite_b=1)[0].T
+        factor, last = whitened[:-1], whitened[-1]
+        self._factor[: self.size, self._pending : self._pending + rows] = factor
+        self._pending += rows
+        return factor @ last, float(last @ last)
+
+    def append(self, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> int:
+        """Add numbers that depend on the state and on a measurement.
+
+        Parameters
+        ----------
+        index : (k,) int64 array
+            Indices of the state that they depend on.
+        jacobian : (d, k) array
+            Their derivative by that.
+        noise : (d, d) array
+            Covariance that the measurement adds.
+
+        Returns
+        -------
+        int
+            Where they begin in the state.
+        """
+        first = self.size
+        self._make_room(first + len(jacobian))
+        self.size = first + len(jacobian)
+        self.replace(first, index, jacobian, noise)
+        return first
+
+    def replace(self, first: int, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> None:
+        """Replace numbers from `first` on by others; see `append`."""
+        count, size = len(jacobian), self.size
+        columns = np.empty((size, len(index)), order="F")
+        symmetric_columns(self._base, size, index, columns)
+        rows = jacobian @ columns.T
+        own = rows[:, index] @ jacobian.T + noise
+        rows[:, first : first + count] = 0.5 * (own + own.T)
+        set_symmetric_rows(self._base, size, first, rows)
+        factor = self._factor[:, : self._pending]
+        factor[first : first + count] = jacobian @ factor[index]
+
+    def _settle(self) -> None:
+        """Subtract W W^T from B."""
+        if self._pending:
+            used = self._factor[:, : self._pending]
+            self._base = self._subtract(-1.0, used, 1.0, self._base, lower=1, overwrite_c=1)
+            self._pending = 0
+            # The pose's block is read and written whole.
+            lower = np.tril(self._base[:POSE_SIZE, :POSE_SIZE])
+            self._base[:POSE_SIZE, :POSE_SIZE] = lower + np.tril(lower, -1).T
+
+    def _make_room(self, size: int) -> None:
+        capacity = len(self._base)
+        if size <= capacity:
+            return
+        wanted = -(-size // _CHUNK) * _CHUNK
+        base = np.zeros((wanted, wanted), order="F")
+        base[:capacity, :capacity] = self._base
+        factor = np.zeros((wanted, self._factor.shape[1]), order="F")
+        factor[:capacity] = self._factor
+        self._base, self._factor = base, factor

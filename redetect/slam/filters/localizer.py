@@ -1,0 +1,262 @@
+"""Localisation in a known map: an extended Kalman filter of the pose alone.
+
+The map has errors of its own. They are the same each time a landmark is seen, so that adding its
+covariance to each measurement's would let the filter average them away, which it can't. By default
+the filter *considers* them: it carries the correlation of the pose with each landmark's error along
+without estimating the landmarks anew (Schmidt-Kalman filter).
+
+Landmarks of a map made by driving share most of their error with their neighbours. The joint
+covariance describes this (`redetect.slam.mapping.covariance_file`); without it landmarks are
+assumed to be independent of each other.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.landmarks.map_file import LandmarkMap, Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.association import Associator
+from redetect.slam.filters.frames import (
+    NO_CAMERA,
+    FilterRun,
+    FrameRows,
+    RowCount,
+    frames_of,
+    unknown,
+)
+from redetect.slam.models.motion import move, move_jacobians
+from redetect.slam.recording import Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MapErrors = Literal["considered", "white", "ignored"]
+
+_POSE_SIZE = 3
+
+
+class Localizer:
+    """The filter.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        Where the landmarks are.
+    start : (3,) array_like
+        Pose at the start, in the map (m, m, rad).
+    start_covariance : (3, 3) array_like
+        Its covariance; none by default, as the start of a run defines its map.
+    camera_xy : (2,) array_like
+        The camera's centre in the robot frame (m); only lines need it.
+    map_errors : str
+        `considered`: see above; `white`: each landmark's covariance is added to that of each of
+        its rows, as if its error were another one each time; `ignored`: the map is exact.
+    joint_covariance : (2 M, 2 M) array, optional
+        Of all discs and then lines (m^2), for errors that are considered; by default landmarks are
+        independent.
+    """
+
+    def __init__(
+        self,
+        landmark_map: LandmarkMap,
+        start: ArrayLike = (0.0, 0.0, 0.0),
+        start_covariance: ArrayLike | None = None,
+        camera_xy: ArrayLike = NO_CAMERA,
+        *,
+        map_errors: MapErrors = "considered",
+        joint_covariance: FloatArray | None = None,
+    ) -> None:
+        discs, lines = landmark_map.discs, landmark_map.lines
+        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        self.disc_slots = {int(i): _POSE_SIZE + 2 * k for k, i in enumerate(discs.ids)}
+        first = _POSE_SIZE + 2 * len(discs)
+        self.line_slots = {int(i): first + 2 * k for k, i in enumerate(lines.ids)}
+        self.count = RowCount()
+        self.pose_covariance = np.zeros((3, 3))
+        if start_covariance is not None:
+            self.pose_covariance += np.asarray(start_covariance, dtype=np.float64)
+        self._state = np.concatenate(
+            [np.asarray(start, dtype=np.float64), discs.xy.ravel(), lines.xy.ravel()]
+        )
+        self._map_errors = map_errors
+        self._predicted = np.array(start, dtype=np.float64)
+        numbers = len(self._state) - _POSE_SIZE
+        self._map_covariance = np.zeros((numbers, numbers))
+        if map_errors == "considered" and joint_covariance is not None:
+            self._map_covariance += joint_covariance
+        elif map_errors != "ignored":
+            for k, block in enumerate(np.concatenate([discs.covariance, lines.covariance])):
+                own = slice(2 * k, 2 * k + 2)
+                self._map_covariance[own, own] = block
+        # Of the pose with the landmarks' errors.
+        self._cross = np.zeros((_POSE_SIZE, len(self._state) - _POSE_SIZE))
+
+    @property
+    def state(self) -> FloatArray:
+        """The pose, then the landmarks: (n,)."""
+        return self._state
+
+    @property
+    def pose(self) -> FloatArray:
+        """x, y (m), theta (rad): (3,)."""
+        return self._state[:_POSE_SIZE]
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns of the joint covariance of pose and map.
+
+        Parameters
+        ----------
+        index : (3 + 2 k,) int64 array
+            The pose, and then landmarks, of which each may be there several times.
+
+        Returns
+        -------
+        (3 + 2 k, 3 + 2 k) float64
+        """
+        landmarks = index[_POSE_SIZE:] - _POSE_SIZE
+        cross = self._cross[:, landmarks]
+        own = self._map_covariance[landmarks[:, None], landmarks]
+        return np.block([[self.pose_covariance, cross], [cross.T, own]])
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> None:
+        """The robot moves by an odometry step.
+
+        Parameters
+        ----------
+        step : (3,) array
+            dx, dy (m), dphi (rad).
+        noise : (3, 3) array
+            Its covariance.
+        """
+        by_pose, by_step = move_jacobians(self.pose, step)
+        self._state[:_POSE_SIZE] = move(self.pose, step)
+        if self._map_errors == "considered":
+            # From prediction to prediction, as with first estimates in EKF-SLAM: else corrections
+            # would look like knowledge of how the map as a whole is turned.
+            by_pose[0, 2] = self._predicted[1] - self._state[1]
+            by_pose[1, 2] = self._state[0] - self._predicted[0]
+            self._predicted = self.pose.copy()
+        moved = by_pose @ self.pose_covariance @ by_pose.T + by_step @ noise @ by_step.T
+        self.pose_covariance = 0.5 * (moved + moved.T)
+        self._cross = by_pose @ self._cross
+
+    def measure(self, rows: FrameRows) -> None:
+        """Use the rows of a frame whose landmarks are in the map; the others are left out.
+
+        A row of several lines measures the mean of their bearings.
+
+        Parameters
+        ----------
+        rows : FrameRows
+
+        Raises
+        ------
+        SlamError
+            If the covariance of the innovation is not positive definite.
+        """
+        discs = [k for k, number in enumerate(rows.disc_ids) if number in self.disc_slots]
+        lines = [
+            k
+            for k, numbers in enumerate(rows.line_ids)
+            if numbers and all(number in self.line_slots for number in numbers)
+        ]
+        self._count(rows, discs, lines)
+        if not discs and not lines:
+            return
+        innovation, jacobian, noise, index = rows.innovation(
+            discs,
+            lines,
+            self.disc_slots,
+            self.line_slots,
+            self._state,
+            self._state,
+            self.camera_xy,
+        )
+        block = self.block(index)
+        covariance = jacobian @ block @ jacobian.T + noise
+        try:
+            root = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            raise SlamError(
+                "the covariance of the innovation is not positive definite: rows or steps with "
+                "covariances that contradict each other"
+            ) from None
+        whitened = np.linalg.solve(root, innovation)
+        # The pose's part of P H^T, over the root of S.
+        factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
+        self._state[:_POSE_SIZE] += factor @ whitened
+        if self._map_errors == "considered":
+            # Of the measurement with the landmarks' errors: H P[index, landmarks].
+            by_map = jacobian[:, :_POSE_SIZE] @ self._cross
+            by_map += (
+                jacobian[:, _POSE_SIZE:] @ self._map_covariance[index[_POSE_SIZE:] - _POSE_SIZE]
+            )
+            self._cross -= factor @ np.linalg.solve(root, by_map)
+        self.pose_covariance = self.pose_covariance - factor @ factor.T
+        self.count.innovation_squared += float(whitened @ whitened)
+        self.count.innovation_numbers += len(innovation)
+
+    def _count(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
+        used_discs, used_lines = set(discs), set(lines)
+        for k, number in enumerate(rows.disc_ids):
+            if k not in used_discs:
+                reason = "disc without ID" if unknown(number) else "disc not in the map"
+                self.count.left_out[reason] += 1
+        for k, numbers in enumerate(rows.line_ids):
+            if k not in used_lines:
+                reason = "line not in the map" if numbers else "line without ID"
+                self.count.left_out[reason] += 1
+        self.count.discs += len(discs)
+        self.count.lines += len(lines)
+
+
+def run_localizer(
+    recording: Recording, localizer: Localizer, associator: Associator | None = None
+) -> FilterRun:
+    """Take a localizer through a run.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    localizer : Localizer
+        A filter at the start; changed.
+    associator : Associator, optional
+        How rows are paired with the map; by default by their identifiers.
+
+    Returns
+    -------
+    FilterRun
+        With the landmarks that each row was taken to show.
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible; the message names the step.
+    """
+    pairing = associator or Associator()
+    poses = np.empty((len(recording) + 1, _POSE_SIZE))
+    covariance = np.empty((len(recording) + 1, _POSE_SIZE, _POSE_SIZE))
+    poses[0], covariance[0] = localizer.pose, localizer.pose_covariance
+    disc_ids: list[int] = []
+    line_ids: list[tuple[int, ...]] = []
+    for k, rows in enumerate(frames_of(recording)):
+        try:
+            localizer.predict(recording.steps[k], recording.step_covariance[k])
+            identified = pairing.identified(rows, localizer)
+            localizer.measure(identified)
+        except SlamError as error:
+            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
+        disc_ids.extend(identified.disc_ids)
+        line_ids.extend(identified.line_ids)
+        poses[k + 1], covariance[k + 1] = localizer.pose, localizer.pose_covariance
+    return FilterRun(
+        path=Path2D(("start", *recording.prefixes), poses, covariance),
+        count=localizer.count,
+        disc_ids=np.array(disc_ids, dtype=np.int64),
+        line_ids=tuple(line_ids),
+    )

@@ -1,0 +1,90 @@
+"""Common parts of other tools' text formats: rows, numbers and axes."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.axes import Axes
+from redetect.storage import write_whole
+
+#: Begins the comment that says which axes a file is in.
+AXES_COMMENT = "# AXES"
+
+#: The largest number of a vertex: other tools keep it in 31 bits.
+LARGEST_NUMBER = 2**31 - 1
+
+_LARGEST_FILE_BYTES = 1 << 28
+_LONGEST_ROW_BYTES = 1 << 20
+# Narrower than `float` and `int`, which also take nan, infinity and 1_000.
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
+_WHOLE = re.compile(r"[0-9]{1,10}", re.ASCII)
+
+
+def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
+    """Write rows of text, whole or not at all."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        for row in rows:
+            stream.write(f"{row}\n".encode("utf-8", "surrogateescape"))
+
+
+def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
+    """Rows of a text file with their line numbers, without blank ones; comments are among them.
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read or is too large, or a row is too long.
+    """
+    place = Path(path)
+    try:
+        if place.stat().st_size > _LARGEST_FILE_BYTES:
+            raise SlamError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
+        with place.open("rb") as stream:
+            number = 0
+            while source := stream.readline(_LONGEST_ROW_BYTES + 1):
+                number += 1
+                if len(source) > _LONGEST_ROW_BYTES:
+                    raise SlamError(
+                        f"{place}:{number}: longer than {_LONGEST_ROW_BYTES} bytes: expected a "
+                        "row of text"
+                    )
+                text = source.decode("utf-8", "surrogateescape").strip()
+                if text:
+                    yield number, text
+    except OSError as error:
+        raise SlamError(f"{place}: cannot be read: {error.strerror or error}") from None
+
+
+def finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
+    """A word as a finite number; `SlamError` where it is none."""
+    value = float(word) if len(word) <= 400 and _NUMBER.fullmatch(word) else math.nan
+    if not math.isfinite(value):
+        raise SlamError(f"{path}:{line}: {name} is {word[:30]!a}: expected a finite number")
+    return value
+
+
+def whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:
+    """A word as the number of a vertex; `SlamError` where it is none."""
+    value = int(word) if _WHOLE.fullmatch(word) else LARGEST_NUMBER + 1
+    if value > LARGEST_NUMBER:
+        raise SlamError(
+            f"{path}:{line}: {name} is {word[:30]!a}: expected a whole number of 0 to "
+            f"{LARGEST_NUMBER}"
+        )
+    return value
+
+
+def demand_axes(path: str | os.PathLike[str], line: int, comment: str, axes: Axes) -> None:
+    """Refuse a file whose comment says that it is in other axes than those requested."""
+    if comment.startswith(AXES_COMMENT + " "):
+        said = (comment[len(AXES_COMMENT) :].split() or [""])[0]
+        if said != axes:
+            raise SlamError(
+                f"{path}:{line}: the file's axes are {said[:20]!a}: expected {axes}, or --axes to "
+                "name them"
+            )

@@ -1,0 +1,153 @@
+"""Paths as TUM trajectories: a row ``t x y z qx qy qz qw`` for each pose.
+
+Comments begin with ``#``. A path on the floor has z, qx and qy 0. Of a run without times t is the
+number of the step, 0 for the start. Files of times have rows ``name t``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.axes import MEANING, Axes, from_dataset, to_dataset
+from redetect.slam.formats.text import AXES_COMMENT, demand_axes, finite, text_rows, write_text
+
+FloatArray = NDArray[np.float64]
+
+_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+# How far a pose may lie off the floor (m; quaternion) and still be a pose on it.
+_FLAT = 1e-6
+_UNIT = 1e-3
+
+
+def write_tum(
+    path: str | os.PathLike[str],
+    poses: Path2D,
+    *,
+    times: Mapping[str, float] | None = None,
+    axes: Axes = "robotics",
+    comments: Sequence[str] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write a path as a TUM trajectory.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    poses : Path2D
+        The path, in the data set's axes. Its covariance has no place in the format.
+    times : mapping of str to float, optional
+        Times of the poses (s), by their names; the others, like the start, are left out. By default
+        t is the number of the step.
+    axes : str
+        The axes to write it in.
+    comments : sequence of str
+        Lines for the head.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    redetect.storage.OutputExistsError
+        If the file exists and may not be replaced.
+    """
+    rows = [
+        *(f"# {comment}" for comment in comments),
+        f"{AXES_COMMENT} {axes} ({MEANING[axes]})",
+        f"# {' '.join(_COLUMNS)}",
+    ]
+    numbers = (from_dataset(poses.poses, axes) + 0.0).tolist()
+    for number, (name, (x, y, theta)) in enumerate(zip(poses.prefixes, numbers)):
+        half, t = 0.5 * theta, str(number)
+        if times is not None:
+            if name not in times:
+                continue
+            t = f"{times[name]:.6f}"
+        rows.append(f"{t} {x!r} {y!r} 0 0 0 {np.sin(half).item()!r} {np.cos(half).item()!r}")
+    write_text(path, rows, overwrite=overwrite)
+
+
+def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Read a file of times.
+
+    Parameters
+    ----------
+    path : path
+        Rows ``name seconds`` between blanks or commas.
+
+    Returns
+    -------
+    dict of str to float
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read or has other rows.
+    """
+    times = {}
+    for line, text in text_rows(path):
+        words = text.partition("#")[0].replace(",", " ").split()
+        if words:
+            if len(words) != 2:
+                raise SlamError(f"{path}:{line}: {len(words)} words: expected a name and seconds")
+            times[words[0]] = finite(path, line, "t", words[1])
+    return times
+
+
+def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D:
+    """Read a TUM trajectory of a path on the floor.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    axes : str
+        The axes that it is in.
+
+    Returns
+    -------
+    Path2D
+        In the data set's axes; angles in [-pi, pi). The first pose is called ``start``, the others
+        by their time as it is written.
+
+    Raises
+    ------
+    SlamError
+        If the file cannot be read, is not a path on the floor, its times do not ascend, or it says
+        that its axes are others; the message names file and line.
+    """
+    prefixes: list[str] = []
+    numbers: list[list[float]] = []
+    for line, text in text_rows(path):
+        if text.startswith("#"):
+            demand_axes(path, line, text, axes)
+            continue
+        words = text.split()
+        if len(words) != len(_COLUMNS):
+            raise SlamError(
+                f"{path}:{line}: {len(words)} values: expected {len(_COLUMNS)}: "
+                f"{' '.join(_COLUMNS)}"
+            )
+        row = [finite(path, line, name, word) for name, word in zip(_COLUMNS, words)]
+        time, _, _, z, qx, qy, qz, qw = row
+        if numbers and time <= numbers[-1][0]:
+            raise SlamError(f"{path}:{line}: t is {words[0]}: expected more than the row before")
+        if abs(float(np.hypot(np.hypot(qx, qy), np.hypot(qz, qw))) - 1.0) > _UNIT:
+            raise SlamError(f"{path}:{line}: qx qy qz qw are no unit quaternion")
+        if max(abs(z), abs(qx), abs(qy)) > _FLAT:
+            raise SlamError(f"{path}:{line}: expected a pose on the floor: z, qx and qy 0")
+        prefixes.append(words[0] if numbers else "start")
+        numbers.append(row)
+    if not numbers:
+        raise SlamError(f"{path}: no poses: expected rows of {' '.join(_COLUMNS)}")
+    table = np.array(numbers, dtype=np.float64)
+    theta = wrap_angle(2.0 * np.arctan2(table[:, 6], table[:, 7]))
+    poses = to_dataset(np.column_stack([table[:, 1:3], theta]), axes) + 0.0  # no -0.0
+    return Path2D(tuple(prefixes), poses)

@@ -1,0 +1,283 @@
+"""Finds rows of discs whose identifier contradicts the rest of a run, and what they show instead.
+
+A robust map leaves out the rows that do not fit. Each of them is then held against the map that the
+others make: the squared error of measurements added to a least-squares problem is
+``r^T (I + J P J^T)^-1 r`` with r and J their whitened errors and Jacobians and P the covariance
+before (Y. Bar-Shalom, X. Li, T. Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, section 5.4). The same number says whether another landmark, or one of its own,
+explains rows better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU
+from scipy.stats import chi2
+
+from camera import Camera
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
+from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
+from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.mapping.solve import factor, normal_equations, solve
+from redetect.slam.models.measurement import disc_in_map
+from redetect.slam.recording import UNKNOWN_ID, Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Kind = Literal["exchange", "split", "drop"]
+
+# Standard deviations from which on rows pull less.
+_LOSS_SCALE = 3.0
+# Rows whose squared error in the robust map is this share of the gate are held against the others.
+_SUSPECT_SHARE = 0.25
+# Rows of an identifier further apart than this belong to different groups (frames).
+_LONGEST_GAP = 10
+# How far a landmark may be from where a group lies, to be tried (m).
+_NEAR_M = 1.0
+# Rows are explained by a landmark unless their squared error is less probable.
+_LEAST_PROBABILITY = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Rows of one identifier in neighbouring frames that contradict the rest.
+
+    Attributes
+    ----------
+    rows : (k,) int64
+        Which rows of the recording's discs.
+    id : int
+        Their identifier in the file.
+    kind : "exchange", "split" or "drop"
+        Whether they show another landmark, one of their own, or nothing that could be said.
+    new_id : int
+        That landmark; -1 for `drop`.
+    xy : (k, 2) float64
+        Where the rows lie in the map (m).
+    own_m : float
+        How far the median of these is from the landmark of that identifier.
+    row_chi_squared : (k,) float64
+        Squared error of each row against the map without any of the suspects.
+    chi_squared, mended_chi_squared : float
+        Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
+    """
+
+    rows: IntArray
+    id: int
+    kind: Kind
+    new_id: int
+    xy: FloatArray
+    own_m: float
+    row_chi_squared: FloatArray
+    chi_squared: float
+    mended_chi_squared: float
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """What contradicts, and chi-squared with all rows, without those, and with identifiers mended.
+
+    Attributes
+    ----------
+    groups : tuple of Group
+        By frame.
+    before, dropped, mended : ChiSquared
+    """
+
+    groups: tuple[Group, ...]
+    before: ChiSquared
+    dropped: ChiSquared
+    mended: ChiSquared
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A least-squares map, with the factor of its normal equations."""
+
+    graph: Graph
+    estimate: Estimate
+    weighting: Weighting
+    information: SuperLU
+    table: ChiSquared
+
+
+def audit_run(
+    recording: Recording,
+    camera: Camera | None = None,
+    *,
+    calibrate: bool = False,
+    gate: float = 100.0,
+    name: str = "run",
+) -> Audit:
+    """Find the rows whose identifier contradicts the rest.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run, without lines.
+    camera : Camera, optional
+        As calibrated.
+    calibrate : bool
+        Estimate the camera's mounting as well.
+    gate : float
+        Squared error, in units of its covariance, from which on a row contradicts.
+    name : str
+        What messages call the run.
+
+    Returns
+    -------
+    Audit
+
+    Raises
+    ------
+    SlamError
+        If the run has lines; else as `map_run`.
+    """
+    if len(recording.lines):
+        raise SlamError(f"{name}: has lines: expected discs, the only ones that are audited")
+    plain = Weighting(calibrate=calibrate, row_errors="recorded")
+    loss = replace(plain, loss="geman-mcclure", loss_scale=_LOSS_SCALE)
+    before = map_run(recording, camera, plain, name=name).table
+    robust = map_run(recording, camera, loss, name=name)
+    ids = recording.circles.ids.copy()
+    known = np.flatnonzero(ids >= 0)
+    squared = np.sum(errors(robust.graph, robust.estimate, plain).discs ** 2, axis=1)
+    suspects = known[squared > _SUSPECT_SHARE * gate]
+    trusted = ids.copy()
+    trusted[suspects] = UNKNOWN_ID
+    fit = _fit(recording, trusted, robust.estimate, camera, plain)
+    score = {
+        int(k): _misfit(recording, fit, np.array([k]), int(ids[k]))
+        for k in suspects
+        if ids[k] in fit.graph.disc_ids
+    }
+    accused = np.array([k for k, value in score.items() if value > gate], dtype=np.int64)
+    ids[accused] = UNKNOWN_ID
+    fit = _fit(recording, ids, fit.estimate, camera, plain)
+    dropped = fit.table
+
+    groups = []
+    # The largest first: what they show may be what smaller ones show as well.
+    for rows in sorted(_groups(recording, accused), key=lambda rows: (-len(rows), rows[0])):
+        group = _explained(recording, fit, rows, np.array([score[int(k)] for k in rows]))
+        groups.append(group)
+        if group.new_id != UNKNOWN_ID:
+            ids[rows] = group.new_id
+            fit = _fit(recording, ids, fit.estimate, camera, plain)
+    return Audit(tuple(sorted(groups, key=lambda g: g.rows[0])), before, dropped, fit.table)
+
+
+def _fit(
+    recording: Recording,
+    ids: IntArray,
+    start: Estimate,
+    camera: Camera | None,
+    weighting: Weighting,
+) -> _Fit:
+    """The map with these identifiers; discs start at the median of where their rows lie."""
+    graph = graph_of_recording(
+        replace(recording, circles=replace(recording.circles, ids=ids)), camera
+    )
+    places = disc_in_map(start.poses[graph.disc_pose], graph.disc_xy)
+    order = np.argsort(graph.disc_index, kind="stable")
+    parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
+    first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
+    estimate = solve(graph, first, weighting, tolerance=1e-7).estimate
+    equations = normal_equations(linearise(graph, estimate, weighting))
+    table = chi_squared(graph, estimate, weighting)
+    return _Fit(graph, estimate, weighting, factor(equations.matrix), table)
+
+
+def _misfit(
+    recording: Recording, fit: _Fit, rows: IntArray, number: int, at: FloatArray | None = None
+) -> float:
+    """By how much chi-squared grows if rows are added as those of a landmark, a new one if `at`."""
+    error, spread, by_new = _innovation(recording, fit, rows, np.full(len(rows), number), at)
+    root = np.linalg.cholesky(spread)
+    error, by_new = np.linalg.solve(root, error), np.linalg.solve(root, by_new)
+    if at is not None:
+        error = error - by_new @ np.linalg.lstsq(by_new, error)[0]
+    return float(error @ error)
+
+
+def _innovation(
+    recording: Recording, fit: _Fit, rows: IntArray, ids: IntArray, at: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whitened errors (2 k,) of rows against a map without them, and their covariance.
+
+    With `at` they show a new landmark near there: the third result (2 k, 2) is the derivative by
+    its place. The camera's mounting counts as known.
+    """
+    circles, graph, estimate = recording.circles, fit.graph, fit.estimate
+    if at is not None:
+        graph = replace(graph, disc_ids=np.append(graph.disc_ids, ids[0]))
+        estimate = replace(estimate, disc_xy=np.vstack([estimate.disc_xy, at]))
+    graph = replace(
+        graph,
+        disc_pose=circles.frame[rows] + 1,
+        disc_index=np.searchsorted(graph.disc_ids, ids),
+        disc_xy=circles.xy[rows],
+        disc_whitening=whitening(circles.covariance[rows]),
+    )
+    problem = linearise(graph, estimate, fit.weighting)
+    first, known = 3 * len(graph.steps), fit.information.shape[0]
+    jacobian = problem.jacobian[first:].toarray()
+    spread = jacobian[:, :known] @ fit.information.solve(jacobian[:, :known].T.copy())
+    return problem.residual[first:], np.eye(len(spread)) + spread, jacobian[:, known:]
+
+
+def _groups(recording: Recording, accused: IntArray) -> list[IntArray]:
+    """Accused rows of an identifier between which none that fits and no long gap lies."""
+    ids, frame = recording.circles.ids, recording.circles.frame
+    guilty = np.zeros(len(ids), dtype=bool)
+    guilty[accused] = True
+    groups = []
+    for number in np.unique(ids[accused]):
+        rows = np.flatnonzero(ids == number)
+        apart = (np.diff(frame[rows]) > _LONGEST_GAP) | (np.diff(guilty[rows].astype(int)) != 0)
+        groups += [part for part in np.split(rows, np.flatnonzero(apart) + 1) if guilty[part[0]]]
+    return groups
+
+
+def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArray) -> Group:
+    """What the rows of a group show."""
+    circles, graph = recording.circles, fit.graph
+    number = int(circles.ids[rows[0]])
+    xy = disc_in_map(fit.estimate.poses[circles.frame[rows] + 1], circles.xy[rows])
+    place = np.median(xy, axis=0)
+    away = np.linalg.norm(fit.estimate.disc_xy - place, axis=1)
+    # A landmark shows up once in a frame.
+    taken = graph.disc_index[np.isin(graph.disc_pose, circles.frame[rows] + 1)]
+    free = np.setdiff1d(np.flatnonzero(away < _NEAR_M), taken)
+    others = {int(k): _misfit(recording, fit, rows, int(k)) for k in graph.disc_ids[free]}
+    new_id = min(others, key=others.__getitem__, default=UNKNOWN_ID)
+    kind: Kind = "exchange"
+    mended = others.get(new_id, np.inf)
+    if mended > _limit(2 * len(rows)):
+        kind, new_id = "split", int(max(circles.ids.max(), graph.disc_ids.max())) + 1
+        mended = _misfit(recording, fit, rows, new_id, place)
+        if len(rows) == 1 or mended > _limit(2 * len(rows) - 2):
+            kind, new_id, mended = "drop", UNKNOWN_ID, np.nan
+    own = int(np.searchsorted(graph.disc_ids, number))
+    return Group(
+        rows=rows,
+        id=number,
+        kind=kind,
+        new_id=new_id,
+        xy=xy,
+        own_m=float(away[own]),
+        row_chi_squared=score,
+        chi_squared=_misfit(recording, fit, rows, number),
+        mended_chi_squared=float(mended),
+    )
+
+
+def _limit(numbers: int) -> float:
+    """Largest squared error of rows that a landmark explains."""
+    return float(chi2.isf(_LEAST_PROBABILITY, numbers))

@@ -1,0 +1,210 @@
+"""All measurements of a run as one least-squares problem, and a value for each of its unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from camera import Camera
+from redetect.slam.models.measurement import disc_in_map
+from redetect.slam.models.motion import chain_steps
+from redetect.slam.recording import LineRows, Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """The measurements of a run, each with a root of its information.
+
+    A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 that after
+    step k.
+
+    Attributes
+    ----------
+    steps : (N, 3) float64
+        Odometry (m, m, rad).
+    step_whitening : (N, 3, 3) float64
+    disc_ids : (M,) int64
+        Ascending.
+    disc_pose, disc_index : (n,) int64
+        From which pose each row saw which disc (index into `disc_ids`).
+    disc_xy : (n, 2) float64
+        Where, in the robot frame (m).
+    disc_whitening : (n, 2, 2) float64
+    line_ids : (K,) int64
+        Vertical lines, ascending.
+    line_pose : (q,) int64
+        From which pose each row saw its lines.
+    bearing_rad, bearing_sigma_rad : (q,) float64
+        The rows' bearings and their standard deviations.
+    member_row, member_line : (e,) int64
+        Which rows show which lines (index into `line_ids`); a row may show several.
+    camera_xy : (2,) float64
+        Where in the robot frame bearings are taken from (m).
+    camera : Camera or None
+        As calibrated; it is needed where the mounting or a tilt is estimated.
+    """
+
+    steps: FloatArray
+    step_whitening: FloatArray
+    disc_ids: IntArray
+    disc_pose: IntArray
+    disc_index: IntArray
+    disc_xy: FloatArray
+    disc_whitening: FloatArray
+    line_ids: IntArray
+    line_pose: IntArray
+    bearing_rad: FloatArray
+    bearing_sigma_rad: FloatArray
+    member_row: IntArray
+    member_line: IntArray
+    camera_xy: FloatArray
+    camera: Camera | None = None
+
+    @property
+    def disc_row_counts(self) -> IntArray:
+        """(M,) how many rows show each disc."""
+        return np.bincount(self.disc_index, minlength=len(self.disc_ids)).astype(np.int64)
+
+    @property
+    def line_row_counts(self) -> IntArray:
+        """(K,) how many rows show each line."""
+        return np.bincount(self.member_line, minlength=len(self.line_ids)).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A value for each unknown.
+
+    Attributes
+    ----------
+    poses : (N + 1, 3) float64
+        x, y (m), theta (rad) in the map; the first is given, not estimated.
+    disc_xy : (M, 2) float64
+        Discs in the map (m).
+    line_xy : (K, 2) float64
+        Vertical lines in the map (m).
+    mounting : (3, 4) float64 or None
+        robot_from_camera as mounted; None: as calibrated, and discs are taken as the rows say.
+    tilt : (N + 1, 2) float64 or None
+        Pitch and roll per pose (rad): x and y of a rotation vector in the robot frame; None: the
+        robot is upright.
+    """
+
+    poses: FloatArray
+    disc_xy: FloatArray
+    line_xy: FloatArray
+    mounting: FloatArray | None = None
+    tilt: FloatArray | None = None
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """Inverse Cholesky roots of covariances.
+
+    Parameters
+    ----------
+    covariance : (..., d, d) float64
+        Positive definite.
+
+    Returns
+    -------
+    (..., d, d) float64
+        Lower triangular W with ``W C W^T = I``.
+    """
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
+    """The problem that a run's odometry and discs pose; lines come in by `with_lines`.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run. Rows without an identifier are left out.
+    camera : Camera, optional
+        As calibrated.
+
+    Returns
+    -------
+    Graph
+    """
+    circles = recording.circles
+    known = circles.ids >= 0
+    ids, index = np.unique(circles.ids[known], return_inverse=True)
+    none = np.zeros(0, dtype=np.int64)
+    return Graph(
+        steps=recording.steps,
+        step_whitening=whitening(recording.step_covariance),
+        disc_ids=ids,
+        disc_pose=circles.frame[known] + 1,
+        disc_index=index.astype(np.int64),
+        disc_xy=circles.xy[known],
+        disc_whitening=whitening(circles.covariance[known]),
+        line_ids=none,
+        line_pose=none,
+        bearing_rad=np.zeros(0),
+        bearing_sigma_rad=np.zeros(0),
+        member_row=none,
+        member_line=none,
+        camera_xy=np.zeros(2) if camera is None else np.array(camera.centre[:2]),
+        camera=camera,
+    )
+
+
+def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
+    """The problem with the bearings of some lines.
+
+    Parameters
+    ----------
+    graph : Graph
+        Without lines.
+    rows : LineRows
+        All rows of lines. One that shows a line other than those to be estimated, or none that is
+        known, is left out.
+    line_ids : (K,) int64
+        The lines to be estimated, ascending.
+
+    Returns
+    -------
+    Graph
+    """
+    place = {int(number): k for k, number in enumerate(line_ids)}
+    usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]
+    members = [(r, place[i]) for r, k in enumerate(usable) for i in rows.ids[k]]
+    table = np.array(members, dtype=np.int64).reshape(-1, 2)
+    return replace(
+        graph,
+        line_ids=np.asarray(line_ids, dtype=np.int64),
+        line_pose=rows.frame[usable] + 1,
+        bearing_rad=rows.bearing_rad[usable],
+        bearing_sigma_rad=rows.sigma_rad[usable],
+        member_row=table[:, 0].copy(),
+        member_line=table[:, 1].copy(),
+    )
+
+
+def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
+    """Poses as odometry chains them, discs where they were first seen, no lines.
+
+    Parameters
+    ----------
+    graph : Graph
+        Its lines are not placed: `line_xy` is NaN.
+    start : (3,) array_like
+        The first pose.
+
+    Returns
+    -------
+    Estimate
+    """
+    poses = chain_steps(graph.steps, start)
+    _, first = np.unique(graph.disc_index, return_index=True)
+    return Estimate(
+        poses=poses,
+        disc_xy=disc_in_map(poses[graph.disc_pose[first]], graph.disc_xy[first]),
+        line_xy=np.full((len(graph.line_ids), 2), np.nan),
+    )

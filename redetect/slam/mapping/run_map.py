@@ -1,0 +1,298 @@
+"""A run's least-squares map, from its rows to poses and landmarks with covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
+from redetect.slam.mapping.connection import check_connected
+from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
+from redetect.slam.mapping.graph_terms import Loss, Weighting
+from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
+from redetect.slam.mapping.marginals import Marginals, marginals
+from redetect.slam.mapping.solve import Solution, solve
+from redetect.slam.mapping.solve_gtsam import solve_gtsam
+from redetect.slam.models.mounting import check_rows_fit_camera, mounting_change
+from redetect.slam.recording import Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Solver = Literal["separable", "gtsam"]
+
+# Near enough to the minimum for the final optimisation.
+_COARSE = 1e-3
+# Multiples of the scale of a loss that is not convex, from nearly least squares down.
+_GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Rows and landmarks that a map cannot use, or cannot check.
+
+    Attributes
+    ----------
+    rows_without_id : int
+    discs_seen_once : int
+        They are in the map, but nothing checks them.
+    lines_without_parallax : int
+        Lines never seen, alone in a row, under enough parallax, or that do not stay placed.
+    line_rows : int
+        Rows of lines that show one of those.
+    """
+
+    rows_without_id: int
+    discs_seen_once: int
+    lines_without_parallax: int
+    line_rows: int
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """A camera's mounting as the run has it.
+
+    Attributes
+    ----------
+    change : (4,) float64
+        Rotation vector in the robot frame (rad) and height (m), true less calibrated.
+    covariance : (4, 4) float64
+    robot_from_camera : (3, 4) float64
+    gain : float
+        By how much less the sum of squares is than with the mounting as calibrated.
+    """
+
+    change: FloatArray
+    covariance: FloatArray
+    robot_from_camera: FloatArray
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class MappedRun:
+    """A least-squares map and how it came about.
+
+    Attributes
+    ----------
+    graph : Graph
+    start, estimate : Estimate
+        Odometry and first sight; the minimum. Lines are placed in the second only.
+    covariance : Marginals
+    table : ChiSquared
+    left_out : LeftOut
+    cost : float
+        What was minimised: chi-squared, or less under a robust loss.
+    steps : int
+        Of all descents together.
+    mounting : Mounting or None
+    """
+
+    graph: Graph
+    start: Estimate
+    estimate: Estimate
+    covariance: Marginals
+    table: ChiSquared
+    left_out: LeftOut
+    cost: float
+    steps: int
+    mounting: Mounting | None
+
+
+def map_run(
+    recording: Recording,
+    camera: Camera | None = None,
+    weighting: Weighting | None = None,
+    *,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    solver: Solver = "separable",
+    name: str = "run",
+) -> MappedRun:
+    """Least squares over all poses and landmarks of a run; the first pose is fixed.
+
+    First odometry and discs from first sight; then lines are triangulated from those poses and all
+    is fitted together; then the loss and the mounting, if asked for, start from there.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run. Rows without an identifier do not count.
+    camera : Camera, optional
+        As calibrated: for lines (where bearings are taken from) and where the mounting or a tilt is
+        unknown.
+    weighting : Weighting, optional
+        Loss and unknowns; plain least squares by default.
+    start : (3,)
+        The first pose (m, m, rad).
+    solver : "separable" or "gtsam"
+        The solver that does the final optimisation.
+    name : str
+        What messages call the run.
+
+    Returns
+    -------
+    MappedRun
+
+    Raises
+    ------
+    SlamError
+        If no row has an identifier, the run is disconnected, a calibration is missing, or there is
+        no minimum.
+    """
+    wanted = weighting or Weighting()
+    _check_usable(recording, camera, wanted, name)
+    graph = graph_of_recording(recording, camera)
+    begin = first_sight(graph, start)
+    plain = Weighting()
+    descend = _descent(solver, wanted.loss)
+    trail: list[Solution] = []
+
+    def keep(solution: Solution) -> Estimate:
+        trail.append(solution)
+        return solution.estimate
+
+    more = len(recording.lines) > 0
+    only_start = more or wanted != plain or solver != "separable"
+    estimate = keep(solve(graph, begin, plain, tolerance=_COARSE if only_start else 1e-10))
+    placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
+    if more:
+        placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
+        if not len(placed.ids) and not len(graph.disc_ids):
+            raise SlamError(
+                f"{name}: none of {len(placed.unplaced)} lines is seen, alone in a row, under "
+                "enough parallax: there is nothing to map"
+            )
+        graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
+    if only_start:
+        fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
+        if fixed.loss != "none":
+            estimate = keep(solve(graph, estimate, plain, tolerance=_COARSE))
+        if fixed.loss == "geman-mcclure":
+            # Graduated non-convexity: from where it is nearly least squares, rows that do not fit
+            # are let go one by one (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
+            for factor in _GRADUATION:
+                scale = factor * fixed.loss_scale
+                wide = replace(fixed, loss_scale=scale)
+                estimate = keep(solve(graph, estimate, wide, tolerance=_COARSE))
+        estimate = keep(descend(graph, estimate, fixed))
+    as_calibrated = trail[-1].cost
+    if wanted.calibrate or wanted.tilt_sigma_rad > 0.0:
+        estimate = keep(descend(graph, estimate, wanted))
+    covariance = marginals(graph, estimate, wanted)
+    return MappedRun(
+        graph=graph,
+        start=begin,
+        estimate=estimate,
+        covariance=covariance,
+        table=chi_squared(graph, estimate, wanted),
+        left_out=_left_out(recording, graph, placed),
+        cost=trail[-1].cost,
+        steps=sum(len(solution.costs) - 1 for solution in trail),
+        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].cost),
+    )
+
+
+def landmark_map(graph: Graph, estimate: Estimate, covariance: Marginals | None) -> LandmarkMap:
+    """Landmarks as a map; without covariances those are 0."""
+    discs, lines = len(graph.disc_ids), len(graph.line_ids)
+    zero = Marginals(np.zeros((0, 3, 3)), np.zeros((discs, 2, 2)), np.zeros((lines, 2, 2)), None)
+    spread = covariance or zero
+    return LandmarkMap(
+        discs=Landmarks(graph.disc_ids, estimate.disc_xy, spread.discs, graph.disc_row_counts),
+        lines=Landmarks(graph.line_ids, estimate.line_xy, spread.lines, graph.line_row_counts),
+    )
+
+
+def path_of(recording: Recording, estimate: Estimate, covariance: Marginals | None) -> Path2D:
+    """Poses as a path that begins at the start."""
+    return Path2D(
+        prefixes=("start", *recording.prefixes),
+        poses=estimate.poses,
+        covariance=None if covariance is None else covariance.poses,
+    )
+
+
+def _with_lines(
+    graph: Graph,
+    recording: Recording,
+    estimate: Estimate,
+    placed: InitialLines,
+    keep: Callable[[Solution], Estimate],
+) -> tuple[Graph, Estimate]:
+    """The problem with the lines that stay well placed while all is fitted together."""
+    ids, xy = placed.ids, placed.xy
+    robust = Weighting(loss="huber")
+    while True:
+        graph = with_lines(graph, recording.lines, ids)
+        estimate = replace(estimate, line_xy=xy)
+        if len(ids) == 0:
+            return graph, estimate
+        estimate = keep(solve(graph, estimate, robust, tolerance=_COARSE))
+        good = well_placed(graph, estimate)
+        if np.all(good):
+            return graph, estimate
+        ids, xy = ids[good], estimate.line_xy[good]
+
+
+def _descent(solver: Solver, loss: Loss) -> Callable[[Graph, Estimate, Weighting], Solution]:
+    if solver == "gtsam":
+        return solve_gtsam
+    # A robust loss converges slowly at last: reweighting is no Newton's method.
+    return partial(solve, tolerance=1e-10 if loss == "none" else 1e-7)
+
+
+def _check_usable(
+    recording: Recording, camera: Camera | None, weighting: Weighting, name: str
+) -> None:
+    known = bool(np.any(recording.circles.ids >= 0)) or any(recording.lines.ids)
+    if not len(recording.circles) and not len(recording.lines):
+        raise SlamError(
+            f"{name}: no landmark in it: expected rows of discs or, with --lines, of verticals, as "
+            "`detect circles` and `detect lines` write them"
+        )
+    if not known:
+        raise SlamError(
+            f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
+        )
+    needs = "lines" if len(recording.lines) else ""
+    if weighting.calibrate or weighting.tilt_sigma_rad > 0.0:
+        needs = "the camera's mounting"
+    if needs and camera is None:
+        raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
+    if weighting.calibrate and camera is not None:
+        if not np.any(recording.circles.ids >= 0):
+            raise SlamError(
+                f"{name}: bearings do not say how the camera is mounted: expected discs"
+            )
+        check_rows_fit_camera(camera, recording.circles.xy)
+    check_connected(recording, name)
+
+
+def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:
+    lines = recording.lines
+    return LeftOut(
+        rows_without_id=int(np.sum(recording.circles.ids < 0))
+        + sum(not some for some in lines.ids),
+        discs_seen_once=int(np.sum(graph.disc_row_counts == 1)),
+        lines_without_parallax=len(placed.unplaced) + len(placed.ids) - len(graph.line_ids),
+        line_rows=sum(bool(some) for some in lines.ids) - len(graph.line_pose),
+    )
+
+
+def _mounting(
+    camera: Camera | None, estimate: Estimate, covariance: Marginals, gain: float
+) -> Mounting | None:
+    if estimate.mounting is None or covariance.mounting is None or camera is None:
+        return None
+    return Mounting(
+        change=mounting_change(camera, estimate.mounting),
+        covariance=covariance.mounting,
+        robot_from_camera=estimate.mounting,
+        gain=gain,
+    )

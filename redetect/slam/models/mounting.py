@@ -1,0 +1,209 @@
+"""Rows as a differently mounted camera would have written them, with derivatives.
+
+A row puts a pixel on the floor through the camera as calibrated. If the camera is really mounted
+otherwise, the same pixel's ray meets the floor elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from camera import Camera
+from redetect.slam.errors import SlamError
+from redetect.slam.models.mounted_discs import rotation_exp, skew
+
+FloatArray = NDArray[np.float64]
+
+
+def nominal_mounting(camera: Camera) -> FloatArray:
+    """(3, 4) robot_from_camera as calibrated."""
+    return np.column_stack([camera.rotation, camera.centre])
+
+
+def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
+    """Rays from the camera as calibrated to rows' places on the floor.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    floor_xy : (n, 2) float64
+        Rows in the robot frame (m).
+
+    Returns
+    -------
+    (n, 3) float64
+        Directions in the robot frame, z below 0, not of unit length.
+    """
+    on_floor = np.concatenate([floor_xy, np.zeros((len(floor_xy), 1))], axis=1)
+    return np.asarray(on_floor - camera.centre)
+
+
+def rows_through_mounting(
+    camera: Camera, directions: FloatArray, mounting: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where rows' rays meet the floor if the camera is mounted otherwise.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    directions : (n, 3) float64
+        See `directions_of_rows`.
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+
+    Returns
+    -------
+    floor_xy : (n, 2) float64
+        In the robot frame (m); NaN where a ray does not go down.
+    by_mounting : (n, 2, 4) float64
+        Derivatives by a rotation vector in the robot frame, applied to the mounting from the left,
+        and by the height.
+    """
+    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
+    centre = mounting[:, 3]
+    ray = directions @ turn.T
+    ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
+    slope = ray[:, :2] / ray[:, 2:]
+    by_ray = np.zeros((len(ray), 2, 3))
+    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -centre[2] / ray[:, 2]
+    by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
+    by_mounting = np.concatenate([-by_ray @ skew(ray), -slope[:, :, None]], axis=2)
+    return centre[:2] - centre[2] * slope, by_mounting
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedJacobians:
+    """Derivatives of n rows as recorded.
+
+    Attributes
+    ----------
+    floor : (n, 2, 2) float64
+        By the disc in the robot frame.
+    tilt : (n, 2, 2) float64
+        By the frame's pitch and roll.
+    mounting : (n, 2, 4) float64
+        By a rotation vector in the robot frame, applied to the mounting from the left, and by the
+        height.
+    """
+
+    floor: FloatArray
+    tilt: FloatArray
+    mounting: FloatArray
+
+
+def rows_as_recorded(
+    camera: Camera, floor_xy: FloatArray, mounting: FloatArray, tilt: FloatArray
+) -> tuple[FloatArray, RecordedJacobians]:
+    """Rows by the calibration of discs that the camera sees as mounted and tilted.
+
+    The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
+    the camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    floor_xy : (n, 2) float64
+        Discs in the robot frame (m).
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+    tilt : (n, 2) float64
+        Pitch and roll of the robot: x and y of a rotation vector in the robot frame (rad).
+
+    Returns
+    -------
+    rows_xy : (n, 2) float64
+        In the robot frame (m); NaN where the ray does not go down for the calibrated camera.
+    jacobians : RecordedJacobians
+    """
+    unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
+    from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
+    turn, left = rotation_exp(np.column_stack([tilt, np.zeros(len(tilt))]))
+    level = np.swapaxes(turn, 1, 2)
+    untilted = np.einsum("nij,nj->ni", level, from_centre)
+    ray = untilted @ unturn.T
+    ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
+    height = float(camera.centre[2])
+    slope = ray[:, :2] / ray[:, 2:]
+    by_ray = np.zeros((len(ray), 2, 3))
+    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -height / ray[:, 2]
+    by_ray[:, :, 2] = height * slope / ray[:, 2:]
+    by_untilted = by_ray @ unturn
+    by_robot = by_untilted @ level
+    return camera.centre[:2] - height * slope, RecordedJacobians(
+        floor=by_robot[:, :, :2],
+        tilt=(by_robot @ skew(from_centre) @ left)[:, :, :2],
+        mounting=np.concatenate([by_untilted @ skew(untilted), -by_robot[:, :, 2:]], axis=2),
+    )
+
+
+def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
+    """Rotation vector in the robot frame (rad) and height (m), true less calibrated.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+
+    Returns
+    -------
+    (4,) float64
+    """
+    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
+    return np.append(
+        Rotation.from_matrix(turn).as_rotvec(), mounting[2, 3] - float(camera.centre[2])
+    )
+
+
+def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, FloatArray]:
+    """By how much a camera is turned about the vertical against its calibration.
+
+    Parameters
+    ----------
+    camera : Camera
+        As calibrated.
+    mounting : (3, 4) float64
+        robot_from_camera as mounted.
+
+    Returns
+    -------
+    angle : float
+        The turn of the plane nearest to the rotation (rad).
+    by_mounting : (4,) float64
+        Its derivatives by a rotation vector in the robot frame, applied to the mounting from the
+        left, and by the height.
+    """
+    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
+    sin, cos = turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]
+    tilt_x, tilt_y = turn[2, 0], turn[2, 1]
+    squared = sin**2 + cos**2
+    by_x = (-cos * tilt_x + sin * tilt_y) / squared
+    by_y = (-cos * tilt_y - sin * tilt_x) / squared
+    return float(np.arctan2(sin, cos)), np.array([by_x, by_y, 1.0, 0.0])
+
+
+def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
+    """See that rows can come from a camera at all.
+
+    Raises
+    ------
+    SlamError
+        If a row lies where the camera as calibrated cannot see the floor: the calibration is not
+        that of the run.
+    """
+    pixels = camera.project_floor(floor_xy)
+    outside = ~np.all(np.isfinite(pixels), axis=-1)
+    if np.any(outside):
+        x, y = floor_xy[np.flatnonzero(outside)[0]]
+        raise SlamError(
+            f"--calibrate: {int(np.sum(outside))} rows, the first at ({x:g}, {y:g}), lie where the "
+            "camera as calibrated cannot see: expected the calibration that the rows were made with"
+        )

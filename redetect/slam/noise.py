@@ -1,0 +1,177 @@
+"""White Gaussian noise on a run's rows, which say so in their covariances: rows in, rows out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, wrap_angle
+from redetect.slam.errors import SlamError
+from redetect.slam.recording import Recording
+from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
+
+
+@dataclass(frozen=True)
+class AddedNoise:
+    """Standard deviations of the added noise, independent for each number.
+
+    Attributes
+    ----------
+    disc_m : float
+        To x and y of a disc.
+    bearing_rad : float
+        To the bearing of a line. Its ends in the image stay as they are.
+    step_m : float
+        To dx and dy of a step.
+    turn_rad : float
+        To dphi of a step.
+    seed : int
+        Steps and landmarks draw from streams of their own, so that the files of discs and of lines
+        of one run get the same odometry.
+
+    Raises
+    ------
+    SlamError
+        If a standard deviation is negative or not finite, or the seed is negative.
+    """
+
+    disc_m: float = 0.0
+    bearing_rad: float = 0.0
+    step_m: float = 0.0
+    turn_rad: float = 0.0
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        demand(
+            self,
+            SlamError,
+            disc_m=NOT_NEGATIVE,
+            bearing_rad=NOT_NEGATIVE,
+            step_m=NOT_NEGATIVE,
+            turn_rad=NOT_NEGATIVE,
+            seed=whole(0),
+        )
+
+    @property
+    def nothing(self) -> bool:
+        """Whether all are 0."""
+        return not (self.disc_m or self.bearing_rad or self.step_m or self.turn_rad)
+
+    @property
+    def comment(self) -> str:
+        """The head of the file."""
+        return (
+            f"Noise was added, standard deviations: discs {self.disc_m:g} m, bearings "
+            f"{self.bearing_rad:g} rad, dx and dy {self.step_m:g} m, dphi {self.turn_rad:g} rad; "
+            f"seed {self.seed}. The covariances are raised to match."
+        )
+
+
+def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
+    """Rows of a landmark file with noise added.
+
+    Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
+    comment at the head says what was added. Without noise the rows come out as they are.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        As `redetect.landmarks.read_rows` gives them.
+    noise : AddedNoise
+
+    Yields
+    ------
+    Row
+    """
+    of_steps = np.random.default_rng([noise.seed, 0])
+    of_landmarks = np.random.default_rng([noise.seed, 1])
+    first = True
+    for row in rows:
+        if first and not noise.nothing:
+            line_end = b"\r\n" if (row.source or b"").endswith(b"\r\n") else b"\n"
+            yield Row(None, b"# " + noise.comment.encode() + line_end)
+        first = False
+        record = row.record
+        if isinstance(record, Step) and (noise.step_m or noise.turn_rad):
+            yield row.with_record(_noisy_step(record, noise, of_steps))
+        elif isinstance(record, CircleLandmark) and noise.disc_m:
+            yield row.with_record(_noisy_circle(record, noise.disc_m, of_landmarks))
+        elif isinstance(record, LineLandmark) and noise.bearing_rad:
+            yield row.with_record(_noisy_line(record, noise.bearing_rad, of_landmarks))
+        else:
+            yield row
+
+
+def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recording:
+    """A run whose landmark rows are noisier by a factor on their own standard deviations.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    factor : float
+        Standard deviation of the added noise as a multiple of each row's own; 0 adds none.
+    seed : int
+        Everything random follows from it.
+
+    Returns
+    -------
+    Recording
+        Covariances are 1 + factor^2 times what they were; odometry stays.
+
+    Raises
+    ------
+    SlamError
+        If the factor is negative or not finite, or the seed is negative.
+    """
+    AddedNoise(disc_m=factor, seed=seed)  # which refuses what makes no sense
+    rng = np.random.default_rng([seed, 2])
+    circles, lines = recording.circles, recording.lines
+    root = np.linalg.cholesky(circles.covariance)
+    added = np.einsum("nij,nj->ni", root, rng.standard_normal(circles.xy.shape))
+    turned = lines.sigma_rad * rng.standard_normal(len(lines))
+    return replace(
+        recording,
+        circles=replace(
+            circles,
+            xy=circles.xy + factor * added,
+            covariance=circles.covariance * (1.0 + factor**2),
+        ),
+        lines=replace(
+            lines,
+            bearing_rad=wrap_angle(lines.bearing_rad + factor * turned),
+            sigma_rad=lines.sigma_rad * math.sqrt(1.0 + factor**2),
+        ),
+    )
+
+
+def _noisy_step(step: Step, noise: AddedNoise, rng: np.random.Generator) -> Step:
+    x, y, turn = rng.standard_normal(3).tolist()
+    return replace(
+        step,
+        dx=step.dx + noise.step_m * x,
+        dy=step.dy + noise.step_m * y,
+        dphi=step.dphi + noise.turn_rad * turn,
+        cxx=step.cxx + noise.step_m**2,
+        cyy=step.cyy + noise.step_m**2,
+        cphiphi=step.cphiphi + noise.turn_rad**2,
+    )
+
+
+def _noisy_circle(disc: CircleLandmark, sigma_m: float, rng: np.random.Generator) -> CircleLandmark:
+    x, y = rng.standard_normal(2).tolist()
+    return replace(
+        disc,
+        px=disc.px + sigma_m * x,
+        py=disc.py + sigma_m * y,
+        cxx=disc.cxx + sigma_m**2,
+        cyy=disc.cyy + sigma_m**2,
+    )
+
+
+def _noisy_line(line: LineLandmark, sigma_rad: float, rng: np.random.Generator) -> LineLandmark:
+    alpha = line.alpha + sigma_rad * float(rng.standard_normal())
+    return replace(line, alpha=float(wrap_angle(alpha)), sigma=math.hypot(line.sigma, sigma_rad))

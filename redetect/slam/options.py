@@ -1,0 +1,362 @@
+"""The flags of the command ``slam``: one frozen dataclass per command, nothing heavy imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+from tyro.conf import Positional, arg
+
+from redetect.slam.models.odometry_noise import OdometryNoise
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeStr = Optional[str]  # noqa: UP045
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """Options of all commands that read the landmarks of a run.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file.
+    circles : bool
+        Use the discs; the default if neither kind is given.
+    lines : bool
+        Use the vertical lines.
+    stem : str
+        Name of the landmark files in the folder; by default map, else detected.
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines need one).
+    force : bool
+        Replace existing files.
+    odometry_noise : OdometryNoise
+        Of the steps that state no covariance.
+    """
+
+    run: Positional[Path]
+    circles: bool = False
+    lines: bool = False
+    stem: MaybeStr = None
+    camera: MaybePath = None
+    force: bool = False
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map(RunFlags):
+    """Least-squares map: all poses and landmarks of a run at once.
+
+    Example: slam map images/e --circles --lines -o /tmp/e-map
+
+    Parameters
+    ----------
+    camera : Path
+        Calibration, if it is not the one in the run folder (lines and --calibrate need one).
+    calibrate : bool
+        Estimate the camera's mounting (rotation and height) as well.
+    row_errors : str
+        With --calibrate, where rows are compared with discs: `corrected`, on the floor as the
+        camera as mounted sees it; `recorded`, as the rows were written, where their covariances
+        belong.
+    tilt_deg : float
+        Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
+        recorded.
+    solver : str
+        `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
+        (extra [slam]).
+    loss : str
+        `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
+    loss_scale : float
+        Standard deviations from which on they do.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
+    output : Path
+        Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
+    interactive : bool
+        Show the pictures in windows as well.
+    """
+
+    calibrate: bool = False
+    row_errors: Literal["corrected", "recorded"] = "corrected"
+    tilt_deg: float = 0.0
+    solver: Literal["separable", "gtsam"] = "separable"
+    loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
+    loss_scale: float = 3.0
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Audit(RunFlags):
+    """Find discs whose identifiers contradict the rest of the run, and write the run without them.
+
+    Example: slam audit images/e -o /tmp/audited.circles
+
+    Parameters
+    ----------
+    calibrate : bool
+        Estimate the camera's mounting as well.
+    gate : float
+        Squared error of a row, in units of its covariance, from which on it contradicts.
+    apply : str
+        `mend`: rows get the identifier of the landmark that they show, -1 where none explains
+        them; `drop`: their lines are left out.
+    pictures : Path
+        Folder for pictures of what the rows show.
+    images : Path
+        Folder of the run's images; by default that of the rows.
+    output : Path
+        The landmark file to write; by default audited.circles in the run folder. The list goes
+        into a .csv beside.
+    """
+
+    calibrate: bool = False
+    gate: float = 100.0
+    apply: Literal["mend", "drop"] = "mend"
+    pictures: MaybePath = None
+    images: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterFlags(RunFlags):
+    """Options of both filters.
+
+    Parameters
+    ----------
+    gate_probability : float
+        Share of right rows that pass the gate; with known association nothing is gated.
+    reference : Path
+        A path.csv to measure the distance from.
+    interactive : bool
+        Show the pictures in windows as well.
+    """
+
+    association: Literal["known", "nearest", "joint"] = "known"
+    gate_probability: float = 0.999
+    reference: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    interactive: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localize(FilterFlags):
+    """Localise in a known map with an extended Kalman filter.
+
+    Example: slam localize images/e --map /tmp/e-map/map.csv
+
+    Parameters
+    ----------
+    map : Path
+        The map (written by `slam map`).
+    association : str
+        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+        out, by Mahalanobis distance of one row at a time or of a frame's rows together.
+    map_errors : str
+        `considered`: the map's covariances are errors that stay the same each time a landmark is
+        seen; `white`: errors that are new each time; `ignored`: the map is exact. By default
+        (`auto`) considered with known association, else ignored.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
+    start_sigma : three floats
+        Its standard deviations.
+    output : Path
+        Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run
+        folder.
+    """
+
+    map: Path
+    map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ekf(FilterFlags):
+    """Map and localise at once with an extended Kalman filter (EKF-SLAM, landmarks by their IDs).
+
+    Example: slam ekf images/e --reference /tmp/e-map/path.csv
+
+    Parameters
+    ----------
+    association : str
+        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+        out.
+    jacobians : str
+        Where the models are linearised: at the `first` estimate of each landmark, so that the
+        filter gains no spurious information about its heading from landmarks that it has placed
+        itself; or at the `latest`, as the textbook filter does, which is inconsistent at large
+        heading errors.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
+    reference_map : Path
+        A map.csv to measure the distance of the landmarks from.
+    output : Path
+        Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run
+        folder.
+    """
+
+    jacobians: Literal["first", "latest"] = "first"
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    reference_map: MaybePath = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Associate(RunFlags):
+    """Find out which rows of a run show the same landmark, and write the run with those IDs.
+
+    Where the file has IDs of its own they are not used, but the result is scored against them.
+
+    Example: slam associate images/e --method joint --map-level
+
+    Parameters
+    ----------
+    method : str
+        `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
+        frame's rows (JCBB).
+    map_level : bool
+        Then search loops by fitting local maps of landmarks to each other.
+    gate_probability : float
+        Share of right rows that pass the gate.
+    sigma_scale : float
+        Factor on the discs' standard deviations: a robot that sways moves them by more than the
+        file says.
+    tilt_sigma_deg : float
+        Standard deviation of the robot's sway, which moves all discs of a frame together.
+    kept_probability : float
+        Share of a disc's right rows that keep its ID at the map level, by their covariances as the
+        file states them; rows farther from its place in the map get -1.
+    fewest_rows : int
+        Discs of fewer such rows are taken for clutter: their rows get -1.
+    noise : several floats
+        Score again with noise added to the measurements (factors on their standard deviation).
+    seed : int
+        Of that noise.
+    output : Path
+        The landmark file to write; by default associated.circles (or .lines) in the run folder.
+        With both kinds two files, which differ in the suffix. The scores go into a .json beside.
+    """
+
+    method: Literal["nearest", "joint"] = "joint"
+    map_level: bool = True
+    gate_probability: float = 0.999
+    sigma_scale: float = 1.4
+    tilt_sigma_deg: float = 0.2
+    kept_probability: float = 0.99
+    fewest_rows: int = 3
+    noise: tuple[float, ...] = ()
+    seed: int = 1
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Add white Gaussian noise to a run; its covariances are raised to match.
+
+    Example: slam noise images/e --sigma 0.05 -o /tmp/noisy.circles
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles, .lines or .txt file.
+    sigma : float
+        Standard deviation added to disc positions along x and y (m).
+    bearing_sigma : float
+        Standard deviation added to bearings of lines (rad).
+    step_sigma : float
+        Standard deviation added to dx and dy of each step (m).
+    turn_sigma : float
+        Standard deviation added to dphi of each step (rad).
+    lines : bool
+        Of a run folder take the .lines file instead of the .circles.
+    stem : str
+        Name of the landmark file in the folder; by default map, else detected.
+    seed : int
+        Everything random follows from it.
+    output : Path
+        The file to write.
+    force : bool
+        Replace an existing file.
+    """
+
+    run: Positional[Path]
+    sigma: float = 0.0
+    bearing_sigma: float = 0.0
+    step_sigma: float = 0.0
+    turn_sigma: float = 0.0
+    lines: bool = False
+    stem: MaybeStr = None
+    seed: int = 1
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(RunFlags):
+    """Write a run (and a map of it) in the formats of other tools.
+
+    Example: slam export images/e --to g2o -o /tmp/e.g2o
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a .circles or .lines file; for --to tum a path.csv as well.
+    to : str
+        `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
+        odometry and measurements as tables for GTSAM or MRPT.
+    solution : Path
+        Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
+        default odometry's and first sight's.
+    times : Path
+        For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside
+        the run that has them all; where there is none, t counts the steps.
+    axes : str
+        `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
+    output : Path
+        The file to write; for csv a folder.
+    """
+
+    output: Annotated[Path, arg(aliases=["-o"])]
+    to: Literal["g2o", "tum", "csv"] = "g2o"
+    solution: MaybePath = None
+    times: MaybePath = None
+    axes: Literal["robotics", "dataset"] = "robotics"
+
+
+@dataclass(frozen=True)
+class Import:
+    """Read other tools' and data sets' files into this project's.
+
+    Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
+
+    Parameters
+    ----------
+    file : Path
+        A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the
+        UTIAS data set (MRCLAM), or aa3_dr.mat of Victoria Park.
+    axes : str
+        The axes that the graph or trajectory is in; see `slam export`.
+    range_sigma, bearing_sigma : float
+        Standard deviations of a data set's ranges (m) and bearings (rad).
+    output : Path
+        Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates;
+        of a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of
+        true landmarks the map.csv.
+    force : bool
+        Replace an existing file.
+    """
+
+    file: Positional[Path]
+    output: Annotated[Path, arg(aliases=["-o"])]
+    axes: Literal["robotics", "dataset"] = "robotics"
+    range_sigma: float = 0.1
+    bearing_sigma: float = 0.03
+    force: bool = False
+
+
+Command = Map | Audit | Localize | Ekf | Associate | Noise | Export | Import

@@ -1,0 +1,435 @@
+"""Pictures of maps and of errors along a path, as PNG files or in windows.
+
+Maps are drawn in the axes that they are in, X to the right and Y up, equally scaled. The same input
+gives the same bytes; a user's own matplotlib settings do not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+from matplotlib.ticker import MultipleLocator
+from numpy.typing import ArrayLike, NDArray
+
+from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.slam.errors import SlamError
+from redetect.slam.figure_file import picture
+from redetect.slam.recording import PICTURES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FloatArray = NDArray[np.float64]
+
+#: Central 95 % of chi squared with 3 degrees of freedom.
+NEES_BAND = (0.21579528262389785, 9.348403604496145)
+
+_PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
+_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+_ELLIPSE_POINTS = 40
+# Crops in a row, and their half width.
+_CROPS_ABREAST, _CROP_PX = 8, 48.0
+# Largest number of discs that are labelled with their numbers.
+_MOST_NUMBERED = 40
+# Largest number of landmarks whose ellipses are drawn.
+_MOST_ELLIPSES = 700
+# How far beyond path and discs a vertical may be and still be drawn.
+_MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
+
+
+def pose_errors(
+    path: Path2D, reference: ArrayLike
+) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """Errors of a path's poses, their standard deviations, and the normalised error squared.
+
+    Parameters
+    ----------
+    path : Path2D
+        The estimate.
+    reference : (N, 3) array_like
+        True poses in the same map, one for each of the path's.
+
+    Returns
+    -------
+    error : (N, 3) float64
+        Estimate less truth: x, y (m), theta (rad, wrapped).
+    sigma : (N, 3) float64 or None
+        Standard deviations; None where the path has no covariance.
+    nees : (N,) float64 or None
+        Normalised estimation error squared; NaN where a covariance is singular, as a start's is.
+
+    Raises
+    ------
+    SlamError
+        If there is not one reference pose for each pose.
+    """
+    truth = np.asarray(reference, dtype=np.float64)
+    if truth.shape != path.poses.shape:
+        raise SlamError(
+            f"reference of shape {truth.shape}: expected one pose for each of the path's "
+            f"{len(path.poses)}"
+        )
+    error = path.poses - truth
+    error[:, 2] = wrap_angle(error[:, 2])
+    if path.covariance is None:
+        return error, None, None
+    variance = np.diagonal(path.covariance, axis1=1, axis2=2)
+    nees = np.full(len(error), np.nan)
+    usable = is_positive_definite(path.covariance)
+    nees[usable] = squared_mahalanobis(error[usable], path.covariance[usable])
+    return error, np.sqrt(np.clip(variance, 0.0, None)), nees
+
+
+def ellipse_outlines(xy: ArrayLike, covariance: ArrayLike, sigmas: float = 3.0) -> FloatArray:
+    """Outlines of covariance ellipses.
+
+    Parameters
+    ----------
+    xy : (M, 2) array_like
+        Centres (m).
+    covariance : (M, 2, 2) array_like
+        Positive semidefinite (m^2).
+    sigmas : float
+        Mahalanobis distance of the outline.
+
+    Returns
+    -------
+    (M, K, 2) float64
+        Points round each ellipse (m).
+    """
+    centre = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+    spread, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64).reshape(-1, 2, 2))
+    # The root of the covariance: axes scaled by the standard deviations along them.
+    root = axes * np.sqrt(np.clip(spread, 0.0, None))[:, None, :]
+    angle = np.linspace(0.0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    offset = sigmas * np.einsum("mij,kj->mki", root, circle)
+    return np.asarray(centre[:, None, :] + offset)
+
+
+def draw_map(
+    png: Path,
+    landmark_map: LandmarkMap,
+    path: Path2D,
+    *,
+    before: Path2D | None = None,
+    before_map: LandmarkMap | None = None,
+    reference: Path2D | None = None,
+    title: str = "",
+    overwrite: bool,
+    interactive: bool = False,
+) -> None:
+    """Draw a map: path, landmarks and their 3-sigma ellipses.
+
+    Parameters
+    ----------
+    png : Path
+        The picture's file.
+    landmark_map : LandmarkMap
+        Discs and verticals. Verticals far outside are counted in the legend, not drawn.
+    path : Path2D
+        The robot's path.
+    before, before_map : Path2D, LandmarkMap, optional
+        The same before loops were closed: drawn in a panel of its own, to the same scale.
+    reference : Path2D, optional
+        The true path, or another to compare with; dashed.
+    title : str
+        Drawn above the picture.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    interactive : bool
+        Show a window as well, and wait until it is closed.
+
+    Raises
+    ------
+    redetect.storage.OutputExistsError
+        If the file exists and may not be replaced.
+    SlamError
+        If there is nothing to draw, or `interactive` where no window can be opened.
+    """
+    panels: list[tuple[str, LandmarkMap | None, Path2D]] = [("", landmark_map, path)]
+    if before is not None:
+        panels = [
+            ("before closing loops", before_map, before),
+            ("after closing loops", landmark_map, path),
+        ]
+    low, high = _extent([(m, p) for _, m, p in panels], reference)
+    span = high - low
+    stacked = len(panels) > 1 and span[0] > 1.5 * span[1]
+    rows, columns = (len(panels), 1) if stacked else (1, len(panels))
+    largest = (9.0, 8.0) if len(panels) == 1 else (10.0, 6.0) if stacked else (7.0, 7.5)
+    scale = min(largest[0] / span[0], largest[1] / span[1])
+    size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
+    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
+        all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        for axes, (name, some, poses) in zip(all_axes, panels):
+            _draw_panel(axes, some, poses, reference, low, high)
+            axes.set_xlim(low[0], high[0])
+            axes.set_ylim(low[1], high[1])
+            axes.set_aspect("equal")
+            # Squares of one size: a scale for the eye.
+            axes.xaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
+            axes.yaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
+            axes.set_title(name, fontsize=11)
+            axes.set_xlabel("x / m")
+            axes.set_ylabel("y / m")
+            axes.label_outer()
+            axes.grid(alpha=0.25, lw=0.6)
+        handles, labels = all_axes[-1].get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=min(len(labels), 4), fontsize=9
+        )
+        if title:
+            figure.suptitle(title, fontsize=12)
+
+
+def draw_errors(
+    png: Path,
+    path: Path2D,
+    reference: ArrayLike,
+    *,
+    title: str = "",
+    overwrite: bool,
+    interactive: bool = False,
+) -> None:
+    """Draw position and heading error over the steps, and the normalised error squared.
+
+    Parameters
+    ----------
+    png : Path
+        The picture's file.
+    path : Path2D
+        The estimate. Without covariance there is no band and no normalised error.
+    reference : (N, 3) array_like
+        True poses in the same map.
+    title : str
+        Drawn above the picture.
+    overwrite, interactive : bool
+        As for `draw_map`.
+
+    Raises
+    ------
+    redetect.storage.OutputExistsError
+        If the file exists and may not be replaced.
+    SlamError
+        If there is not one reference pose for each pose, or `interactive` where no window can be
+        opened.
+    """
+    error, sigma, nees = pose_errors(path, reference)
+    step = np.arange(len(error))
+    unit = np.array([1.0, 1.0, 180.0 / np.pi])
+    names = ("x error / m", "y error / m", "heading error / °")
+    rows = 3 if nees is None else 4
+    size = (10.0, 1.9 * rows + 1.0)
+    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
+        all_axes = figure.subplots(rows, 1, sharex=True)
+        for i, (axes, name) in enumerate(zip(all_axes, names)):
+            value = unit[i] * error[:, i]
+            if sigma is not None:
+                band = 3.0 * unit[i] * sigma[:, i]
+                axes.fill_between(
+                    step, -band, band, color=_BAND, alpha=0.2, lw=0, label=f"±3 {_SIGMA}", zorder=1
+                )
+                share = float(np.mean(np.abs(value) <= band))
+                axes.set_title(f"within 3 {_SIGMA}: {share:.1%}", fontsize=9, loc="right")
+            axes.plot(step, value, color="black", lw=0.8, label="error", zorder=3)
+            axes.axhline(0.0, color=_REFERENCE, lw=0.6, zorder=2)
+            axes.set_ylabel(name)
+            axes.grid(alpha=0.25, lw=0.6)
+        all_axes[0].legend(loc="upper left", fontsize=8, ncols=2)
+        if nees is not None:
+            _draw_nees(all_axes[3], step, nees)
+        all_axes[-1].set_xlabel("step")
+        all_axes[-1].set_xlim(0, max(len(step) - 1, 1))
+        figure.align_ylabels(list(all_axes))
+        if title:
+            figure.suptitle(title, fontsize=12)
+
+
+def _draw_nees(axes: Axes, step: NDArray[np.int64], nees: FloatArray) -> None:
+    known = np.isfinite(nees)
+    axes.axhspan(*NEES_BAND, color=_BAND, alpha=0.2, lw=0, label="95 % band", zorder=1)
+    axes.axhline(3.0, color=_REFERENCE, lw=0.6, label="expected: 3", zorder=2)
+    if known.any():
+        # A logarithm has no place for an error of exactly 0.
+        axes.plot(step, np.maximum(nees, 1e-3), color="black", lw=0.8, label="NEES", zorder=3)
+        inside = (nees[known] >= NEES_BAND[0]) & (nees[known] <= NEES_BAND[1])
+        axes.set_title(
+            f"mean {np.mean(nees[known]):.3g}, in the band: {np.mean(inside):.1%}",
+            fontsize=9,
+            loc="right",
+        )
+        # Space above for the legend.
+        highest = max(100.0, 5.0 * float(np.max(nees[known])))
+        lowest = min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5))
+        axes.set_ylim(lowest, highest)
+    axes.set_yscale("log")
+    axes.set_ylabel("error², normalised")
+    axes.grid(alpha=0.25, lw=0.6)
+    axes.legend(loc="upper left", fontsize=8, ncols=3)
+
+
+def _extent(
+    drawn: list[tuple[LandmarkMap | None, Path2D]], reference: Path2D | None
+) -> tuple[FloatArray, FloatArray]:
+    """Corners of the picture (m): all paths and discs, and the verticals not far from them."""
+    points = [path.poses[:, :2] for _, path in drawn]
+    points += [some.discs.xy for some, _ in drawn if some is not None]
+    if reference is not None:
+        points.append(reference.poses[:, :2])
+    inner = np.concatenate(points)
+    if len(inner) == 0:
+        raise SlamError("a map without path and discs: expected something to draw")
+    low, high = inner.min(axis=0), inner.max(axis=0)
+    reach = np.minimum(_MARGIN_M, _MARGIN_SHARE * float(np.max(high - low)) + 1.0)
+    for some, _ in drawn:
+        if some is not None:
+            near = _inside(some.lines.xy, low - reach, high + reach)
+            for landmarks, shown in ((some.discs, slice(None)), (some.lines, near)):
+                # With their ellipses, but an unknown place shall not shrink the known ones.
+                variance = np.diagonal(landmarks.covariance[shown], axis1=1, axis2=2)
+                around = np.minimum(3.0 * np.sqrt(np.clip(variance, 0.0, None)), 0.5 * reach)
+                places = landmarks.xy[shown]
+                inner = np.concatenate([inner, places - around, places + around])
+    low, high = inner.min(axis=0), inner.max(axis=0)
+    margin = max(0.03 * float(np.max(high - low)), 0.3)
+    # A straight drive has next to no width, but shall have a picture.
+    middle, half = 0.5 * (low + high), 0.5 * (high - low) + margin
+    half = np.maximum(half, 0.2 * float(half.max()))
+    return middle - half, middle + half
+
+
+def _grid_spacing(span: FloatArray) -> float:
+    """1, 2 or 5 times a power of ten, of which the larger side has 5 to 12."""
+    finest = float(np.max(span)) / 12.0
+    power = 10.0 ** np.floor(np.log10(finest))
+    return float(next(n * power for n in (1.0, 2.0, 5.0, 10.0) if n * power >= finest))
+
+
+def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.all((xy >= low) & (xy <= high), axis=1))
+
+
+def _draw_panel(
+    axes: Axes,
+    some: LandmarkMap | None,
+    path: Path2D,
+    reference: Path2D | None,
+    low: FloatArray,
+    high: FloatArray,
+) -> None:
+    if reference is not None:
+        axes.plot(
+            reference.poses[:, 0], reference.poses[:, 1], color=_REFERENCE, lw=0.9, ls=(0, (4, 2)),
+            label="reference", zorder=4,
+        )  # fmt: skip
+    axes.plot(path.poses[:, 0], path.poses[:, 1], color=_PATH, lw=0.9, label="path", zorder=3)
+    if some is not None:
+        ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
+        _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
+        _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), low, high, ellipses=ellipses)
+        if 0 < len(some.discs) <= _MOST_NUMBERED:
+            for number, (x, y) in zip(some.discs.ids.tolist(), some.discs.xy.tolist()):
+                axes.annotate(
+                    str(number), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7,
+                    color=_DISC, zorder=6,
+                )  # fmt: skip
+    for index, name, marker in ((0, "start", "o"), (-1, "end", "s")):
+        axes.plot(
+            path.poses[index, :1], path.poses[index, 1:2], ls="", marker=marker, ms=6, mfc="white",
+            mec="black", mew=1.2, label=name, zorder=7,
+        )  # fmt: skip
+
+
+def _draw_landmarks(
+    axes: Axes,
+    some: Landmarks,
+    look: tuple[str, str, str],
+    low: FloatArray,
+    high: FloatArray,
+    *,
+    ellipses: bool,
+) -> None:
+    name, colour, marker = look
+    if len(some) == 0:
+        return
+    shown = _inside(some.xy, low, high)
+    outside = int(np.sum(~shown))
+    label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
+    # Many landmarks are close together: with small dots their ellipses remain visible, and where
+    # there are hundreds the dots alone show walls.
+    size = 4.0 if len(some) <= 100 else 2.0
+    axes.plot(
+        some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
+        mew=0.8 if marker == "x" else 0.0, label=label, zorder=5,
+    )  # fmt: skip
+    known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
+    if known.any() and ellipses:
+        outlines = ellipse_outlines(some.xy[known], some.covariance[known])
+        # The fillings of hundreds of overlapping ellipses would hide everything else.
+        filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
+        patches = PolyCollection(
+            list(outlines),
+            facecolors=[(*_rgb(colour), filling)],
+            edgecolors=[(*_rgb(colour), edge)],
+            linewidths=width,
+            zorder=2,
+        )
+        patches.set_label(f"3 {_SIGMA} of {name}")
+        axes.add_collection(patches, autolim=False)
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    return to_rgb(colour)
+
+
+class Crop(NamedTuple):
+    """A part of an image: its file, the pixel (u, v) in the middle, and what it is called."""
+
+    file: Path
+    pixel: tuple[float, float]
+    name: str
+
+
+def picture_of_frame(folder: Path, prefix: str) -> Path | None:
+    """The image of a frame in a folder or its subfolder ``images``; None where there is none."""
+    for place in (folder, folder / "images"):
+        for name in (prefix, *(f"{prefix}{suffix}" for suffix in sorted(PICTURES))):
+            if Path(name).suffix.lower() in PICTURES and (place / name).is_file():
+                return place / name
+    return None
+
+
+def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool = False) -> None:
+    """Draw parts of images side by side, a cross-hair with a gap in the middle of each.
+
+    Parameters
+    ----------
+    png : Path
+        The picture's file.
+    crops : sequence of Crop
+    title : str
+    overwrite : bool
+        Whether an existing file may be replaced.
+    """
+    rows = -(-len(crops) // _CROPS_ABREAST)
+    size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
+    with picture(png, size, overwrite=overwrite, interactive=False) as figure:
+        figure.suptitle(title)
+        axes = figure.subplots(rows, _CROPS_ABREAST, squeeze=False)
+        for some in axes.flat:
+            some.set_axis_off()
+        for some, crop in zip(axes.flat, crops):
+            u, v = crop.pixel
+            some.imshow(imread(crop.file), cmap="gray", aspect="auto")
+            some.plot([u - 14, u + 14], [v, v], "+", color=_DISC, markersize=5)
+            some.set_xlim(u - _CROP_PX, u + _CROP_PX)
+            some.set_ylim(v + _CROP_PX / 2, v - _CROP_PX / 2)
+            some.set_title(crop.name, fontsize=8)

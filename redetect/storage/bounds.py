@@ -1,0 +1,116 @@
+"""Bounds of settings; other values are refused with the name, the value and what was expected.
+
+    demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
+
+A dataclass of many may annotate its fields instead, and call `demand_fields`.
+
+NaN is always refused; infinity is refused unless it means "no limit".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from numbers import Integral
+from typing import Annotated, Any, get_type_hints
+
+from redetect.storage.messages import excerpt
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The numbers that a setting may have: an interval, in words and by its ends.
+
+    `above` and `below` exclude the ends; `whole` demands whole numbers.
+    """
+
+    expected: str
+    least: float = -math.inf
+    most: float = math.inf
+    above: bool = False
+    below: bool = False
+    whole: bool = False
+
+    def hold(self, value: Any) -> bool:
+        """Whether a value is such a number."""
+        if isinstance(value, bool) or (self.whole and not isinstance(value, Integral)):
+            return False
+        try:
+            high_enough = value > self.least if self.above else value >= self.least
+            low_enough = value < self.most if self.below else value <= self.most
+        except TypeError:
+            return False
+        return bool(high_enough and low_enough)
+
+
+def from_to(least: float, most: float) -> Bounds:
+    """Numbers of a closed interval."""
+    return Bounds(f"{least:g} to {most:g}", least, most)
+
+
+def inside(least: float, most: float) -> Bounds:
+    """Numbers of an open interval."""
+    return Bounds(f"above {least:g}, below {most:g}", least, most, above=True, below=True)
+
+
+def whole(least: int, most: int | None = None) -> Bounds:
+    """Whole numbers, both ends included."""
+    words = f"{least} or more" if most is None else f"{least} to {most}"
+    return Bounds(f"a whole number, {words}", least, math.inf if most is None else most, whole=True)
+
+
+FINITE = Bounds("a finite number", above=True, below=True)
+ABOVE_0 = Bounds("above 0", 0.0, above=True, below=True)
+NOT_NEGATIVE = Bounds("0 or more", 0.0, below=True)
+#: Infinity means "no limit".
+LIMIT = Bounds("above 0", 0.0, above=True)
+LIMIT_OR_0 = Bounds("0 or more", 0.0)
+SHARE = from_to(0.0, 1.0)
+SHARE_ABOVE_0 = Bounds("above 0, at most 1", 0.0, 1.0, above=True)
+PROBABILITY = inside(0.0, 1.0)
+
+#: Types of fields for `demand_fields`.
+Positive = Annotated[float, ABOVE_0]
+NotNegative = Annotated[float, NOT_NEGATIVE]
+Limit = Annotated[float, LIMIT]
+LimitOr0 = Annotated[float, LIMIT_OR_0]
+ShareAbove0 = Annotated[float, SHARE_ABOVE_0]
+Share = Annotated[float, SHARE]
+
+
+def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
+    """Refuse settings with a number out of its bounds.
+
+    Parameters
+    ----------
+    settings : object
+        Has the numbers as attributes; each number of a tuple is checked.
+    error : type of exception
+        What is raised: names the setting, its value and what was expected.
+    bounds : Bounds
+        By the attributes' names.
+    """
+    for name, allowed in bounds.items():
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if not allowed.hold(number):
+                shown = f"{number:g}" if isinstance(number, float) else excerpt(number)
+                raise error(f"{name} is {shown}: expected {allowed.expected}")
+
+
+def demand_fields(settings: object, error: type[Exception]) -> None:
+    """Refuse settings, a dataclass, with a number out of the bounds that annotate its field."""
+    kind: Any = type(settings)
+    demand(settings, error, **_annotated(kind))
+
+
+@cache
+def _annotated(kind: type) -> dict[str, Bounds]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        name: bounds
+        for name, hint in hints.items()
+        for bounds in getattr(hint, "__metadata__", ())
+        if isinstance(bounds, Bounds)
+    }
