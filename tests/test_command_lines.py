@@ -8,12 +8,12 @@ from importlib import import_module
 
 import pytest
 
-PROGRAMS = ("camera", "detect", "groundtruth", "slam")
+from redetect.programs import PROGRAMS
 
 
 def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as end:
-        import_module(f"{program}.cli").main([*words, "--help"])
+        import_module(PROGRAMS[program]).main([*words, "--help"])
     assert end.value.code == 0
     return capsys.readouterr().out
 
@@ -50,7 +50,7 @@ def test_every_help_shows_an_example_that_parses(
         assert [program, command] in [words[:2] for words in examples], command
         for words in examples:
             # It may be another program's.
-            parsed = import_module(f"{words[0]}.cli").parsed
+            parsed = import_module(PROGRAMS[words[0]]).parsed
             assert type(parsed(words[1:])).__name__.lower() == words[1]
 
 
@@ -59,7 +59,7 @@ def test_the_programs_own_help_shows_an_example_that_parses(
     program: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (words,) = examples_in(help_of(program, [], capsys))
-    assert type(import_module(f"{program}.cli").parsed(words[1:])).__name__.lower() == words[1]
+    assert type(import_module(PROGRAMS[program]).parsed(words[1:])).__name__.lower() == words[1]
 
 
 def test_an_example_with_a_flag_that_is_none_is_noticed(
@@ -76,6 +76,6 @@ def test_an_example_with_a_flag_that_is_none_is_noticed(
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_program_says_its_version(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
-        import_module(f"{program}.cli").main(["--version"])
+        import_module(PROGRAMS[program]).main(["--version"])
     assert end.value.code == 0
     assert re.fullmatch(rf"{program} \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from redetect.programs import PROGRAMS
+
 DEMO = Path(__file__).parent.parent / "images/e"
 
 
@@ -80,7 +82,7 @@ def test_it_is_told_what_to_do(
     line: str, told: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program, *words = line.split()
-    assert import_module(f"{program}.cli").main(words) == 1
+    assert import_module(PROGRAMS[program]).main(words) == 1
     (said,) = [row for row in capsys.readouterr().err.splitlines() if row.startswith("error: ")]
     for words_of_help in told:
         assert words_of_help in said

@@ -1,6 +1,6 @@
 """Landmark records, their files, and the association of records.
 
->>> from landmarks import read_frames
+>>> from redetect.landmarks import read_frames
 >>> for frame in read_frames("images/e/map.circles"):          # doctest: +SKIP
 ...     print(frame.step.prefix, [circle.ids for circle in frame.circles])
 """

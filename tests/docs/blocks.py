@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-PROGRAMS = ("camera", "detect", "groundtruth", "slam")
+from redetect.programs import PROGRAMS
+
 RUNS = "<!-- runs -->"
 #: What stands for something else, and is no word of a command line: `RUN…`, `...`.
 _OPEN = re.compile(r"…|\.\.\.")

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import tyro
 
+from redetect.programs import PROGRAMS
 from tests.docs.blocks import blocks_of, commands_in, documents
 
 
@@ -60,7 +61,7 @@ def start(words: list[str]) -> None:
             warnings.simplefilter("ignore", RuntimeWarning)
             run_module(words[0], run_name="__main__", alter_sys=True)
     else:
-        import_module(f"{words[0]}.cli").main(words[1:])
+        import_module(PROGRAMS[words[0]]).main(words[1:])
 
 
 def test_every_command_line_is_accepted(

@@ -189,7 +189,7 @@ def test_files_larger_than_the_bounds_are_not_read(
         ("report.inputs", "_MOST_PICTURE_BYTES"),
         ("json_file", "_LARGEST_FILE_BYTES"),
     ):
-        monkeypatch.setattr(f"groundtruth.{module}.{name}", 64)
+        monkeypatch.setattr(f"redetect.groundtruth.{module}.{name}", 64)
     inputs = gather(session)
     for place in ("validation/errors.png", "laser.jsonl", "laser.json"):
         assert f"{place}: cannot be read: larger than 64 bytes" in inputs.problems
