@@ -247,8 +247,7 @@ def _without_fit(
         qualities[pixels[:, 1], pixels[:, 0]] = quality
         keep = local_maxima(qualities, settings.threshold)[pixels[:, 1], pixels[:, 0]]
         pixels, quality = pixels[keep], quality[keep]
-    seen_xy = table.floor_xy[pixels[:, 1], pixels[:, 0]]
-    keep = alone_published(seen_xy, quality, settings.separation_m)
+    keep = alone_published(pixels, quality, table.floor_xy, settings.separation_m)
     pixels, quality = pixels[keep], quality[keep]
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))

@@ -31,7 +31,7 @@ from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 13
+TABLE_VERSION = 14
 
 Table = TypeVar("Table", DiscTable, VerticalTable)
 
@@ -122,15 +122,13 @@ def _read(path: Path, kind: type[Table], fits: Callable[[Table], bool]) -> Table
 
 def disc_table_fits(table: DiscTable, camera: Camera, shape: DiscShape) -> bool:
     """Whether a table's arrays are such that no loop leaves the image, or the arrays themselves."""
-    height, width, centres = camera.height, camera.width, len(table.row)
+    height, width, centres = camera.height, camera.width, len(table.pixels)
     return (
         _is_array(table.samples, np.uint32, (centres, shape.samples, 2))
-        and _is_array(table.row, np.int32, (centres,))
-        and _is_array(table.column, np.int32, (centres,))
+        and _is_array(table.pixels, np.int32, (centres, 2))
         and _is_array(table.floor_xy, np.float32, (height, width, 2))
         and bool(np.all(table.samples <= height * width))
-        and bool(np.all((table.row >= 0) & (table.row < height)))
-        and bool(np.all((table.column >= 0) & (table.column < width)))
+        and bool(np.all((table.pixels >= 0) & (table.pixels < [width, height])))
     )
 
 

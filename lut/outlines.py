@@ -118,27 +118,26 @@ class DiscTable:
     samples : (N, K, 2) uint32
         Index in scan order of the pixel of the inner and of the outer sample in each direction,
         every second direction first; H * W outside the image, or where it does not count.
-    row, column : (N,) int32
-        Pixel of each centre, in scan order.
+    pixels : (N, 2) int32
+        Pixel (u, v) of each centre, in scan order.
     floor_xy : (H, W, 2) float32
         Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
     """
 
     samples: NDArray[np.uint32]
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
+    pixels: NDArray[np.int32]
     floor_xy: NDArray[np.float32]
 
     @cached_property
     def groups(self) -> CentreGroups:
         """Neighbouring centres, by samples that they share."""
-        return _groups(self.samples, self.row, self.column, self.floor_xy[..., 0].size)
+        return _groups(self.samples, self.pixels, self.floor_xy[..., 0].size)
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(H, W) the centres that are tested."""
         usable = np.zeros(self.floor_xy.shape[:2], np.bool_)
-        usable[self.row, self.column] = True
+        usable[self.pixels[:, 1], self.pixels[:, 0]] = True
         return usable
 
 
@@ -184,29 +183,25 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     candidate = _within_limits(down, shape)
     step = _columns_apart(floor_xy, down, shape)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
-    nothing = np.zeros((0, shape.samples, 2), np.uint32)
-    samples, rows, columns = [nothing], [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
+    samples, pixels = [np.zeros((0, shape.samples, 2), np.uint32)], [np.zeros((0, 2), np.int32)]
     for row in _rows_tested(floor_xy, candidate, shape.rows_m):
         across = np.flatnonzero(candidate[row])
-        pixels = _sample_pixels(camera, floor_xy[row, across], down[row, across], shape)
-        inside = np.count_nonzero(pixels < camera.height * camera.width, axis=1).min(axis=1)
+        seen = _sample_pixels(camera, floor_xy[row, across], down[row, across], shape)
+        inside = np.count_nonzero(seen < camera.height * camera.width, axis=1).min(axis=1)
         usable = np.flatnonzero(inside >= enough)
         kept = usable[_strided(across[usable], step[row, across[usable]])]
-        samples.append(pixels[kept])
-        columns.append(across[kept].astype(np.int32))
-        rows.append(np.full(len(kept), row, np.int32))
+        samples.append(seen[kept])
+        pixels.append(np.stack([across[kept], np.full(len(kept), row)], axis=1).astype(np.int32))
     return DiscTable(
         samples=np.concatenate(samples),
-        row=np.concatenate(rows),
-        column=np.concatenate(columns),
+        pixels=np.concatenate(pixels),
         floor_xy=floor_xy.astype(np.float32),
     )
 
 
-def _groups(
-    samples: NDArray[np.uint32], row: NDArray[np.int32], column: NDArray[np.int32], outside: int
-) -> CentreGroups:
+def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int) -> CentreGroups:
     n = len(samples)
+    column, row = pixels.T
     if samples.shape[1] < GROUP_SAMPLES or n == 0:
         single = np.arange(n, dtype=np.int32), np.ones(n, np.int32)
         return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32))
@@ -312,12 +307,17 @@ def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> 
 
 
 def _strided(columns: NDArray[np.int64], step: NDArray[np.int64]) -> list[int]:
-    """Which of some columns keep the distance that the one before them asks for."""
-    kept, following = [], 0
+    """Which of some columns keep the distance that the one before them asks for.
+
+    Where pixels grow fast along a row, in a very wide lens, twice the distance that they themselves
+    ask for is enough.
+    """
+    kept: list[int] = []
+    last, following = 0, 0
     for k, (column, apart) in enumerate(zip(columns.tolist(), step.tolist())):
-        if column >= following:
+        if column >= following or column - last > 2 * apart:
             kept.append(k)
-            following = column + apart
+            last, following = column, column + apart
     return kept
 
 

@@ -183,27 +183,32 @@ def middles(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def alone_published(
-    floor_xy: NDArray[np.float32], quality: NDArray[np.float64], separation: float
-) -> NDArray[np.bool_]:
+    pixels: NDArray[np.int64], quality: FloatArray, floor_xy: NDArray[np.float32],
+    separation: float,
+) -> NDArray[np.bool_]:  # fmt: skip
     """Which centres have none of a higher quality nearby.
 
     Of centres of the same quality, the first stays that has none nearby that stays.
 
     Parameters
     ----------
-    floor_xy : (N, 2) float32
-        In scan order, metres.
+    pixels : (N, 2) int64
+        (u, v), in scan order.
     quality : (N,) float64
+    floor_xy : (H, W, 2) float32
+        Floor position of each pixel, metres.
     separation : float
         Nearer than this is nearby, metres.
     """
     kept = np.ones(len(quality), np.bool_)
+    x, y = np.empty(len(quality)), np.empty(len(quality))
+    for i in range(len(quality)):
+        x[i], y[i] = floor_xy[pixels[i, 1], pixels[i, 0]]
     for i in range(len(quality)):
         for j in range(len(quality)):
-            if quality[j] > quality[i] or (quality[j] == quality[i] and j < i and kept[j]):
-                dx = np.float64(floor_xy[j, 0]) - floor_xy[i, 0]
-                dy = np.float64(floor_xy[j, 1]) - floor_xy[i, 1]
-                if dx * dx + dy * dy < separation * separation:
-                    kept[i] = False
-                    break
+            near = (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 < separation * separation
+            before = quality[j] == quality[i] and j < i and kept[j]
+            if near and (before or quality[j] > quality[i]):
+                kept[i] = False
+                break
     return kept

@@ -71,15 +71,15 @@ def least_part_quality(quality: float, samples: int) -> float:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _columns_left(
-    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], g: int, least_quality: np.float32
+    grey: NDArray[np.uint8], samples: NDArray[np.uint32], g: int, least_quality: np.float32
 ) -> np.int32:
     """Which columns of a group the samples that they share do not rule out, a bit each."""
     left = _I32(0)
     for column in range(_COLUMNS):
         a = b = squares = _I32(0)
         for k in range(_SAMPLES):
-            x = _I32(pixels[samples[g, k, 0] + column])
-            y = _I32(pixels[samples[g, k, 1] + column])
+            x = _I32(grey[samples[g, k, 0] + column])
+            y = _I32(grey[samples[g, k, 1] + column])
             a, b = _I32(a + x), _I32(b + y)
             squares = _I32(squares + _I32(_I32(x * x) + _I32(y * y)))
         difference, total = _I32(a - b), _I32(a + b)
@@ -91,7 +91,7 @@ def _columns_left(
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _quality_of(
-    pixels: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, outside: int
+    grey: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, outside: int
 ) -> tuple[float, float]:
     """Quality and contrast of a centre."""
     # Whole numbers all, and exact: but sums of floats stay in order, one sample after the other,
@@ -100,8 +100,8 @@ def _quality_of(
     n_inner = n_outer = 0
     for k in range(_U64(samples.shape[1])):
         inner, outer = samples[i, k, 0], samples[i, k, 1]
-        x = float(pixels[inner]) if inner < outside else 0.0
-        y = float(pixels[outer]) if outer < outside else 0.0
+        x = float(grey[inner]) if inner < outside else 0.0
+        y = float(grey[outer]) if outer < outside else 0.0
         a += x
         b += y
         squares += x * x + y * y
@@ -115,44 +115,46 @@ def _quality_of(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def find_centres(
-    pixels: NDArray[np.uint8], outside: int, samples: NDArray[np.uint32], groups: CentreGroups,
-    limits: Limits,
+    grey: NDArray[np.uint8], outside: int, pixels: NDArray[np.int32],
+    samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:  # fmt: skip
-    """The centres within some limits: (M,) indices, qualities and contrasts.
+    """The centres within some limits: (M, 2) pixels, (M,) qualities and contrasts.
 
     Parameters
     ----------
-    pixels : (M,) uint8
+    grey : (M,) uint8
         The image in scan order, and anything after it up to `GROUP_COLUMNS` pixels.
     outside : int
         H W.
-    samples, groups
+    pixels, samples, groups
         Of `lut.DiscTable`.
     limits : Limits
     """
     least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
     any_left = np.empty(len(groups.samples), np.bool_)
     for g in range(_U64(len(any_left))):
-        any_left[g] = _columns_left(pixels, groups.samples, g, least_part) != 0
+        any_left[g] = _columns_left(grey, groups.samples, g, least_part) != 0
     most = np.count_nonzero(any_left) * GROUP_COLUMNS
-    index, quality, contrast = np.empty(most, np.int64), np.empty(most), np.empty(most, np.float32)
+    found_at = np.empty((most, 2), np.int64)
+    quality, contrast = np.empty(most), np.empty(most, np.float32)
     found = 0
     for g in range(_U64(len(any_left))):
         if not any_left[g]:
             continue
-        left = _columns_left(pixels, groups.samples, g, least_part) & groups.columns[g]
+        left = _columns_left(grey, groups.samples, g, least_part) & groups.columns[g]
         i = groups.first[g] - 1
         for k in range(GROUP_COLUMNS if left else 0):
             i += (groups.columns[g] >> k) & 1
             if not (left >> k) & 1:
                 continue
-            of_centre, step = _quality_of(pixels, samples, i, outside)
+            of_centre, step = _quality_of(grey, samples, i, outside)
             signed = limits.sign == 0 or limits.sign * step >= 0.0
             strong = limits.contrast == 0.0 or abs(step) > limits.contrast
             if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
-                index[found], quality[found], contrast[found] = i, of_centre, step
+                found_at[found, 0], found_at[found, 1] = pixels[i, 0], pixels[i, 1]
+                quality[found], contrast[found] = of_centre, step
                 found += 1
-    return index[:found], quality[:found], contrast[:found]
+    return found_at[:found], quality[:found], contrast[:found]
 
 
 def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Centres:
@@ -177,13 +179,12 @@ def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Ce
             f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
             f"{expected}"
         )
-    pixels = image.ravel()
+    grey = image.ravel()
     if image.size < GROUP_COLUMNS:
-        pixels = np.append(pixels, np.zeros(GROUP_COLUMNS, np.uint8))
-    index, quality, contrast = find_centres(pixels, image.size, table.samples, table.groups, limits)
-    places = np.empty((len(index), 2), np.int64)
-    places[:, 0], places[:, 1] = table.column[index], table.row[index]
-    return Centres(places, quality, contrast)
+        grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))
+    return Centres(
+        *find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
+    )
 
 
 def quality_of_centres(

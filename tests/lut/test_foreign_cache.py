@@ -138,11 +138,11 @@ DISC_DAMAGE: list[tuple[str, Callable[[Any], Any]]] = [
     ("samples", lambda table: table.samples.astype(np.int32)),
     ("samples", lambda table: table.samples[:-4].copy()),
     ("samples", lambda table: table.samples[:, :, :1].copy()),
-    ("row", lambda table: changed(table.row, 0, 36)),
-    ("row", lambda table: changed(table.row, 0, -1)),
-    ("row", lambda table: table.row[:-1].copy()),
-    ("column", lambda table: changed(table.column, 0, 96)),
-    ("column", lambda table: table.column.astype(np.int64)),
+    ("pixels", lambda table: changed(table.pixels, (0, 1), 36)),
+    ("pixels", lambda table: changed(table.pixels, (0, 1), -1)),
+    ("pixels", lambda table: table.pixels[:-1].copy()),
+    ("pixels", lambda table: changed(table.pixels, (0, 0), 96)),
+    ("pixels", lambda table: table.pixels.astype(np.int64)),
     ("floor_xy", lambda table: table.floor_xy[:-1].copy()),
 ]
 

@@ -75,8 +75,7 @@ def assert_table_is(table: DiscTable, plain: Outlines) -> None:
     height, width = plain.usable.shape
     assert np.array_equal(table.usable, plain.usable)
     v, u = np.nonzero(plain.usable)
-    assert np.array_equal(table.row, v)
-    assert np.array_equal(table.column, u)
+    assert np.array_equal(table.pixels, np.stack([u, v], axis=1))
     expected = np.where(plain.inside, plain.row * width + plain.column, height * width)[v, u]
     samples = expected.shape[1] // 2
     order = np.concatenate([np.arange(0, samples, 2), np.arange(1, samples, 2)])
@@ -91,11 +90,12 @@ def assert_groups(table: DiscTable) -> None:
     assert groups.samples.shape == (len(groups.first), GROUP_SAMPLES, 2)
     assert groups.samples.max(initial=0) <= max(outside - GROUP_COLUMNS, 0)
     members = [np.flatnonzero(bits >> np.arange(GROUP_COLUMNS) & 1) for bits in groups.columns]
-    assert sum(len(columns) for columns in members) == len(table.row)
+    assert sum(len(columns) for columns in members) == len(table.pixels)
     for first, columns, samples in zip(groups.first, members, groups.samples, strict=True):
         of_group = slice(first, first + len(columns))
-        assert np.array_equal(table.column[of_group], table.column[first] + columns)
-        assert np.all(table.row[of_group] == table.row[first])
+        u, v = table.pixels[of_group].T
+        assert np.array_equal(u, table.pixels[first, 0] + columns)
+        assert np.all(v == table.pixels[first, 1])
         if samples.any():
             for outline in range(2):
                 seen = samples[:, outline] + columns[:, None]
@@ -300,7 +300,7 @@ def test_a_camera_that_looks_up_gets_an_empty_table(published_camera: Camera) ->
     table = build_disc_table(up, DiscShape())
     assert not table.usable.any()
     assert table.samples.shape == (0, 16, 2)
-    assert len(table.row) == len(table.column) == 0
+    assert len(table.pixels) == 0
     assert np.isnan(table.floor_xy).all()
 
 

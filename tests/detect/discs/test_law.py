@@ -136,7 +136,7 @@ def test_tested_centres_and_their_pairs_are_those_of_the_law(published_camera: C
             else:
                 u += 1
         assert np.flatnonzero(table.usable[v]).tolist() == list(expected)
-        inside = table.samples[table.row == v] < camera.width * camera.height
+        inside = table.samples[table.pixels[:, 1] == v] < camera.width * camera.height
         np.testing.assert_array_equal(inside.sum(axis=1).T, [list(expected.values())] * 2)
 
 
@@ -186,7 +186,9 @@ def test_what_is_alone_is_so_by_definition(data: st.DataObject) -> None:
     quality = np.array(
         data.draw(st.lists(st.sampled_from([0.5, 0.7, 0.8]), min_size=count, max_size=count))
     ).reshape(-1)
-    kept = np.flatnonzero(alone_published(pixels.astype(np.float32), quality, 2.5)).tolist()
+    v, u = np.mgrid[0:10, 0:10].astype(np.float32)
+    floor_xy = np.stack([u, v], axis=-1)
+    kept = np.flatnonzero(alone_published(pixels, quality, floor_xy, 2.5)).tolist()
     expected: list[int] = []
     for k in range(count):
         near = [j for j in range(count) if j != k and np.hypot(*(pixels[j] - pixels[k])) < 2.5]
