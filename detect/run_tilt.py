@@ -5,8 +5,9 @@ leans. Those of a run determine how the camera leans relative to its calibration
 robot tilts about that. The outlines of discs (`detect.discs.outline_tilt`) show a frame's
 deviation, too; their constant is taken from the verticals, since their own depends on the camera's
 height. Each axis is an autoregression about a constant, measured with errors that last as long as
-their scene is in view (`smooth_axis`). The constant and the spread about it maximise
-the likelihood.
+their scene is in view (`smooth_axis`). The constants, the spread, and the factors by which errors
+are smaller or larger than a frame by itself can know maximise the likelihood: in one building all
+verticals are true, in another few.
 """
 
 from __future__ import annotations
@@ -26,15 +27,20 @@ FloatArray = NDArray[np.float64]
 
 #: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
-#: See `_joined`.
-_OUTLIER_SIGMAS, _STATED_FRAMES = 3.0, 4.0
 #: Prior of the spread of the true tilt about its constant, a robot on an even floor (rad), and the
 #: standard deviation of its logarithm.
 _SPREAD_RAD, _LOG_SPREAD_SIGMA = math.radians(0.3), 0.3
-_SEARCH = {"fatol": 1e-4, "xatol": 1e-3}
+#: Standard deviation of the logarithm of the factor by which stated deviations are off.
+_LOG_SCALE_SIGMA = 1.0
+#: The constants are searched in this unit (rad), to a hundredth.
+_UNIT_RAD = math.radians(0.1)
+_SEARCH = {"fatol": 1e-3, "xatol": 1e-2, "maxiter": 2000}
 #: Systematic error of any number of verticals: the lens's error common to all of them towards the
 #: image's border (rad). It is given, not estimated: a run shows its sum with the true lean.
 COMMON_RAD = math.radians(0.15)
+#: The same where the calibration is right in lens and height, and how far the constants of outlines
+#: and verticals are apart then, and otherwise (rad; `_common_variance`).
+_EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
 #: Correlation of true deviations from frame to frame: a robot swings on its springs.
 MEMORY = 0.65
 #: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
@@ -45,7 +51,7 @@ STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
 #: How often, and how far, the robot tilts for a moment (rad): a wheel is on a sill or a cable.
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
 #: Least standard deviation of a frame's tilt (rad).
-_LEAST_RAD = math.radians(0.03)
+_LEAST_RAD = math.radians(0.01)
 
 
 class FrameTilts(NamedTuple):
@@ -131,64 +137,144 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
     """
     if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None
-    measured, variance = verticals if outlines is None else _joined(verticals, outlines)
+    if outlines is None or not _are_enough(outlines, verticals):
+        nothing = np.full_like(verticals.tilt, np.nan)
+        outlines = FrameTilts(nothing, nothing)
+    series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
+    found = [_learned(axis) for axis in series]
+    common = _common_variance([one.apart for one in found])
     axes, tilts, variances = [], [], []
-    for values, of_values in zip(measured.T, variance.T):
-        sigma = np.sqrt(of_values)
-        axis = _learned(values, sigma)
-        _, deviation, of_deviation = smooth_axis(values - axis.lean, sigma, axis.spread)
-        axes.append(axis)
-        tilts.append(axis.lean + deviation)
-        variances.append(of_deviation + axis.lean_sigma**2)
+    for axis, one in zip(series, found):
+        tilt, of_deviation = axis.tilt(one)
+        # How far a frame's tilt follows the constant: where it is well measured, not at all.
+        shifted = axis.tilt(one._replace(lean=one.lean + _UNIT_RAD))[0]
+        share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
+        axes.append(AxisModel(one.lean, math.sqrt(one.lean_variance + common), one.spread))
+        tilts.append(tilt)
+        variances.append(of_deviation + share**2 * one.lean_variance + common)
     return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1))
 
 
-def _joined(verticals: FrameTilts, outlines: FrameTilts) -> FrameTilts:
-    """Means of both, weighed by their variances; outlines are moved onto the verticals' lean.
+def _are_enough(outlines: FrameTilts, verticals: FrameTilts) -> bool:
+    both = np.isfinite(outlines.tilt[:, 0]) & np.isfinite(verticals.tilt[:, 0])
+    return bool(np.count_nonzero(both) >= LEAST_FRAMES)
 
-    Two independent measurements show how well their variances hold in this run:
-    both are scaled by the mean squared difference in units of the stated variances. Frames beyond
-    `_OUTLIER_SIGMAS` are outliers; the stated variances count as much as `_STATED_FRAMES` frames.
-    """
-    both = np.isfinite(verticals.tilt[:, 0]) & np.isfinite(outlines.tilt[:, 0])
-    if np.count_nonzero(both) < LEAST_FRAMES:
-        return verticals
-    between = outlines.tilt - verticals.tilt
-    apart = np.median(between[both], axis=0)
-    squared = (between[both] - apart) ** 2 / (verticals.variance + outlines.variance)[both]
-    found = np.minimum(squared, _OUTLIER_SIGMAS**2).mean(axis=1).sum()
-    scale = (found + _STATED_FRAMES) / (np.count_nonzero(both) + _STATED_FRAMES)
-    values = np.stack([verticals.tilt, outlines.tilt - apart])
-    information = np.where(
-        np.isfinite(values), 1.0 / np.stack([verticals.variance, outlines.variance]), 0.0
+
+class _Axis(NamedTuple):
+    """What is learned of an axis: constants (rad), spread (rad), factors of stated deviations."""
+
+    lean: float
+    spread: float
+    verticals_scale: float
+    outlines_scale: float
+    apart: float = math.nan
+    """By how much the outlines' constant differs from the verticals'."""
+    lean_variance: float = math.nan
+
+
+class _Series(NamedTuple):
+    """What the frames show of an axis (rad, rad^2); NaN where nothing."""
+
+    verticals: FloatArray
+    verticals_variance: FloatArray
+    outlines: FloatArray
+    outlines_variance: FloatArray
+
+    def smoothed(self, axis: _Axis) -> tuple[float, FloatArray, FloatArray]:
+        """The log-likelihood of what is learned; deviations from the constant, their variances.
+
+        Verticals and outlines have as much information as their weighted means, which are smoothed,
+        and their differences.
+        """
+        variance = np.stack(
+            [
+                axis.verticals_scale**2 * self.verticals_variance,
+                axis.outlines_scale**2 * self.outlines_variance,
+            ]
+        )
+        values = np.stack([self.verticals, self.outlines - axis.apart])
+        information = np.where(np.isfinite(values), 1.0 / variance, 0.0)
+        total = information.sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean = (information * np.nan_to_num(values)).sum(axis=0) / total
+            likelihood, deviation, of_deviation = smooth_axis(
+                mean - axis.lean, 1.0 / np.sqrt(total), axis.spread
+            )
+        difference, of_difference = values[1] - values[0], variance.sum(axis=0)
+        both = np.isfinite(difference)
+        return (
+            likelihood + _log_density(difference[both], of_difference[both]),
+            deviation,
+            of_deviation,
+        )
+
+    def tilt(self, axis: _Axis) -> tuple[FloatArray, FloatArray]:
+        """The tilt of each frame, and its variance if the constant is right."""
+        _, deviation, variance = self.smoothed(axis)
+        return axis.lean + deviation, variance
+
+
+def _log_density(difference: FloatArray, variance: FloatArray) -> float:
+    """Of differences of two measurements, either of which may be an outlier."""
+    log_good, log_bad = (
+        math.log(share) - 0.5 * (np.log(spread) + difference**2 / spread)
+        for share, spread in (
+            (1.0 - 2.0 * STRAY_SHARE, variance),
+            (2.0 * STRAY_SHARE, variance + STRAY_RAD**2),
+        )
     )
-    total = information.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = (information * np.nan_to_num(values)).sum(axis=0) / total
-        return FrameTilts(mean, scale / total)
+    return float(np.logaddexp(log_good, log_bad).sum())
 
 
-def _learned(values: FloatArray, sigma: FloatArray) -> AxisModel:
-    """The constants of the largest likelihood, and how well the lean among them is known."""
+def _learned(series: _Series) -> _Axis:
+    """The constants, spread and factors of the largest likelihood.
+
+    The factors are known by how verticals and outlines differ; without these they are 1.
+    """
     from scipy.optimize import minimize  # takes as long as a hundred frames
 
-    unit = math.radians(0.1)
+    has_outlines = bool(np.isfinite(series.outlines).any())
+    lean = float(np.nanmedian(series.verticals))
+    apart = float(np.nanmedian(series.outlines - series.verticals)) if has_outlines else math.nan
+
+    def axis_of(unknowns: FloatArray) -> _Axis:
+        to_lean, spread, *others = unknowns.tolist()
+        verticals, outlines, to_apart = others or (0.0, 0.0, 0.0)
+        scales = _SPREAD_RAD * math.exp(spread), math.exp(verticals), math.exp(outlines)
+        return _Axis(lean + _UNIT_RAD * to_lean, *scales, apart + _UNIT_RAD * to_apart)
 
     def cost(unknowns: FloatArray) -> float:
-        lean, log_spread = unknowns.tolist()
-        spread = _SPREAD_RAD * math.exp(log_spread)
-        log_likelihood, _, _ = smooth_axis(values - unit * lean, sigma, spread)
-        return float(0.5 * (log_spread / _LOG_SPREAD_SIGMA) ** 2 - log_likelihood)
+        prior = (unknowns[1] / _LOG_SPREAD_SIGMA) ** 2
+        prior += float(np.sum((unknowns[2:4] / _LOG_SCALE_SIGMA) ** 2))
+        return float(0.5 * prior - series.smoothed(axis_of(unknowns))[0])
 
-    start = np.array([float(np.nanmedian(values)) / unit, 0.0])
-    found = minimize(cost, start, method="Nelder-Mead", options=_SEARCH)
-    step = np.array([0.2, 0.0])
-    curvature = (cost(found.x + step) - 2.0 * found.fun + cost(found.x - step)) / (0.2 * unit) ** 2
-    own = 1.0 / max(curvature, 1e-6)
-    lean, log_spread = found.x.tolist()
-    return AxisModel(
-        unit * lean, math.sqrt(own + COMMON_RAD**2), _SPREAD_RAD * math.exp(log_spread)
+    start = np.zeros(5 if has_outlines else 2)
+    simplex = np.vstack([start, start + np.diag([1.0, 0.3, -0.5, -0.5, 0.5][: len(start)])])
+    search = {**_SEARCH, "initial_simplex": simplex}
+    found = minimize(cost, start, method="Nelder-Mead", options=search)
+    step = np.zeros(len(start))
+    step[0] = 0.2
+    curvature = (cost(found.x + step) - 2.0 * found.fun + cost(found.x - step)) / 0.2**2
+    variance = _UNIT_RAD**2 / max(curvature, 1e-4)
+    return axis_of(found.x)._replace(lean_variance=variance)
+
+
+def _common_variance(apart: Sequence[float]) -> float:
+    """Variance of the error that all frames have in common, the calibration's (rad^2).
+
+    A wrong lens or height moves the constant that outlines show away from that of the verticals.
+    Where they agree, the calibration is most likely right; they do so by chance as well.
+    """
+    if not np.isfinite(apart).all():
+        return COMMON_RAD**2
+    log_odds = sum(
+        math.log(_APART_RAD / _EXACT_APART_RAD)
+        - 0.5 * (x / _EXACT_APART_RAD) ** 2
+        + 0.5 * (x / _APART_RAD) ** 2
+        for x in apart
     )
+    exact = 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
+    return exact * _EXACT_RAD**2 + (1.0 - exact) * COMMON_RAD**2
 
 
 @njit(cache=True, error_model="numpy")

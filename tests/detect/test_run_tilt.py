@@ -137,3 +137,37 @@ def test_few_outlines_are_left_out() -> None:
     assert run is not None
     assert alone is not None
     np.testing.assert_array_equal(run.tilt, alone.tilt)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("factor", [0.3, 1.0])
+def test_how_good_verticals_are_is_learned_by_outlines(seed: int, factor: float) -> None:
+    """A frame by itself cannot know how true a building's verticals are: errors are `factor`."""
+    true, measured, variance = sequence(seed, spread=0.4, strays=0.0, jumps=0.0)
+    measured = true + factor * (measured - true)
+    sigma = np.radians(0.3)
+    outlines = true + sigma * np.random.default_rng(seed).standard_normal(true.shape)
+    stated = FrameTilts(outlines, np.full(true.shape, (2.0 * sigma) ** 2))
+
+    run = tilt_of_run(FrameTilts(measured, variance), stated)
+
+    assert run is not None
+    # Outlines and verticals agree, and no lens is wrong here.
+    assert all(axis.lean_sigma < 0.5 * COMMON_RAD for axis in run.axes)
+    normalised = np.mean((run.tilt - true) ** 2 / run.variance, axis=0)
+    assert np.all((normalised > 0.4) & (normalised < 1.7)), normalised
+
+
+def test_outlines_that_disagree_leave_the_lens_in_doubt() -> None:
+    true, measured, variance = sequence(3)
+    sigma = np.radians(0.2)
+    outlines = true + sigma * np.random.default_rng(1).standard_normal(true.shape)
+    outlines[:, 0] += np.radians(1.0)
+
+    run = tilt_of_run(
+        FrameTilts(measured, variance), FrameTilts(outlines, np.full(true.shape, sigma**2))
+    )
+
+    assert run is not None
+    assert all(axis.lean_sigma > 0.9 * COMMON_RAD for axis in run.axes)
+    assert run.variance.min() > (0.9 * COMMON_RAD) ** 2

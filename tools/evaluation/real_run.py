@@ -76,7 +76,7 @@ def measure_run(run: Path, folder: Path) -> list[RunFigures]:
         factors = []
         for calibrate in ((), ("--calibrate",)):
             mapped = folder / f"{number}{'-calibrated' * len(calibrate)}-map"
-            _run("slam", "map", rows, "--camera", camera, "--output", mapped, *calibrate)
+            _run("redetect.slam", "map", rows, "--camera", camera, "--output", mapped, *calibrate)
             factors.append(json.loads((mapped / "table.json").read_text())["table"]["factor"])
         left = (result["lean"] or {}).get("left", {})
         figures.append(
