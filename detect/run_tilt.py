@@ -3,8 +3,9 @@
 The verticals of one frame often have a common error: trunks, folds of a curtain, a board that
 leans. Those of a run determine how the camera leans relative to its calibration, and how far the
 robot tilts about that. The outlines of discs (`detect.discs.outline_tilt`) show a frame's
-deviation, too; their constant is taken from the verticals, since their own depends on the camera's
-height. Each axis is an autoregression about a constant, measured with errors that last as long as
+deviation, too. The two constants differ where the calibration is not exact: that of the verticals
+is as wrong as the lens, that of the outlines as the height and the discs' radius. The truth is taken
+to be anywhere between them, and the mean is used. Each axis is an autoregression about a constant, measured with errors that last as long as
 their scene is in view (`smooth_axis`). The constants, the spread, and the factors by which errors
 are smaller or larger than a frame by itself can know maximise the likelihood: in one building all
 verticals are true, in another few.
@@ -39,7 +40,7 @@ _SEARCH = {"fatol": 1e-3, "xatol": 1e-2, "maxiter": 2000}
 #: image's border (rad). It is given, not estimated: a run shows its sum with the true lean.
 COMMON_RAD = math.radians(0.15)
 #: The same where the calibration is right in lens and height, and how far the constants of outlines
-#: and verticals are apart then, and otherwise (rad; `_common_variance`).
+#: and verticals are apart then, and otherwise (rad; `_share_exact`).
 _EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
 #: Correlation of true deviations from frame to frame: a robot swings on its springs.
 MEMORY = 0.65
@@ -142,15 +143,19 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
     found = [_learned(axis) for axis in series]
-    common = _common_variance([one.apart for one in found])
+    exact = _share_exact([one.apart for one in found])
     axes, tilts, variances = [], [], []
     for axis, one in zip(series, found):
         tilt, of_deviation = axis.tilt(one)
         # How far a frame's tilt follows the constant: where it is well measured, not at all.
         shifted = axis.tilt(one._replace(lean=one.lean + _UNIT_RAD))[0]
         share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
-        axes.append(AxisModel(one.lean, math.sqrt(one.lean_variance + common), one.spread))
-        tilts.append(tilt)
+        apart = 0.0 if math.isnan(one.apart) else one.apart
+        common = COMMON_RAD**2 + apart**2 / 12.0  # the latter: uniform between the constants
+        common = exact * _EXACT_RAD**2 + (1.0 - exact) * common
+        lean = one.lean + 0.5 * apart
+        axes.append(AxisModel(lean, math.sqrt(one.lean_variance + common), one.spread))
+        tilts.append(tilt + 0.5 * apart)
         variances.append(of_deviation + share**2 * one.lean_variance + common)
     return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1))
 
@@ -259,22 +264,21 @@ def _learned(series: _Series) -> _Axis:
     return axis_of(found.x)._replace(lean_variance=variance)
 
 
-def _common_variance(apart: Sequence[float]) -> float:
-    """Variance of the error that all frames have in common, the calibration's (rad^2).
+def _share_exact(apart: Sequence[float]) -> float:
+    """How probable it is that the calibration is exact, by how far the constants are apart.
 
     A wrong lens or height moves the constant that outlines show away from that of the verticals.
     Where they agree, the calibration is most likely right; they do so by chance as well.
     """
     if not np.isfinite(apart).all():
-        return COMMON_RAD**2
+        return 0.0
     log_odds = sum(
         math.log(_APART_RAD / _EXACT_APART_RAD)
         - 0.5 * (x / _EXACT_APART_RAD) ** 2
         + 0.5 * (x / _APART_RAD) ** 2
         for x in apart
     )
-    exact = 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
-    return exact * _EXACT_RAD**2 + (1.0 - exact) * COMMON_RAD**2
+    return 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
 
 
 @njit(cache=True, error_model="numpy")
