@@ -16,17 +16,16 @@ from collections.abc import Sequence
 
 from tyro import MISSING
 
-from detect.announcing import show_announcements
-from detect.exports.options import Export
 from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
-from detect.options import All, Circles, Compare, Lines, Markers
+from detect.options import All, Circles, Lines, Markers
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
-from detect.viewing_options import Draw, Report, Tune, View
+from detect.terminal import show_announcements
+from detect.viewing_options import Compare, Draw, Export, Report, Tune, View
 from redetect.storage.command_line import Program
 from redetect.storage.exit_codes import EXIT_INTERRUPTED, exit_code_of
 
@@ -37,12 +36,12 @@ PROGRAM = Program(
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
         **dict.fromkeys((Circles, Lines, Markers, All), "detect.runs.command"),
-        Compare: "detect.comparison.command",
-        Export: "detect.exports.command",
+        Compare: "detect.comparison.report",
+        Export: "detect.export",
         Draw: "detect.drawing.command",
         View: "detect.view_command",
-        Report: "detect.report.command",
-        Tune: "detect.tune.command",
+        Report: "detect.report.page",
+        Tune: "detect.tune",
     },
 )
 

@@ -21,3 +21,7 @@ class FrameError(OneLineError, ValueError):
 
 class WorkerError(OneLineError, RuntimeError):
     """Worker processes or machines cannot do the work; the message says what is missing."""
+
+
+class CompareError(ValueError):
+    """Two runs that cannot be compared; the message says which file or frame and why."""

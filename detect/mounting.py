@@ -25,9 +25,9 @@ from detect.line_settings import LineSettings
 from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.runs.progress import progress_bar
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated
+from detect.terminal import progress_bar
 from redetect.storage import OutputExistsError
 
 FloatArray = NDArray[np.float64]

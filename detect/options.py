@@ -1,4 +1,4 @@
-"""The flags of the detectors and of ``detect compare``: one frozen dataclass per command.
+"""The flags of the detectors, a frozen dataclass per command, and those that others share.
 
 Nothing heavy is imported: `--help` needs it all.
 """
@@ -7,27 +7,124 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal, Optional
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from detect.comparison.result import CompareOptions
 from detect.errors import DetectError
-from detect.flags import (
-    DiscPreset,
-    LineEnds,
-    MaybeFloat,
-    MaybeInt,
-    MaybePath,
-    MaybeStr,
-    Preset,
-    RunFlags,
-)
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.settings import CircleSettings, Levelling
-from detect.sources.options import SourceOptions
-from redetect.storage.bounds import NOT_NEGATIVE, demand
+from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
+
+# For `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeInt = Optional[int]  # noqa: UP045
+MaybeFloat = Optional[float]  # noqa: UP045
+MaybeStr = Optional[str]  # noqa: UP045
+
+Preset = Literal["default", "published"]
+DiscPreset = Literal["default", "published", "report"]
+LineEnds = Literal["lf", "crlf"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """Options of all commands that process the frames of a run.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
+    output : Path
+        The file to write.
+    camera : Path
+        Calibration, if it is not the one in the run folder.
+    force : bool
+        Replace existing files.
+    """
+
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    camera: MaybePath = None
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class PickedFrames:
+    """Selects the frames of a run.
+
+    Parameters
+    ----------
+    every : int
+        Only every n-th frame.
+    frames : tuple of str
+        Only these frames: names of images, positions in the run, and ranges FROM:TO or
+        FROM:TO:STEP of positions without the last.
+    """
+
+    every: int = 1
+    frames: tuple[str, ...] = ()
+
+
+#: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
+Axes = Literal["robotics", "dataset"]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Options of a source besides its name.
+
+    Parameters
+    ----------
+    odometry : str
+        Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
+        z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
+        nav_msgs/Odometry topic of the bag (/odom), or none.
+    odometry_axes : str
+        Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
+        backward).
+    wheel_base_m : float
+        Distance of the two wheels whose ticks are counted.
+    metres_per_tick : float
+        Way of a wheel from one tick to the next.
+    times : str
+        File of the images' times, rows `prefix seconds`; by default <folder>.times among the
+        images.
+    image_topic : str
+        The images of a bag, if there are several topics of them.
+    base_frame : str
+        The frame of the robot's base, on the floor, in a bag that holds the calibration itself
+        (camera_info and tf_static); by default base_footprint.
+    frames : int
+        Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
+    bits : int
+        Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
+        the values of the first images.
+    """
+
+    odometry: str = ""
+    odometry_axes: Axes = "robotics"
+    wheel_base_m: float = 0.0
+    metres_per_tick: float = 0.0
+    times: str = ""
+    image_topic: str = ""
+    base_frame: str = ""
+    frames: int = 0
+    bits: int = 0
+
+    def __post_init__(self) -> None:
+        demand(
+            self, DetectError,
+            frames=whole(0), wheel_base_m=NOT_NEGATIVE, metres_per_tick=NOT_NEGATIVE,
+        )  # fmt: skip
+        if self.bits and not 8 <= self.bits <= 16:
+            raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing is said of steps and times."""
+        return not (self.odometry or self.times or self.image_topic or self.base_frame)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,52 +309,3 @@ class All(DetectorFlags):
     find_radius: bool = False
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
-
-
-@dataclass(frozen=True)
-class Compare:
-    """Compare detected rows with reference rows: found, missed, look-alikes, clutter, errors.
-
-    Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
-
-    Parameters
-    ----------
-    run : Path
-        Run folder.
-    lines : bool
-        Compare verticals instead of discs.
-    reference : Path
-        Reference rows; by default map.circles (map.lines) in the run folder.
-    detected : Path
-        Detected rows; by default detected.circles (detected.lines) in the run folder.
-    unlisted : Path
-        Discs that may be detected but need not be: rows on them are neither right nor wrong; by
-        default unlisted.circles beside the reference, if it is there.
-    lookalikes : Path
-        What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
-        beside the reference, if it is there.
-    camera : Path
-        Calibration, by default the one in the run folder: discs are compared in the image, each row
-        where it was seen. Without one, or with --gate-m or --sigma, on the floor.
-    min_recall : float
-        Exit with 1 if the recall is lower.
-    min_precision : float
-        Exit with 1 if the precision is lower.
-    json : Path
-        Write the result as JSON.
-    force : bool
-        Replace an existing JSON file.
-    """
-
-    run: Positional[Path]
-    lines: bool = False
-    reference: MaybePath = None
-    detected: MaybePath = None
-    unlisted: MaybePath = None
-    lookalikes: MaybePath = None
-    camera: MaybePath = None
-    min_recall: MaybeFloat = None
-    min_precision: MaybeFloat = None
-    json: MaybePath = None
-    force: bool = False
-    options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)

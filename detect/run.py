@@ -12,12 +12,9 @@ done.
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,95 +22,9 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import bounded_content, decode_gray
-from detect.sources.image_names import IMAGE_SUFFIXES, ImageNames, images_of_folder
-from redetect.landmarks import Step, read_steps
-
-
-@dataclass(frozen=True, slots=True)
-class RunFrame:
-    """One frame of a run: its STEP row, and the image taken after it.
-
-    Attributes
-    ----------
-    step : Step
-    image : path or None
-        The image's file; None where there is none.
-    content : bytes or (H, W) uint8 array or None
-        The encoded image or its grey values, where it comes from no file of its own.
-    time_s : float or None
-        When it was taken, where that is known.
-    bits : int
-        Significant bits of a file with more than 8.
-    failure : str or None
-        Why there is no image, although there should be.
-    """
-
-    step: Step
-    image: Path | None
-    content: bytes | NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
-    time_s: float | None = None
-    bits: int = 16
-    failure: str | None = None
-
-
-class Frames(Protocol):
-    """The frames of a run, made on demand.
-
-    Iterating again starts over (with a live camera: from then on).
-
-    Attributes
-    ----------
-    ships_images : bool
-        Whether frames carry contents of images, not paths.
-    expected : int or None
-        Approximate number of frames, if it is known.
-    left_out : int
-        How many images, so far, are no part of the run.
-    why_left_out : str
-        Why; printed after their number.
-    """
-
-    ships_images: bool
-
-    @property
-    def expected(self) -> int | None: ...
-
-    @property
-    def left_out(self) -> int: ...
-
-    @property
-    def why_left_out(self) -> str: ...
-
-    def __iter__(self) -> Generator[RunFrame, None, None]: ...
-
-
-class RunFrames:
-    """The frames of a run folder: in the order of the odometry, or of names."""
-
-    ships_images = False
-    why_left_out = "images are not named by a STEP row: left out"
-
-    def __init__(
-        self, images: ImageNames, odometry: Path | None, expected: int, left_out: int, bits: int
-    ) -> None:
-        self._images, self._odometry, self._bits = images, odometry, bits
-        self.expected, self.left_out = expected, left_out
-
-    def __iter__(self) -> Generator[RunFrame, None, None]:
-        if self._odometry is None:
-            for place in range(len(self._images)):
-                yield self._frame(_standing_still(self._images.path(place).stem), place)
-        else:
-            for step in read_steps(self._odometry):
-                yield self._frame(step)
-
-    def _frame(self, step: Step, place: int | None = None) -> RunFrame:
-        try:
-            found = self._images.place_of(step.prefix) if place is None else place
-            image = None if found is None else self._images.checked(found)
-            return RunFrame(step, image, bits=self._bits)
-        except FrameError as error:
-            return RunFrame(step, None, failure=str(error))
+from detect.sources.image_files import IMAGE_SUFFIXES, RunFrames, bits_of_images, images_of_folder
+from detect.sources.interface import Frames, RunFrame
+from redetect.landmarks import read_steps
 
 
 @dataclass(frozen=True)
@@ -206,8 +117,6 @@ def open_images(
 
 
 def _image_run(folder: Path, bits: int | None) -> ImageRun:
-    from detect.sources.pictures import bits_of_images
-
     images = images_of_folder(folder)
     odometry = _odometry(folder)
     bits = bits_of_images(images) if bits is None else bits
@@ -304,8 +213,3 @@ def _odometry(folder: Path) -> Path | None:
         if candidate.is_file():
             return candidate
     return None
-
-
-def _standing_still(prefix: str) -> Step:
-    # What would part the word, begin a comment or continue the row.
-    return Step(re.sub(r"\s|\A#|\\\Z", "_", prefix), *[0.0] * 9)

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.matching import numbers
+from detect.comparison.compare import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import read_image
-from detect.runs.progress import print_failures, progress_bar
 from detect.seen import circle_on_floor, image_positions
 from detect.sources.opening import demand_recording, open_calibrated
+from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path

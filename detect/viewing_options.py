@@ -1,4 +1,4 @@
-"""The flags of the commands that show results: one frozen dataclass per command.
+"""The flags of the commands that show, compare and export rows: one frozen dataclass per command.
 
 Nothing heavy is imported: `--help` needs it all.
 """
@@ -6,15 +6,142 @@ Nothing heavy is imported: `--help` needs it all.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from detect.comparison.result import Gates
-from detect.flags import MaybeInt, MaybePath, MaybeStr, PickedFrames, Preset, RunFlags
+from detect.errors import CompareError
 from detect.line_settings import LineSettings
+from detect.options import (
+    MaybeFloat,
+    MaybeInt,
+    MaybePath,
+    MaybeStr,
+    PickedFrames,
+    Preset,
+    RunFlags,
+    SourceOptions,
+)
 from detect.settings import CircleSettings
-from detect.sources.options import SourceOptions
+from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
+
+ErrorCovariance = Literal["detected", "reference", "sum"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gates:
+    """Which detected and reference rows are the same landmark.
+
+    Parameters
+    ----------
+    gate_m : float
+        Compare discs on the floor: they are the same within this distance, metres. By default they
+        are compared in the image where there is a calibration, and within 0.1 m where there is
+        none.
+    tolerance_deg : float
+        Bearings of the same line differ by at most this,
+    sigmas : float
+        or by this many standard deviations of the detected one.
+    """
+
+    gate_m: MaybeFloat = None
+    tolerance_deg: float = 0.5
+    sigmas: float = 2.0
+
+    def __post_init__(self) -> None:
+        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
+        if self.gate_m is not None:
+            demand(self, CompareError, gate_m=ABOVE_0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(Gates):
+    """Which rows are the same landmark, and which rows count.
+
+    Parameters
+    ----------
+    sigma : float
+        Compare discs on the floor: they are the same within this Mahalanobis distance under the
+        reference row's covariance (standard deviations).
+    least_px : float
+        In the image, discs are the same if they differ by at most half the width and height of the
+        disc's own image, or by this (px), whichever is more.
+    only_identified : bool
+        Count only reference rows that have an ID. Detected rows that fit a reference row without
+        one are then neither right nor wrong: they are set aside.
+    all_frames : bool
+        Count frames that only one file has, too: all their rows are missed, or extra.
+    error_covariance : {"detected", "reference", "sum"}
+        Which covariance position errors of discs are measured in: the detected row's, the reference
+        row's, or, where both err independently, their sum.
+    """
+
+    sigma: MaybeFloat = None
+    least_px: float = 3.0
+    only_identified: bool = False
+    all_frames: bool = False
+    error_covariance: ErrorCovariance = "detected"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        demand(self, CompareError, least_px=ABOVE_0)
+        if self.sigma is not None:
+            demand(self, CompareError, sigma=ABOVE_0)
+
+    @property
+    def on_floor(self) -> bool:
+        """Whether discs are to be compared on the floor even where there is a calibration."""
+        return self.gate_m is not None or self.sigma is not None
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare detected rows with reference rows: found, missed, look-alikes, clutter, errors.
+
+    Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
+
+    Parameters
+    ----------
+    run : Path
+        Run folder.
+    lines : bool
+        Compare verticals instead of discs.
+    reference : Path
+        Reference rows; by default map.circles (map.lines) in the run folder.
+    detected : Path
+        Detected rows; by default detected.circles (detected.lines) in the run folder.
+    unlisted : Path
+        Discs that may be detected but need not be: rows on them are neither right nor wrong; by
+        default unlisted.circles beside the reference, if it is there.
+    lookalikes : Path
+        What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
+        beside the reference, if it is there.
+    camera : Path
+        Calibration, by default the one in the run folder: discs are compared in the image, each row
+        where it was seen. Without one, or with --gate-m or --sigma, on the floor.
+    min_recall : float
+        Exit with 1 if the recall is lower.
+    min_precision : float
+        Exit with 1 if the precision is lower.
+    json : Path
+        Write the result as JSON.
+    force : bool
+        Replace an existing JSON file.
+    """
+
+    run: Positional[Path]
+    lines: bool = False
+    reference: MaybePath = None
+    detected: MaybePath = None
+    unlisted: MaybePath = None
+    lookalikes: MaybePath = None
+    camera: MaybePath = None
+    min_recall: MaybeFloat = None
+    min_precision: MaybeFloat = None
+    json: MaybePath = None
+    force: bool = False
+    options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
 @dataclass(frozen=True)
@@ -194,3 +321,42 @@ class Tune(PickedFrames, RowsFlags):
     jobs: MaybeInt = None
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
+
+
+Format = Literal["csv", "parquet", "mcap"]
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the rows of a file in another format, with named columns and units.
+
+    Example: detect export images/e/map.circles --to csv -o /tmp/discs.csv, or:
+    detect export drive.detected.circles --to mcap
+
+    Cameras of COLMAP come from the calibration: camera convert e.cam cameras.txt
+
+    Parameters
+    ----------
+    file : Path
+        A .circles, .lines, .markers or .tilt file, or one of STEP rows.
+    to : str
+        csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
+        (extra [bags]).
+    output : Path
+        The file to write; by default the file's name and the format's. The steps go beside it, as
+        .steps.csv or .steps.parquet; MCAP has all in one.
+    times : Path
+        Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
+        detected together (detected.times).
+    rate_hz : float
+        Frame rate to use without times, the first frame at 0 s. MCAP needs one or the other.
+    force : bool
+        Replace existing files.
+    """
+
+    file: Positional[Path]
+    to: Format = "csv"
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    times: MaybePath = None
+    rate_hz: MaybeFloat = None
+    force: bool = False

@@ -1,35 +1,15 @@
 """Tables that depend on the calibration only, and their cache."""
 
-from lut.cache import TABLE_VERSION, cache_folder, cached_disc_table, cached_vertical_table
-from lut.errors import TableError
-from lut.outlines import (
-    GROUP_COLUMNS,
-    GROUP_SAMPLES,
-    MIN_SHARE_INSIDE,
-    CentreGroups,
-    DiscShape,
-    DiscTable,
-    build_disc_table,
-    floor_positions,
-    ring,
-)
-from lut.verticals import VerticalTable, build_vertical_table
-
-__all__ = [
-    "GROUP_COLUMNS",
-    "GROUP_SAMPLES",
-    "MIN_SHARE_INSIDE",
-    "TABLE_VERSION",
-    "CentreGroups",
-    "DiscShape",
-    "DiscTable",
-    "TableError",
-    "VerticalTable",
-    "build_disc_table",
-    "build_vertical_table",
-    "cache_folder",
-    "cached_disc_table",
-    "cached_vertical_table",
-    "floor_positions",
-    "ring",
-]
+from lut.cache import cache_folder as cache_folder
+from lut.cache import cached_disc_table as cached_disc_table
+from lut.cache import cached_vertical_table as cached_vertical_table
+from lut.outlines import GROUP_COLUMNS as GROUP_COLUMNS
+from lut.outlines import GROUP_SAMPLES as GROUP_SAMPLES
+from lut.outlines import CentreGroups as CentreGroups
+from lut.outlines import DiscShape as DiscShape
+from lut.outlines import DiscTable as DiscTable
+from lut.outlines import TableError as TableError
+from lut.outlines import build_disc_table as build_disc_table
+from lut.outlines import ring as ring
+from lut.verticals import VerticalTable as VerticalTable
+from lut.verticals import build_vertical_table as build_vertical_table

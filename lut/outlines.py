@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from lut.errors import TableError
 from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+from redetect.storage.messages import OneLineError
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +30,10 @@ FloatArray = NDArray[np.float64]
 MIN_SHARE_INSIDE = 0.5
 #: Samples of each outline that the centres of a group share, and columns that it covers.
 GROUP_SAMPLES, GROUP_COLUMNS = 10, 16
+
+
+class TableError(OneLineError, ValueError):
+    """A table that cannot be computed; the message names the quantity and what was expected."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""Where on the floor two sets of rows put the same discs.
+"""Where on the floor two sets of rows put the same discs, and figures of errors.
 
-Their differences over distance, and the one tilt and height of the camera that explains them.
+Differences over distance, and the one tilt and height of the camera that explains them. Figures are
+None where there is nothing to compute them from.
 """
 
 from __future__ import annotations
@@ -11,13 +12,41 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
+from scipy.special import chdtri
 
 from camera import Camera
-from detect.comparison.figures import normalised_error, quantile
-from detect.comparison.result import CommonLean, DiscPairs, FloorBin, FloorDifference
+from detect.comparison.result import (
+    CommonLean,
+    DiscPairs,
+    FloorBin,
+    FloorDifference,
+    NormalisedError,
+)
 from detect.seen import image_positions, level_seen
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 FloatArray = NDArray[np.float64]
+
+
+def quantile(values: FloatArray, q: float = 0.5) -> float | None:
+    """Quantile of `values`, interpolated linearly; by default the median."""
+    return float(np.quantile(values, q)) if len(values) else None
+
+
+def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
+
+    Errors whose covariance (N, n, n) is not positive definite are left out.
+    """
+    usable = is_positive_definite(covariance)
+    left_out = int((~usable).sum())
+    dof = offset[usable].size
+    if dof == 0:
+        return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
+    squared = squared_mahalanobis(offset[usable], covariance[usable])
+    low, high = (float(chdtri(dof, 1.0 - p)) / dof for p in (0.025, 0.975))
+    return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+
 
 #: Huber's constant: 95 % efficient where errors are normal.
 _HUBER = 1.345

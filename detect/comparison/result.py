@@ -9,85 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.flags import MaybeFloat
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
-
 if TYPE_CHECKING:
     from detect.seen import Sight
+    from detect.viewing_options import CompareOptions
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
-ErrorCovariance = Literal["detected", "reference", "sum"]
-
-
-class CompareError(ValueError):
-    """Two runs that cannot be compared; the message says which file or frame and why."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gates:
-    """Which detected and reference rows are the same landmark.
-
-    Parameters
-    ----------
-    gate_m : float
-        Compare discs on the floor: they are the same within this distance, metres. By default they
-        are compared in the image where there is a calibration, and within 0.1 m where there is
-        none.
-    tolerance_deg : float
-        Bearings of the same line differ by at most this,
-    sigmas : float
-        or by this many standard deviations of the detected one.
-    """
-
-    gate_m: MaybeFloat = None
-    tolerance_deg: float = 0.5
-    sigmas: float = 2.0
-
-    def __post_init__(self) -> None:
-        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
-        if self.gate_m is not None:
-            demand(self, CompareError, gate_m=ABOVE_0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(Gates):
-    """Which rows are the same landmark, and which rows count.
-
-    Parameters
-    ----------
-    sigma : float
-        Compare discs on the floor: they are the same within this Mahalanobis distance under the
-        reference row's covariance (standard deviations).
-    least_px : float
-        In the image, discs are the same if they differ by at most half the width and height of the
-        disc's own image, or by this (px), whichever is more.
-    only_identified : bool
-        Count only reference rows that have an ID. Detected rows that fit a reference row without
-        one are then neither right nor wrong: they are set aside.
-    all_frames : bool
-        Count frames that only one file has, too: all their rows are missed, or extra.
-    error_covariance : {"detected", "reference", "sum"}
-        Which covariance position errors of discs are measured in: the detected row's, the reference
-        row's, or, where both err independently, their sum.
-    """
-
-    sigma: MaybeFloat = None
-    least_px: float = 3.0
-    only_identified: bool = False
-    all_frames: bool = False
-    error_covariance: ErrorCovariance = "detected"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        demand(self, CompareError, least_px=ABOVE_0)
-        if self.sigma is not None:
-            demand(self, CompareError, sigma=ABOVE_0)
-
-    @property
-    def on_floor(self) -> bool:
-        """Whether discs are to be compared on the floor even where there is a calibration."""
-        return self.gate_m is not None or self.sigma is not None
 
 
 class FramePair(NamedTuple):

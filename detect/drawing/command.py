@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import Run, read_image
-from detect.runs.progress import print_failures, progress_bar
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import Draw
+from detect.terminal import print_failures, progress_bar
+from detect.viewing_options import CompareOptions, Draw
 from redetect.storage import OutputExistsError, write_whole
 
 

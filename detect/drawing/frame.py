@@ -8,26 +8,26 @@ missing are drawn as well, and rows that fit none have another colour.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
-from detect.comparison.matching import apart_px, match_frame, numbers, pair_of
-from detect.comparison.result import CompareOptions, FrameMatch
+from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
+from detect.comparison.result import FrameMatch
 from detect.drawing.inputs import SeenRows
-from detect.drawing.strokes import (
-    Colour,
-    canvas_of,
-    draw_bar,
-    draw_curve,
-    draw_text,
-    enlargement,
-    with_legend,
-)
+from detect.lines import ACCEPTED, JOINED, LineDetections
+from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
+from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
+from detect.verticals.tracking import LineTracks
+from detect.viewing_options import CompareOptions
+from lut.verticals import VerticalTable
 from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
 
 FloatArray = NDArray[np.float64]
@@ -196,3 +196,157 @@ def _outline_disc(
         draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
     top = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
     draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))
+
+
+Colour = tuple[int, int, int]
+
+_SUBPIXEL_BITS = 4
+# OpenCV's fixed-point coordinates have 32 bits; curves that go far outside are not drawn.
+_FARTHEST_PX = 1e6
+# Up to this many columns strokes are one pixel wide; wider pictures (of phones) get wider strokes.
+_COLUMNS = 1500
+
+
+def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
+    """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
+
+    Pixels that see nothing through the lens of the calibrated camera are dark and red.
+    """
+    canvas = np.repeat(image[:, :, None], 3, axis=2)
+    if camera is not None and camera.seen_share < 1.0:
+        unseen = _unseen(camera)
+        canvas[unseen] //= 3
+        canvas[unseen] += np.array([0, 0, 80], np.uint8)
+    return canvas
+
+
+@lru_cache(maxsize=2)
+def _unseen(camera: Camera) -> NDArray[np.bool_]:
+    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    return np.isnan(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))[..., 0])
+
+
+def enlargement(canvas: NDArray[np.uint8]) -> int:
+    """How many times as wide strokes and words are, to be seen when the picture is shown whole."""
+    return max(1, round(int(canvas.shape[1]) / _COLUMNS))
+
+
+def draw_curve(
+    canvas: NDArray[np.uint8], points: FloatArray, colour: Colour, *, closed: bool = False
+) -> None:
+    """Draw a curve through (N, 2) points u, v; nothing is drawn if one is not finite."""
+    if np.all(np.abs(points) < _FARTHEST_PX):
+        fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        width = enlargement(canvas)
+        cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def draw_bar(canvas: NDArray[np.uint8], ends: FloatArray, colour: Colour) -> None:
+    """Draw an error bar between two points (2, 2) u, v, with a tick at each."""
+    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
+    for points in (ends, ends[0] + tick, ends[1] + tick):
+        draw_curve(canvas, points, colour)
+
+
+def draw_text(
+    canvas: NDArray[np.uint8],
+    text: str,
+    at: ArrayLike,
+    colour: Colour,
+    size: float = 0.35,
+    shift: tuple[int, int] = (0, 0),
+) -> None:
+    """Write in ASCII from u, v, the left end of the base line, if these are finite.
+
+    `shift` moves the words, by more in wide pictures.
+    """
+    place = np.asarray(at, dtype=np.float64)
+    if np.isfinite(place).all():
+        times = enlargement(canvas)
+        u, v = (np.rint(place) + times * np.array(shift)).astype(int).tolist()
+        cv2.putText(
+            canvas, text.encode("ascii", "replace").decode(), (u, max(v, 10 * times)),
+            cv2.FONT_HERSHEY_SIMPLEX, times * size, colour, times, cv2.LINE_AA,
+        )  # fmt: skip
+
+
+def with_legend(
+    canvas: NDArray[np.uint8], words: Sequence[tuple[str, Colour]], column_px: int, size: float
+) -> NDArray[np.uint8]:
+    """The picture, and below it words in columns of some width."""
+    times = enlargement(canvas)
+    width = int(canvas.shape[1])
+    per_row = max(1, width // (column_px * times))
+    rows = -(-len(words) // per_row)
+    legend = np.zeros(((14 * rows + 4) * times, width, 3), np.uint8)
+    for k, (text, colour) in enumerate(words):
+        shift = 4 + column_px * (k % per_row), 13 + 14 * (k // per_row)
+        draw_text(legend, text, (0, 0), colour, size, shift)
+    return np.concatenate([canvas, legend])
+
+
+_CANDIDATE_COLOUR: Colour = (255, 150, 40)
+_FATE_COLOURS: dict[str, Colour] = {
+    ACCEPTED: LINE_COLOUR,
+    JOINED: (255, 190, 0),
+    "short": (120, 120, 120),
+    "no maximum": (200, 0, 120),
+    "little evidence": (200, 120, 60),
+    "off the track": (200, 0, 200),
+    "not straight": (0, 140, 255),
+    "off the horizon": (200, 200, 0),
+    "uncertain": (0, 200, 200),
+    "soft": (160, 80, 200),
+    "not vertical": (0, 0, 255),
+    "same edge": (60, 120, 60),
+    "beside a stronger edge": (0, 90, 160),
+}
+
+
+def draw_tracks(
+    image: NDArray[np.uint8], table: VerticalTable, found: LineDetections
+) -> NDArray[np.uint8]:
+    """Draw the points of tracks, coloured by their fates, with a legend below."""
+    canvas = canvas_of(image)
+    for t, fate in enumerate(found.fate):
+        points = np.rint(track_pixels(found.tracks, table, t)).astype(np.intp)
+        canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _FATE_COLOURS[fate]
+    counts = sorted(Counter(found.fate).items())
+    words = [(f"{fate}: {count}", _FATE_COLOURS[fate]) for fate, count in counts]
+    return with_legend(canvas, words, 190, 0.38)
+
+
+def draw_candidates(picture: NDArray[np.uint8], found: MarkerDetections) -> NDArray[np.uint8]:
+    """The picture with candidates that are no markers, and below it why any were rejected."""
+    for candidate in found.candidates:
+        if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
+            draw_curve(picture, candidate.outline, _CANDIDATE_COLOUR, closed=True)
+    causes = sorted(found.rejected.items())
+    words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
+    return with_legend(picture, words, 210, 0.36)
+
+
+def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:
+    """Draw a response (`detect.verticals.response.line_response`, (H, W)) as a picture (H, W, 3).
+
+    Edges that are brighter on the right are red, on the left blue; the horizon is green.
+    """
+    strength = np.clip(np.abs(response) / (2.0 / np.pi), 0.0, 1.0)
+    shade = (255.0 * np.sqrt(strength)).astype(np.uint8)
+    canvas = np.zeros((*response.shape, 3), np.uint8)
+    canvas[..., 0] = np.where(response < 0.0, shade, 0)
+    canvas[..., 2] = np.where(response > 0.0, shade, 0)
+    columns = np.flatnonzero(table.usable)
+    canvas[np.rint(table.anchor_row[columns]).astype(np.intp), columns, 1] = 160
+    return canvas
+
+
+def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray:
+    """(P, 2) image positions u, v of a track's points."""
+    part = slice(tracks.bounds[t], tracks.bounds[t + 1])
+    row, column = tracks.row[part], tracks.column[part]
+    left = np.clip(column.astype(np.intp), 0, table.column.shape[1] - 2)
+    share = column - left
+    u = (1.0 - share) * table.column[row, left] + share * table.column[row, left + 1]
+    u = np.where(np.isfinite(u), u, table.column[row, np.rint(column).astype(np.intp)])
+    return np.stack([u, row.astype(np.float64)], axis=-1)

@@ -1,4 +1,7 @@
-"""A report as one HTML page: no scripts, nothing loaded, figures as data: addresses."""
+"""The command ``detect report``: files of rows in, one HTML page out.
+
+The page has no scripts and loads nothing: its figures are data: addresses.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +22,48 @@ from detect.comparison.report import (
 )
 from detect.comparison.result import Comparison, DiscComparison, LineComparison
 from detect.drawing.inputs import picture_name
+from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.report.figures import (
+    RateCurve,
     bearings_figure,
     counts_figure,
+    disc_rates,
     distance_figure,
     floor_figure,
+    line_rates,
     rates_figure,
     tilt_figure,
+    whitened,
     whitened_figure,
 )
-from detect.report.inputs import ReportInputs
-from detect.report.parts import Part, Section
-from detect.report.pictures import frame_picture, gallery
-from detect.report.statistics import RateCurve, disc_rates, line_rates, whitened
+from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
+from detect.report.parts import Part, Section, knee
 from detect.settings import CircleSettings
-from detect.tune.table import knee
+from detect.sources.opening import demand_recording, open_source
+from detect.viewing_options import Report
+from redetect.storage import OutputExistsError, write_whole
+
+
+def perform(options: Report) -> int:
+    """Carry the command out; returns the exit code."""
+    if options.worst < 0:
+        raise DetectError(f"worst is {options.worst}: expected 0 or more")
+    demand_recording(options.run)
+    run = open_source(options.run, options.camera, options.source)
+    output = run.output("html") if options.output is None else options.output
+    if output.exists() and not options.force:
+        raise OutputExistsError(output)
+    inputs = gather(run, options.files, options.gates, options.time_frames)
+    page = report_page(inputs, options.worst)
+    with write_whole(output, overwrite=options.force) as stream:
+        stream.write(page)
+    names = [path.name for path in inputs.files.reference.values()]
+    against = f" against {' and '.join(names)}" if names else ", no reference rows"
+    print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
+    return 0
+
 
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
 _SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}

@@ -17,15 +17,14 @@ from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image
-from detect.runs.dispatch import Workers
 from detect.runs.known import FramesByImage, Known, MapByImage
 from detect.runs.outputs import frames_tilt_place
 from detect.runs.plan import Drawing, FramePlan, Job, RunSummary
-from detect.runs.progress import print_failures, progress_bar
 from detect.runs.stream import detect_run, make_folder
-from detect.runs.workers import cluster_workers, default_jobs, local_workers
+from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated, open_source
+from detect.terminal import print_failures, progress_bar
 from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.

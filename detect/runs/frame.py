@@ -32,31 +32,16 @@ COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryErr
 
 @dataclass
 class FrameDetections:
-    """Detections in one image; None for kinds that were not searched.
+    """Detections in one image; None for kinds that were not searched."""
 
-    Attributes
-    ----------
-    image : (H, W) uint8 or None
-        None where it cannot be read.
-    tilt : FrameTilt or None
-        By the lines, or known before; None also if too few lines determine it.
-    seen, discs : CircleDetections or None
-        The discs where they would be on a level robot, and corrected for the tilt where there is
-        one and the plan says so.
-    outline_tilt : FrameTilt or None
-        The tilt by the outlines of the discs, if a run is levelled by all frames.
-    error : str or None
-        Why the frame cannot be worked on.
-    """
-
-    image: NDArray[np.uint8] | None = None
+    image: NDArray[np.uint8] | None = None  # (H, W); None where it cannot be read
     lines: LineDetections | None = None
-    tilt: FrameTilt | None = None
-    seen: CircleDetections | None = None
-    discs: CircleDetections | None = None
-    outline_tilt: FrameTilt | None = None
+    tilt: FrameTilt | None = None  # by the lines, if enough determine it, or known before
+    seen: CircleDetections | None = None  # discs, where they would be on a level robot
+    discs: CircleDetections | None = None  # corrected for the tilt, if the plan says so
+    outline_tilt: FrameTilt | None = None  # by the discs, if a run is levelled by all frames
     markers: MarkerDetections | None = None
-    error: str | None = None
+    error: str | None = None  # why the frame cannot be worked on
 
     @property
     def pixels(self) -> NDArray[np.uint8]:
@@ -74,13 +59,7 @@ class Tables(NamedTuple):
 
 @lru_cache(maxsize=4)
 def tables_of(plan: FramePlan) -> Tables:
-    """The tables that a plan needs: a process makes them or takes them from the cache once.
-
-    Raises
-    ------
-    lut.TableError
-        If there can be none for the camera and the settings.
-    """
+    """The tables that a plan needs: a process makes them or takes them from the cache once."""
     camera = plan.camera
     return Tables(
         cached_vertical_table(camera) if camera and plan.lines else None,

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 
 from detect import __version__
-from detect.run import RunFrame
 from detect.runs.outputs import Output
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
+from detect.sources.interface import RunFrame
 from redetect.storage.parts import PartFile
 
 #: Incremented with every change of the format of a journal or of the rows in it.
@@ -35,13 +35,7 @@ _COMPLETE = "complete"
 
 
 class Journal:
-    """A journal that this process has locked.
-
-    Parameters
-    ----------
-    file : PartFile
-        Closed or removed by whoever opened it.
-    """
+    """A journal that this process has locked; whoever opened its file closes or removes it."""
 
     def __init__(self, file: PartFile) -> None:
         self.file = file

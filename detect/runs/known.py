@@ -11,7 +11,7 @@ import numpy as np
 
 from detect.discs.identity import MappedDisc
 from detect.errors import DetectError
-from detect.sources.image_names import image_name
+from detect.sources.image_files import image_name
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -53,28 +53,15 @@ NOTHING = KnownOfFrame()
 
 @dataclass(frozen=True)
 class Known:
-    """Prior data on the frames of a run, by the prefixes of their images.
+    """Prior data on the frames of a run, by the prefixes of their images."""
 
-    Attributes
-    ----------
-    tilts : mapping, optional
-        Tilts of frames whose verticals are not detected.
-    lines, discs : mapping, optional
-        Frames whose lines or discs have IDs: carried over to the rows of the same landmarks.
-    discs_level : bool
-        Whether these discs are corrected for the tilt.
-    mapped : mapping, optional
-        Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
-    slack_m : float
-        Standard deviation of where these are, besides their covariances, metres.
-    """
-
-    tilts: ByPrefix[FrameTilt] | None = None
-    lines: ByPrefix[Frame] | None = None
-    discs: ByPrefix[Frame] | None = None
-    discs_level: bool = False
+    tilts: ByPrefix[FrameTilt] | None = None  # of frames whose verticals are not detected
+    lines: ByPrefix[Frame] | None = None  # with IDs, carried over to rows of the same lines
+    discs: ByPrefix[Frame] | None = None  # the same of discs
+    discs_level: bool = False  # whether these are corrected for the tilt
+    #: Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
     mapped: ByPrefix[Sequence[MappedDisc]] | None = None
-    slack_m: float = 0.1
+    slack_m: float = 0.1  # standard deviation of where these are, besides their covariances
 
     def __post_init__(self) -> None:
         demand(self, DetectError, slack_m=NOT_NEGATIVE)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from camera import Camera
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
-from detect.run import ImageRun, RunFrame
+from detect.run import ImageRun
 from detect.runs.known import NOTHING, Known, KnownOfFrame
 from detect.settings import CircleSettings, Levelling
+from detect.sources.interface import RunFrame
 from detect.sources.times import format_time
 from redetect.landmarks import format_no_tilt, format_record
 
@@ -32,79 +33,40 @@ KEPT_FAILURES = 100
 class FramePlan:
     """What is done with every frame of a run. Small: it is sent with every task.
 
-    Attributes
-    ----------
-    camera : Camera or None
-        The calibrated camera; without one, only markers can be detected.
-    lines, circles, markers : settings or None
-        Which verticals, discs and square markers are detected, if any.
-    json : bool
-        Whether the discs are written as JSON as well; set by `detect_run`.
-    drawing : {"discs", "lines", "tracks", "markers"} or None
-        What is drawn into the image; "tracks" are all tracks of lines, with the reason of those
-        that are no lines.
-    draw_response : bool
-        Whether the filter's response of the lines is drawn as well.
-    levelling : {"none", "frame", "run"}
-        By what the discs are corrected for the tilt: by nothing, by the frame's own, or, when all
-        frames are done, by the run's (`detect.runs.level_run`).
-    working_folder : path
-        Folder that relative image paths start from, on whatever machine.
+    Without a camera only markers can be detected; of settings that are None, nothing is detected.
     """
 
     camera: Camera | None
     lines: LineSettings | None = None
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
-    json: bool = False
+    json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
+    #: What is drawn into the image: "tracks" are all of the lines', with why some are no lines.
     drawing: Drawing | None = None
-    draw_response: bool = False
+    draw_response: bool = False  # of the lines' filter
+    #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
+    #: done, of the run.
     levelling: Levelling = "frame"
-    working_folder: Path = field(default_factory=Path.cwd)
+    working_folder: Path = field(default_factory=Path.cwd)  # where relative paths start from
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run to be processed, and where its results go.
-
-    Attributes
-    ----------
-    run : ImageRun
-    plan : FramePlan
-        The landmarks to detect.
-    places : mapping
-        The files to write, by kind: "circles", "lines", "tilt", "markers", "json" (the discs once
-        more). Where the frames' times are known, they go beside them.
-    known : Known
-        Prior data on the frames.
-    pictures : path or None
-        Folder for the plan's pictures.
-    base : path or None
-        What log, journal and times are called but for their endings; by default the first of the
-        places.
-    command : str
-        What the log calls the run.
-    crlf : bool
-        Whether the lines of files of landmarks end with CR and LF.
-    overwrite : bool
-        Whether existing files may be replaced.
-    strict : bool
-        Whether the first frame that cannot be worked on ends the run.
-    resume : bool
-        Whether the frames that an unfinished run kept are taken over.
-    """
+    """A run to be processed, and where its results go."""
 
     run: ImageRun
     plan: FramePlan
+    #: The files to write: "circles", "lines", "tilt", "markers", "json" (the discs once more).
     places: Mapping[str, Path]
     known: Known = field(default_factory=Known)
-    pictures: Path | None = None
+    pictures: Path | None = None  # folder for those of the plan
+    #: What log, journal and times are called but for their endings; None: the first of the places.
     base: Path | None = None
-    command: str = ""
-    crlf: bool = False
+    command: str = ""  # what the log calls the run
+    crlf: bool = False  # how lines of files of landmarks end
     overwrite: bool = False
-    strict: bool = False
-    resume: bool = False
+    strict: bool = False  # whether the first frame that cannot be worked on ends the run
+    resume: bool = False  # whether the frames that an unfinished run kept are taken over
 
     @property
     def ships_images(self) -> bool:
@@ -118,10 +80,11 @@ class Job:
 
 
 class FrameTask(NamedTuple):
-    """A frame to be processed, with prior data on it. Small."""
+    """A frame to be processed, prior data on it, and its plan if it is not the run's. Small."""
 
     frame: RunFrame
     known: KnownOfFrame = NOTHING
+    plan: FramePlan | None = None
 
     @property
     def name(self) -> object:
@@ -130,56 +93,27 @@ class FrameTask(NamedTuple):
 
 
 class FrameRows(NamedTuple):
-    """Result of a frame, some kilobytes: all that a worker sends back.
-
-    Attributes
-    ----------
-    prefix : str
-        Of its image.
-    rows : mapping
-        Its rows in files of each kind: "circles", "lines", "tilt", "markers", "json", "times".
-    found : mapping
-        How many "discs", "lines", "tilts" and "markers" there are.
-    rejected : mapping
-        How many candidates for markers were rejected, by cause.
-    error : str or None
-        Why the frame could not be worked on: its STEP stays, without landmarks.
-    pictures : tuple of (name, PNG)
-    """
+    """Result of a frame, some kilobytes: all that a worker sends back."""
 
     prefix: str
-    rows: Mapping[str, str]
-    found: Mapping[str, int] = {}
-    rejected: Mapping[str, int] = {}
-    error: str | None = None
-    pictures: tuple[tuple[str, bytes], ...] = ()
+    rows: Mapping[str, str]  # by kind of file: those of `Job.places`, and "times"
+    found: Mapping[str, int] = {}  # how many "discs", "lines", "tilts" and "markers"
+    rejected: Mapping[str, int] = {}  # how many candidates for markers, by cause
+    error: str | None = None  # why there are no landmarks
+    pictures: tuple[tuple[str, bytes], ...] = ()  # names and PNG files
 
 
 @dataclass
 class RunSummary:
-    """Summary of a run.
-
-    Attributes
-    ----------
-    frames, failed : int
-        Frames of the run, and those of them that could not be worked on.
-    found, rejected : Counter
-        Sums of these of `FrameRows`.
-    failures : list of str
-        A line for each of the first `KEPT_FAILURES` frames that failed.
-    images_without_step : int
-        Images that are no part of the run: the odometry does not have them.
-    tilt : RunTilt or None
-        The tilt of the run, if discs were levelled by it.
-    """
+    """What was found in a run, and the first `KEPT_FAILURES` reasons why frames failed."""
 
     frames: int = 0
     found: Counter[str] = field(default_factory=Counter)
     rejected: Counter[str] = field(default_factory=Counter)
     failed: int = 0
     failures: list[str] = field(default_factory=list)
-    images_without_step: int = 0
-    tilt: RunTilt | None = None
+    images_without_step: int = 0  # the odometry does not have them
+    tilt: RunTilt | None = None  # that discs were levelled by, if by the run's
 
     def add(self, rows: FrameRows) -> None:
         """Count a frame."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.circles import CircleDetections
-from detect.comparison.result import CompareOptions
 from detect.discs.identity import ids_of_map, ids_of_rows
-from detect.drawing.frame import draw_rows
+from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks
 from detect.drawing.inputs import SeenRows
-from detect.drawing.rejected import draw_candidates, draw_response, draw_tracks
 from detect.errors import FrameError
 from detect.lines import LineDetections
 from detect.runs.frame import (
@@ -40,6 +39,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.verticals.detections import carry_ids
 from detect.verticals.response import line_response
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     format_levelling,
     format_no_tilt,
@@ -56,16 +56,15 @@ PIXELS_AT_ONCE = 1 << 25
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRows]:
     """The rows of frames; as many are worked on at a time as fit in memory."""
-    camera = plan.camera
-    at_once = 1
-    if camera is not None and plan.drawing is None and not plan.draw_response:
-        at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
     rows: list[FrameRows] = []
-    for first in range(0, len(tasks), at_once):
-        batch = tasks[first : first + at_once]
-        rows += [
-            _rows_of(task, found, plan) for task, found in zip(batch, detect_batch(batch, plan))
-        ]
+    for own, group in groupby(tasks, lambda task: task.plan or plan):
+        alike, camera, at_once = list(group), own.camera, 1
+        if camera is not None and own.drawing is None and not own.draw_response:
+            at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
+        for first in range(0, len(alike), at_once):
+            batch = alike[first : first + at_once]
+            found = detect_batch(batch, own)
+            rows += [_rows_of(task, each, own) for task, each in zip(batch, found)]
     return rows
 
 
@@ -123,13 +122,7 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
 def landmark_rows(
     keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
 ) -> str:
-    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs.
-
-    Raises
-    ------
-    FrameError
-        If a number is not finite.
-    """
+    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs."""
     if not np.isfinite(numbers).all():
         raise FrameError(f"{keyword}: a number of it is not finite")
     row = keyword + " %g" * numbers.shape[1]

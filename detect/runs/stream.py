@@ -1,24 +1,39 @@
 """Processes a run: frames in, files out, neither ever in memory as a whole.
 
-    frames of the run  ->  tasks  ->  workers (`detect.runs.dispatch`)  ->  rows in order  ->  files
+    frames of the run  ->  tasks  ->  workers (`detect.runs.workers`)  ->  rows in order  ->  files
 
 The files have the same bytes with any number of workers; they appear together at the end, or not at
 all.
+
+The rows of each frame that is done go to the journal (`detect.runs.journal`). However a run ends,
+by a signal, a full disk, workers that are gone, they are there, and a run that resumes goes on
+after them, as long as program, settings, camera and frames are the same. When all frames are done,
+the results are written from the journal to parts (`redetect.storage.parts`) and brought to the
+disk; the journal says so; they take their places. A process killed in between leaves this last step
+to the next run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+import errno
+import hashlib
+import logging
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from detect.errors import DetectError
-from detect.runs.dispatch import Workers, detect_chunks
+from detect.runs.journal import Journal, made_by, task_digest
+from detect.runs.outputs import Output, is_log, log_text, outputs_of
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
-from detect.runs.run_files import RunFiles
-from detect.runs.workers import local_workers
-from redetect.storage import write_whole
+from detect.runs.workers import Workers, detect_chunks, local_workers
+from redetect.storage import OutputExistsError, write_whole
+from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
+
+_log = logging.getLogger("redetect")
 
 
 def detect_run(
@@ -26,22 +41,16 @@ def detect_run(
 ) -> RunSummary:
     """Process every frame of a run by a plan, and write the results.
 
-    Each image is decoded once. Levelled by frames, discs and lines together give the files that
-    they give one after the other, with the tilts that were written. Levelled by the run, the tilt
-    file has the tilts that the discs were levelled by, and the single frames' are in another one
-    (`detect.runs.outputs.frames_tilt_place`).
+    Each image is decoded once. Levelled by the run, the tilt file has the tilts that the discs were
+    levelled by, and those of single frames are in another one (`outputs.frames_tilt_place`).
 
     Parameters
     ----------
     job : Job
     workers : Workers, optional
-        The workers; by default this process (see `detect.runs.workers`).
+        By default this process (see `detect.runs.workers`).
     on_progress : callable, optional
         Called once after every frame.
-
-    Returns
-    -------
-    RunSummary
 
     Raises
     ------
@@ -109,3 +118,211 @@ def _write_pictures(
         for name, picture in rows.pictures:
             with write_whole(folder / name, overwrite=overwrite) as stream:
                 stream.write(picture)
+
+
+class RunFiles:
+    """The files of a run: a context manager that begins or resumes its journal, and ends it."""
+
+    def __init__(self, job: Job) -> None:
+        self._job, self._outputs = job, outputs_of(job)
+        self._base, self._log_path = job.beside(""), job.beside(".log.json")
+        self._paths = [*(output.path for output in self._outputs), self._log_path]
+        self._made_by = made_by(self._outputs, job.plan)
+        self._overwrite, self._resumable = job.overwrite, True
+        self._frames = self._taken_over = 0
+        self._resumes = self._done = False
+        self._journal: Journal
+
+    # -- beginning ------------------------------------------------------------------------
+
+    def __enter__(self) -> RunFiles:
+        places = [os.path.realpath(path) for path in self._paths]
+        for path, place in zip(self._paths, places):
+            if places.count(place) > 1:  # the last one would be all there is
+                raise DetectError(f"{path}: named for two results: expected a file for each")
+        left = left_part(self._base, "journal", named=self._paths[0])
+        try:
+            if left is not None:
+                self._take_up(left)
+            self._demand_places()
+        except BaseException:
+            if left is not None:
+                left.close()
+            raise
+        if not self._resumes:
+            if left is not None:
+                left.remove()
+            self._begin()
+        return self
+
+    def _take_up(self, left: PartFile) -> None:
+        """See whether a journal that was left can be resumed, and complete its run if it ended."""
+        journal = Journal(left)
+        self._resumes = self._job.resume and journal.is_by(self._made_by)
+        complete = journal.complete()
+        if complete is not None:
+            self._complete(*complete)
+        if self._resumes:
+            self._journal = journal
+            self._overwrite |= complete is not None  # the files are its own
+        elif complete is not None:
+            left.remove()
+        elif self._job.resume:
+            _log.info(
+                "what an unfinished run left was made with other settings, another camera or "
+                "version: beginning anew"
+            )
+        else:
+            _log.info("removing what an unfinished run left (--resume would have gone on with it)")
+
+    def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
+        """Complete a run that was killed while its files took their places."""
+        _log.info("the files of a run that was killed at its very end take their places")
+        for path, number in zip(self._paths, numbers):
+            part = left_part(path, number=number)
+            if part is not None:
+                with part:
+                    part.replace(path, overwrite=overwrite or self._may_replace(path))
+
+    def _begin(self) -> None:
+        file = new_part(self._base, "journal", named=self._paths[0])
+        self._journal = Journal(file)
+        try:
+            if file.number > 0:
+                self._resumable = False
+                if not self._overwrite:
+                    place = self._base.with_name(f".{self._base.name}.journal")
+                    raise DetectError(
+                        f"{place}: another run is writing these files: wait for it, or, if it was "
+                        "killed on another machine, remove this file"
+                    )
+                _log.info("another run is writing these files: this one cannot be resumed")
+            self._journal.write([self._made_by])
+        except BaseException:
+            file.remove()
+            raise
+
+    def _demand_places(self) -> None:
+        """Refuse to replace what must not be, or cannot be."""
+        for path in self._paths:
+            demand_place(path, overwrite=self._may_replace(path))
+
+    def _may_replace(self, path: Path) -> bool:
+        """Whether an existing file may be replaced: the log always, if it is one."""
+        return self._overwrite or (path == self._log_path and is_log(path))
+
+    # -- frames -----------------------------------------------------------------------------
+
+    def take_over(
+        self, tasks: Iterator[FrameTask], count: Callable[[FrameRows], None]
+    ) -> Iterator[FrameTask]:
+        """Take over the frames that are done already, counting each; returns the remaining ones."""
+        if not self._resumes:
+            return tasks
+        beyond: list[FrameTask] = []
+        for digest, rows in self._journal.frames():
+            task = next(tasks, None)
+            if task is None or digest != task_digest(task):
+                beyond = [] if task is None else [task]
+                break
+            self._demand_strictly(rows)
+            self._frames += 1
+            count(rows)
+        self._journal.cut()
+        self._taken_over = self._frames
+        _log.info("%d frames of an unfinished run are taken over", self._frames)
+        return chain(beyond, tasks)
+
+    @property
+    def may_replace_pictures(self) -> bool:
+        """Whether pictures may be replaced: a resumed run may have drawn the next ones."""
+        return self._overwrite or (self._resumes and self._frames == self._taken_over)
+
+    def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
+        """Note the next frames."""
+        try:
+            for _, rows in frames:
+                self._demand_strictly(rows)
+        except DetectError:
+            self._resumable = False  # nothing is kept
+            raise
+        self._journal.write_frames(frames)
+        self._frames += len(frames)
+
+    def _demand_strictly(self, rows: FrameRows) -> None:
+        if rows.error is not None and self._job.strict:
+            raise DetectError(f"{rows.error} (--strict: nothing is written)")
+
+    # -- ending -----------------------------------------------------------------------------
+
+    def rows(self) -> Iterator[Mapping[str, str]]:
+        """The rows of each frame, by kind; can be read more than once."""
+        return (rows.rows for _, rows in self._journal.frames())
+
+    def finish(self, rows_of_frames: Iterable[Mapping[str, str]], summary: RunSummary) -> None:
+        """Write the results, and move them to their final paths."""
+        if not self._journal.file.is_in_place():
+            # Another folder may have come in its place: nothing in it is touched.
+            raise FileNotFoundError(errno.ENOENT, "the run's journal is gone", str(self._paths[0]))
+        with ExitStack() as stack:
+            parts = [stack.enter_context(new_part(path)) for path in self._paths]
+            results = list(zip(self._outputs, parts))
+            for output, part in results:
+                part.stream.write(output.encoded(output.head))
+            separators = dict.fromkeys((output.kind for output in self._outputs), "")
+            for rows in rows_of_frames:
+                for output, part in results:
+                    if text := rows.get(output.kind):
+                        part.stream.write(output.encoded(separators[output.kind] + text))
+                        separators[output.kind] = output.between
+            for output, part in results:
+                part.stream.write(output.encoded(output.tail))
+            written = [_described(output, part) for output, part in results]
+            failures = [
+                {"frame": number, "prefix": rows.prefix, "reason": rows.error}
+                for number, (_, rows) in enumerate(self._journal.frames())
+                if rows.error is not None
+            ]
+            parts[-1].stream.write(log_text(self._job, summary, failures, written).encode())
+            for part in parts:
+                part.sync()
+            self._place(parts)
+        self._done = True
+
+    def _place(self, parts: Sequence[PartFile]) -> None:
+        with folder_locked(self._log_path.parent):
+            self._demand_places()
+            self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)
+            try:
+                for path, part in zip(self._paths, parts):
+                    part.replace(path, overwrite=self._may_replace(path))
+            except OutputExistsError:
+                raise
+            except BaseException:
+                for part in parts:
+                    part.close()  # the next run goes on with it
+                raise
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
+        journal = self._journal.file
+        if (
+            self._done
+            or not self._resumable
+            or isinstance(error, OutputExistsError)  # another process was faster
+            or not (self._frames or self._resumes)
+            or journal.stream.closed
+            or not journal.is_in_place()
+        ):
+            journal.remove()
+            return
+        journal.close()
+        if self._frames:
+            _log.info("%d frames are kept: --resume goes on after them", self._frames)
+
+
+def _described(output: Output, part: PartFile) -> dict[str, object]:
+    """Name, size and hash of a result, for the log."""
+    size = part.stream.tell()
+    part.stream.seek(0)
+    sha256 = hashlib.file_digest(part.stream, "sha256").hexdigest()
+    return {"name": output.path.name, "bytes": size, "sha256": sha256}

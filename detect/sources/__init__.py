@@ -4,11 +4,11 @@
 
     source             module       how it is named
     run folder         detect.run   the folder
-    images             pictures     a folder, one image, or a pattern such as 'drive/*.png'
+    images             image_files   a folder, one image, or a pattern such as 'drive/*.png'
     video file         video        the file
     ROS bag, MCAP      bag          the .bag or .mcap file, or the folder of a ROS 2 bag
-    live camera        live         camera:0
+    live camera        video        camera:0
 
 A source gives images in order, with their times if it has them. Odometry is added to it
-(`odometry`), so that any source may be combined with any odometry; `opening` puts both together.
+(`poses`), so that any source may be combined with any odometry; `opening` puts both together.
 """

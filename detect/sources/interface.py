@@ -1,17 +1,81 @@
-"""What all sources of images have in common."""
+"""Frames of a run, and what all sources of images have in common."""
 
 from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Generator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError
-from detect.run import RunFrame
-from detect.sources.poses import PoseStream
 from redetect.landmarks import Step
+
+if TYPE_CHECKING:
+    from detect.sources.poses import PoseStream
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrame:
+    """One frame of a run: its STEP row, and the image taken after it.
+
+    Attributes
+    ----------
+    step : Step
+    image : path or None
+        The image's file; None where there is none.
+    content : bytes or (H, W) uint8 array or None
+        The encoded image or its grey values, where it comes from no file of its own.
+    time_s : float or None
+        When it was taken, where that is known.
+    bits : int
+        Significant bits of a file with more than 8.
+    failure : str or None
+        Why there is no image, although there should be.
+    """
+
+    step: Step
+    image: Path | None
+    content: bytes | NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
+    time_s: float | None = None
+    bits: int = 16
+    failure: str | None = None
+
+
+class Frames(Protocol):
+    """The frames of a run, made on demand.
+
+    Iterating again starts over (with a live camera: from then on).
+
+    Attributes
+    ----------
+    ships_images : bool
+        Whether frames carry contents of images, not paths.
+    expected : int or None
+        Approximate number of frames, if it is known.
+    left_out : int
+        How many images, so far, are no part of the run.
+    why_left_out : str
+        Why; printed after their number.
+    """
+
+    ships_images: bool
+
+    @property
+    def expected(self) -> int | None: ...
+
+    @property
+    def left_out(self) -> int: ...
+
+    @property
+    def why_left_out(self) -> str: ...
+
+    def __iter__(self) -> Generator[RunFrame, None, None]: ...
 
 
 class Source(ABC):

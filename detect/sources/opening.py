@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 from camera import read_camera
 from detect.errors import DetectError
-from detect.run import Frames, ImageRun, Run, open_images, open_run
-from detect.sources.image_names import IMAGE_SUFFIXES
-from detect.sources.options import SourceOptions
+from detect.options import SourceOptions
+from detect.run import ImageRun, Run, open_images, open_run
+from detect.sources.image_files import IMAGE_SUFFIXES
+from detect.sources.interface import Frames
 
 if TYPE_CHECKING:
     from detect.sources.interface import Source
@@ -94,9 +95,8 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
 
 def _source(name: Path, options: SourceOptions) -> Source:
     from detect.sources.bag import BAG_SUFFIXES, Bag
-    from detect.sources.live import LiveCamera
-    from detect.sources.pictures import WILDCARDS, ImageFiles
-    from detect.sources.video import VideoFile
+    from detect.sources.image_files import WILDCARDS, ImageFiles
+    from detect.sources.video import LiveCamera, VideoFile
 
     bits = options.bits or None
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
@@ -120,8 +120,13 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
-    from detect.sources.odometry import frames_along_poses, frames_along_rows
-    from detect.sources.poses import PoseStream, tick_poses, tum_poses
+    from detect.sources.poses import (
+        PoseStream,
+        frames_along_poses,
+        frames_along_rows,
+        tick_poses,
+        tum_poses,
+    )
 
     named = options.odometry
     poses: PoseStream | None
@@ -156,7 +161,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
 def _shortened(run: ImageRun, count: int) -> ImageRun:
     if not count:
         return run
-    from detect.sources.odometry import FirstFrames
+    from detect.sources.poses import FirstFrames
 
     return replace(run, frames=FirstFrames(run.frames, count))
 

@@ -16,7 +16,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -138,6 +138,36 @@ def left_part(
         return PartFile(named or path, place, number, handle)
     os.close(handle)
     return None
+
+
+@contextmanager
+def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
+    """Open a binary stream whose content appears at `path` only once it is complete.
+
+    It is written to a hidden file in the same folder, which takes the place of `path` (or, if that
+    is a symbolic link, of its target) in one step when the block ends, and is removed when the
+    block raises.
+
+    Parameters
+    ----------
+    path : path
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    OutputExistsError
+        If `path` exists and `overwrite` is false.
+    OSError
+        If `path` is no regular file, its folder cannot be written to, or the disk is full; names
+        `path`.
+    """
+    path = Path(path)
+    demand_place(path, overwrite=overwrite)
+    with new_part(path) as part:
+        yield part.stream
+        part.sync()
+        part.replace(path, overwrite=overwrite)
 
 
 @contextmanager

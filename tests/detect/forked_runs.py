@@ -77,7 +77,7 @@ class StopAfter:
         self.frames = frames
 
     def __call__(self) -> None:
-        from detect.runs.run_files import RunFiles
+        from detect.runs.stream import RunFiles
 
         add, count = RunFiles.add, [0]
         if self.frames == 0:

@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from detect.comparison.compare import compare_line_frames, compare_runs
-from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
+from detect.comparison.result import DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
 from detect.runs.known import FramesByImage, Known
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import read_frames
 
 #: What the shipped rows were detected with, apart from what makes one disc one row.

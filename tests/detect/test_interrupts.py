@@ -15,7 +15,7 @@ import pytest
 from detect import cli
 from detect.cli import main
 from detect.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
-from detect.runs.progress import progress_bar
+from detect.terminal import progress_bar
 
 
 @pytest.mark.parametrize("other", [SystemError, ValueError, OSError])

@@ -17,16 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera import Camera, read_camera
-from detect.comparison.result import CompareOptions
-from detect.drawing.frame import draw_rows
+from detect.drawing.frame import draw_response, draw_rows, draw_tracks, track_pixels
 from detect.drawing.inputs import SeenRows
-from detect.drawing.rejected import draw_response, draw_tracks, track_pixels
 from detect.errors import DetectError, FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, beyond_doubt, detect_lines
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.verticals.response import line_response, strip_of
+from detect.viewing_options import CompareOptions
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, Step
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted

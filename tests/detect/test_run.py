@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from camera import Camera, CameraError
 from detect.errors import DetectError, FrameError
-from detect.run import RunFrame, open_run, read_image
+from detect.run import open_run, read_image
+from detect.sources.interface import RunFrame
 from redetect.landmarks import LandmarkFileError, Step
 
 ZEROS = (0.0,) * 9

@@ -23,9 +23,9 @@ from lut import (
     DiscTable,
     TableError,
     build_disc_table,
-    floor_positions,
     ring,
 )
+from lut.outlines import floor_positions
 from redetect.landmarks import read_frames
 from tests.camera.strategies import cameras
 

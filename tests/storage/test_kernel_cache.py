@@ -26,7 +26,7 @@ def of(first, second):
 PROGRAM = """
 import sys
 from functools import cache
-from detect.announcing import on_compilation
+from detect.terminal import on_compilation
 from redetect.storage.exit_codes import exit_code_of
 from kernels import of
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.drawing.rejected import track_pixels
+from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
 from detect.run import open_run, read_image

@@ -442,7 +442,7 @@ def _rendered_lines(command: RenderedLines) -> int:
 
 def _tilt(command: Tilt) -> int:
     from detect.comparison.compare import compare_runs
-    from detect.comparison.result import CompareOptions
+    from detect.viewing_options import CompareOptions
     from redetect.landmarks import read_tilts
 
     options = CompareOptions(gate_m=0.3)

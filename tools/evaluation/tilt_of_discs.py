@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from camera import Camera
 from detect.seen import image_positions
-from detect.sources.image_names import image_name
+from detect.sources.image_files import image_name
 from redetect.landmarks import Frame, read_frames, read_tilts
 from redetect.landmarks.map_file import read_map, read_path
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from camera import CameraError
 from detect.errors import DetectError
-from detect.sources import bag_messages
+from detect.sources import bag as ros_bag
 from detect.sources.bag import Bag, pose_in_dataset, static_transforms
 from detect.sources.poses import step_between
 from tools.fuzz.bag_cells import bag_with_edits
@@ -49,7 +49,7 @@ def _asked_of(path: Path) -> object:
     odometry = bag.poses(None)
     poses = [] if odometry is None else list(odometry.read())
     steps = [step_between("e", *pair) for pair in pairwise(poses)]
-    with bag_messages.opened_bag(path) as reader:
+    with ros_bag.opened_bag(path) as reader:
         transforms = static_transforms(reader, path)
     return images, steps, pose_in_dataset(transforms, "b", "o")
 

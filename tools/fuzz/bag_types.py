@@ -25,9 +25,9 @@ _SETS = 64
 @contextmanager
 def opened_once(path: Path) -> Iterator[None]:
     """Open a bag once for all that asks for it within; what it gives is the same every time."""
-    from detect.sources import bag, bag_messages
+    from detect.sources import bag
 
-    with bag_messages.opened_bag(path) as reader:
+    with bag.opened_bag(path) as reader:
 
         @contextmanager
         def opened(_: Path) -> Iterator[AnyReader]:

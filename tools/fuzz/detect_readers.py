@@ -19,7 +19,7 @@ from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.journal import Journal
 from detect.runs.outputs import is_log
-from detect.sources.bag_messages import pixels_of_message
+from detect.sources.bag import pixels_of_message
 from detect.sources.gray import (
     bounded_content,
     decode_gray,

@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 
 from detect.comparison.compare import Beside, compare_frames, compare_runs
 from detect.comparison.report import format_json
-from detect.comparison.result import CompareError, CompareOptions, DiscComparison, unmet_demands
-from detect.sources.image_names import image_name
+from detect.comparison.result import DiscComparison, unmet_demands
+from detect.errors import CompareError
+from detect.sources.image_files import image_name
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
 from tests.detect.comparison.formatting import format_text
 

@@ -16,9 +16,10 @@ from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.comparison.report import format_json
-from detect.comparison.result import CompareOptions, DiscComparison
+from detect.comparison.result import DiscComparison
 from detect.levelling import levelled
 from detect.seen import Sight, image_positions, level_seen
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

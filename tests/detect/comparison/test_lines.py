@@ -17,7 +17,9 @@ from hypothesis import strategies as st
 
 from detect.comparison.compare import compare_line_frames
 from detect.comparison.report import format_json
-from detect.comparison.result import CompareError, CompareOptions, LineComparison, unmet_demands
+from detect.comparison.result import LineComparison, unmet_demands
+from detect.errors import CompareError
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.cli import main
-from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, read_head, select_frames
 from detect.errors import DetectError
 from detect.run import open_images
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

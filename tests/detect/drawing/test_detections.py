@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.result import CompareOptions
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows
 from detect.seen import Sight
 from detect.settings import CircleSettings
+from detect.viewing_options import CompareOptions
 from lut import ring
 from redetect.landmarks import Frame, Step, circle_landmarks
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.drawing.strokes import canvas_of, draw_curve, draw_text, enlargement, with_legend
+from detect.drawing.frame import canvas_of, draw_curve, draw_text, enlargement, with_legend
 
 WHITE = (255, 255, 255)
 HALF = 127

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from detect.cli import main
-from detect.exports.writers import FRAME_ID, message_definitions, topic_of
+from detect.export import FRAME_ID, message_definitions, topic_of
 from redetect.landmarks import Frame, Landmark, Step, read_frames, read_tilts
 from redetect.landmarks.columns import TABLES, TableName, values_of
 

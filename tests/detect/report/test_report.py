@@ -14,12 +14,13 @@ import pytest
 
 from detect.cli import main
 from detect.comparison.compare import Beside, compare_frames, compare_line_frames, compare_runs
-from detect.comparison.result import CompareOptions, DiscComparison, LineComparison
+from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
-from detect.report.statistics import binned, disc_rates, line_rates, whitened
+from detect.report.figures import binned, disc_rates, line_rates, whitened
 from detect.run import camera_in
 from detect.seen import Sight
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
 from tests.detect.test_cli import assert_refused
 

@@ -15,9 +15,9 @@ import pytest
 
 from camera import Camera
 from detect.errors import WorkerError
-from detect.run import RunFrame
-from detect.runs.dispatch import Chunk, Workers, detect_chunks
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
+from detect.runs.workers import Chunk, Workers, detect_chunks
+from detect.sources.interface import RunFrame
 from redetect.landmarks import Step
 
 

@@ -17,8 +17,9 @@ import pytest
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.run import RunFrame, read_image
+from detect.run import read_image
 from detect.sources.gray import bounded_content, demand_bounded
+from detect.sources.interface import RunFrame
 from redetect.landmarks import Step
 from redetect.storage.image_header import MOST_PIXELS, claimed_size
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from detect.run import RunFrame, open_run
+from detect.run import open_run
 from detect.runs import rows as rows_module
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.journal import Journal, task_digest
@@ -18,6 +18,7 @@ from detect.runs.known import KnownOfFrame
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
 from detect.runs.rows import rows_of_frames
 from detect.settings import PUBLISHED
+from detect.sources.interface import RunFrame
 from redetect.landmarks import FrameTilt
 from redetect.storage.parts import left_part, new_part
 

@@ -14,7 +14,7 @@ import pytest
 
 from detect.cli import main
 from detect.runs.plan import FrameRows, FrameTask
-from detect.runs.run_files import RunFiles
+from detect.runs.stream import RunFiles
 from redetect.storage.parts import PartFile
 from tests.detect.interrupted_runs import (
     FRAMES,

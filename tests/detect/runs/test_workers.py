@@ -24,10 +24,15 @@ from detect.cli import main
 from detect.errors import WorkerError
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.dispatch import Workers
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
-from detect.runs.workers import FRAMES_PER_PROCESS, cluster_workers, default_jobs, local_workers
+from detect.runs.workers import (
+    FRAMES_PER_PROCESS,
+    Workers,
+    cluster_workers,
+    default_jobs,
+    local_workers,
+)
 from detect.settings import CircleSettings
 
 KINDS = ("lines", "tilt", "circles")

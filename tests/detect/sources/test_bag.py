@@ -19,11 +19,11 @@ pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 from camera import Camera, write_camera
 from detect.cli import main
 from detect.errors import DetectError, FrameError
+from detect.options import SourceOptions
 from detect.run import read_image
-from detect.sources.bag_messages import pixels_of_message
+from detect.sources.bag import pixels_of_message
 from detect.sources.gray import gray_of_pixels
 from detect.sources.opening import open_source
-from detect.sources.options import SourceOptions
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said

@@ -18,10 +18,10 @@ from camera.formats.models import ForeignCamera
 from camera.formats.ros import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
+from detect.options import SourceOptions
 from detect.run import Run
 from detect.sources.bag import pose_in_dataset, rotation_of
 from detect.sources.opening import open_calibrated, open_source
-from detect.sources.options import SourceOptions
 from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said
 

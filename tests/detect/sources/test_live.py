@@ -15,10 +15,10 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.cli import main
+from detect.options import SourceOptions
 from detect.run import read_image
-from detect.sources import live
+from detect.sources import video as live
 from detect.sources.opening import open_source
-from detect.sources.options import SourceOptions
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
 from tests.detect.recordings import write_video

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.errors import FrameError
-from detect.sources.image_names import ImageNames, NameIndex
+from detect.sources.image_files import ImageNames, NameIndex
 
 # Short alphabets make names that begin alike; long names are known by their digest.
 NAMES = st.lists(

@@ -13,9 +13,9 @@ import pytest
 from camera import Camera
 from detect.cli import main
 from detect.errors import DetectError
+from detect.options import SourceOptions
 from detect.run import Run, read_image
 from detect.sources.opening import open_calibrated, open_source
-from detect.sources.options import SourceOptions
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
 from tests.detect.recordings import write_video

@@ -19,17 +19,22 @@ from hypothesis import strategies as st
 
 from detect.cli import main
 from detect.comparison.compare import compare_runs
-from detect.comparison.result import CompareOptions
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
+from detect.report.parts import f1_score, knee, pareto_front
 from detect.run import open_run
-from detect.runs.dispatch import Workers
 from detect.runs.plan import FramePlan
-from detect.runs.workers import local_workers
+from detect.runs.workers import Workers, local_workers
 from detect.settings import CircleSettings
-from detect.tune.grid import combinations, parameter_values
-from detect.tune.run import Trial, tune_run
-from detect.tune.table import curve_picture, f1_score, knee, pareto_front, trial_records
+from detect.tune import (
+    Trial,
+    combinations,
+    curve_picture,
+    parameter_values,
+    trial_records,
+    tune_run,
+)
+from detect.viewing_options import CompareOptions
 from redetect.landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.test_cli import assert_refused

@@ -1,4 +1,4 @@
-"""The images of a folder, and which of them belongs to a step: never one outside the run.
+"""Image files as a source, and which of them belongs to a step: never one outside the run.
 
 A run may have a million frames: the memory per frame is the name of its image, twice, and 4 bytes.
 """
@@ -9,13 +9,18 @@ import fnmatch
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.errors import DetectError, FrameError
+from detect.sources.gray import significant_bits_of_file
+from detect.sources.interface import RunFrame, Source, frame_prefix, only_calibration, still
+from detect.sources.times import read_image_times
+from redetect.landmarks import Step, read_steps
 from redetect.storage.inside import leads_out, link_out
 from redetect.storage.messages import excerpt
 
@@ -152,3 +157,103 @@ def _natural_order(name: str) -> str:
         return f"\0{chr(1 + len(digits))}{digits}"
 
     return f"{name[0].isdigit():d}{re.sub('[0-9]+', by_value, name)}"
+
+
+WILDCARDS = frozenset("*?[")
+
+# Number of images, spread over all, that determine the significant bits.
+_SAMPLES = 5
+
+
+class RunFrames:
+    """The frames of a run folder: in the order of the odometry, or of names."""
+
+    ships_images = False
+    why_left_out = "images are not named by a STEP row: left out"
+
+    def __init__(
+        self, images: ImageNames, odometry: Path | None, expected: int, left_out: int, bits: int
+    ) -> None:
+        self._images, self._odometry, self._bits = images, odometry, bits
+        self.expected, self.left_out = expected, left_out
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        if self._odometry is None:
+            for place in range(len(self._images)):
+                yield self._frame(_standing_still(self._images.path(place).stem), place)
+        else:
+            for step in read_steps(self._odometry):
+                yield self._frame(step)
+
+    def _frame(self, step: Step, place: int | None = None) -> RunFrame:
+        try:
+            found = self._images.place_of(step.prefix) if place is None else place
+            image = None if found is None else self._images.checked(found)
+            return RunFrame(step, image, bits=self._bits)
+        except FrameError as error:
+            return RunFrame(step, None, failure=str(error))
+
+
+def _standing_still(prefix: str) -> Step:
+    # What would part the word, begin a comment or continue the row.
+    return still(re.sub(r"\s|\A#|\\\Z", "_", prefix))
+
+
+class ImageFiles(Source):
+    """Images in natural order of their names.
+
+    Calibration and times (``<folder>.times``, if not named) are in the run's folder, and results
+    are written there: the folder of the images, or the one above ``images/``. 16-bit images have
+    the significant bits that some of them need, if not named.
+    """
+
+    ships_images = False
+    times_own = False
+
+    def __init__(self, name: Path, times: str = "", bits: int | None = None) -> None:
+        self.name = str(name)
+        if name.is_dir():
+            self._names, self._home = images_of_folder(name), name
+        else:
+            self._names, self._home = _matching_images(name), name.parent
+            if name.parent.resolve().name == "images":
+                self._home = name.parent.parent
+        self.output_base = self._home / "detected"
+        self.expected = len(self._names)
+        times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
+        self._times = read_image_times(times_file) if times or times_file.is_file() else {}
+        self.has_times = bool(times) or times_file.is_file()
+        self._bits = bits_of_images(self._names) if bits is None else bits
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        for place in range(len(self._names)):
+            path = self._names.path(place)
+            step = still(frame_prefix(path.stem))
+            yield RunFrame(step, path, time_s=self._times.get(path.stem), bits=self._bits)
+
+    def calibration(self, *, posed: bool) -> Camera | None:
+        """The ``.cam`` file in the run's folder."""
+        return only_calibration(self._home, self._home.resolve().name)
+
+
+def bits_of_images(names: ImageNames) -> int:
+    """Significant bits of 16-bit images: what some, spread over all, need; 16 if there are none."""
+    last = len(names) - 1
+    places = {round(k * last / (_SAMPLES - 1)) for k in range(_SAMPLES)}
+    found = [significant_bits_of_file(names.path(place)) for place in places if last >= 0]
+    return max((bits for bits in found if bits is not None), default=16)
+
+
+def _matching_images(pattern: Path) -> ImageNames:
+    """The images that a pattern matches, or one image."""
+    if WILDCARDS & set(str(pattern.parent)):
+        raise DetectError(
+            f"{pattern}: wildcards in the folder's name: expected them in the last part only"
+        )
+    if not pattern.parent.is_dir():
+        raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
+    found = ImageNames(pattern.parent, pattern.name)
+    if not len(found):
+        kinds = " ".join(sorted(IMAGE_SUFFIXES))
+        raise DetectError(f"{pattern}: no image matches: expected {kinds}")
+    return found

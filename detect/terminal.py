@@ -1,10 +1,16 @@
-"""Progress of a long run on a terminal."""
+"""What the terminal shows of long work: announcements, progress, failures.
+
+Compilation of kernels and computation of tables are announced through the logger ``redetect``, so
+that a program that uses the detectors decides who hears it; the command line shows it on stderr.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 
 from rich.console import Console
 from rich.progress import (
@@ -15,6 +21,40 @@ from rich.progress import (
 )
 
 from detect.interrupts import raise_if_interrupted
+
+_log = logging.getLogger("redetect")
+
+
+def show_announcements() -> None:
+    """Show announcements on stderr."""
+    _log.setLevel(logging.INFO)
+    _log.handlers = [logging.StreamHandler()]
+
+
+def announcements_are_shown() -> bool:
+    """Whether announcements go to stderr."""
+    return bool(_log.handlers)
+
+
+@cache
+def say_compiling() -> None:
+    """Announce, once, that kernels are compiled."""
+    _log.info("compiling kernels, once: about a minute")
+
+
+def on_compilation(call: Callable[[], object]) -> None:
+    """Have something called before this process compiles a kernel."""
+    from numba.core import event
+
+    class Compilation(event.Listener):
+        def on_start(self, _: object) -> None:
+            call()
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    event.register("numba:compile", Compilation())
+
 
 _SHOWN_FAILURES = 10
 

@@ -1,20 +1,20 @@
-"""Tables in other programs' formats: CSV, Parquet, and messages of ROS 2 in an MCAP file.
+"""The command ``detect export``: rows in other programs' formats.
 
-CSV is comma separated, with a line of names at the top, numbers as Python prints them: the shortest
-text that gives the same float64; unknown values are empty; several identifiers are separated by
-blanks. Columns of Parquet (package ``pyarrow``) have units and descriptions. MCAP (package
+CSV has a line of names at the top, the shortest numbers that give the same float64, empty cells for
+unknown values. Columns of Parquet (package ``pyarrow``) have units and descriptions. MCAP (package
 ``rosbags``; no ROS is needed) has a message for each frame and table; the messages' definitions
-follow from the tables' columns (`message_definitions`) and are in the file, so that readers need
-none of this project's.
+follow from the tables' columns (`message_definitions`) and are in the file.
 """
 
 from __future__ import annotations
 
 import codecs
 import csv
+import math
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -22,12 +22,87 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
+from detect.sources.times import read_image_times
+from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
+from redetect.storage import OutputExistsError, write_whole
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+# Which table a file of a kind has rows of, even where there are none.
+_TABLES: dict[str, TableName] = {
+    ".circles": "circles",
+    ".lines": "lines",
+    ".markers": "markers",
+    ".tilt": "tilts",
+    ".txt": "steps",
+}
+
+
+def perform(command: Export) -> int:
+    """Export a file; returns the exit code."""
+    file, to, rate_hz = command.file, command.to, command.rate_hz
+    if file.is_dir():
+        kinds = _TABLES.keys() - {".txt"}
+        found = sorted(path.name for path in file.iterdir() if path.suffix in kinds)
+        such = f", such as {', '.join(found)} in it" if found else ""
+        raise DetectError(
+            f"{file}: is a folder: expected a .circles, .lines, .markers or .tilt file{such}"
+        )
+    if file.suffix == ".cam":
+        raise DetectError(
+            f"{file}: is a calibration, not rows: camera convert {file} "
+            "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
+        )
+    if rate_hz is not None and not 0.0 < rate_hz < math.inf:
+        raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
+    if to == "parquet":
+        demand_pyarrow()
+    rows = partial(table_rows, file, _times(command), rate_hz)
+    named = [_TABLES[file.suffix]] if file.suffix in _TABLES else []
+    tables = list(dict.fromkeys([*named, *sorted({row.table for row in rows()})]))
+    if not tables:
+        raise DetectError(f"{file}: no rows in it: expected STEP, LANDMARK or TILT rows")
+    output = command.output or file.with_name(f"{file.name}.{to}")
+    places = {tables[0]: output} if to == "mcap" else _table_files(output, tables)
+    for path in places.values():
+        if path.exists() and path.samefile(file):
+            raise DetectError(f"{path}: is the file to export: expected another output")
+        if path.exists() and not command.force:
+            raise OutputExistsError(path)
+    for table, path in places.items():
+        with write_whole(path, overwrite=command.force) as stream:
+            if to == "mcap":
+                count = write_mcap(stream, tables, rows(), str(file))
+            elif to == "csv":
+                count = write_csv(stream, table, rows())
+            else:
+                count = write_parquet(stream, table, rows(), file.name)
+        print(f"{path}: {count} {'messages' if to == 'mcap' else 'rows'}")
+    return 0
+
+
+def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
+    """The file of each table: the first but steps goes to `output`, others beside it."""
+    first, *others = sorted(tables, key=lambda table: table == "steps")
+    beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
+    return {first: output, **beside}
+
+
+def _times(command: Export) -> dict[str, float] | None:
+    if command.times is not None:
+        return read_image_times(command.times)
+    if command.rate_hz is not None:
+        return None
+    for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
+        beside = command.file.with_name(name)
+        if beside.is_file():
+            return read_image_times(beside)
+    return None
+
 
 #: The robot frame of the data set, X left and Y backward: not ROS's base_link.
 FRAME_ID = "robot_left_backward"

@@ -1,0 +1,294 @@
+"""The command ``detect tune``: settings over a grid, each compared with the same reference rows."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from decimal import Decimal, InvalidOperation
+from itertools import chain, islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect import __version__
+from detect.comparison.compare import compare_frames, compare_line_frames
+from detect.comparison.result import DiscComparison, LineComparison
+from detect.drawing.inputs import select_frames
+from detect.errors import EXIT_FRAMES_FAILED, DetectError
+from detect.line_settings import PRESETS, LineSettings
+from detect.report.parts import draw_rates, f1_score, figure_file, knee, pareto_front
+from detect.run import Run
+from detect.runs.known import ByPrefix, FramesByImage, Known
+from detect.runs.plan import FramePlan, FrameTask
+from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
+from detect.settings import PUBLISHED, CircleSettings, parameter_value
+from detect.sources.interface import RunFrame
+from detect.sources.opening import demand_recording, open_calibrated
+from detect.terminal import print_failures, progress_bar
+from detect.viewing_options import CompareOptions, Tune
+from redetect.landmarks import (
+    Frame,
+    FrameTilt,
+    LandmarkFileError,
+    frames_of_rows,
+    parse_rows,
+    read_tilts,
+)
+from redetect.storage import OutputExistsError, write_whole
+
+
+def perform(options: Tune) -> int:
+    """Carry the command out; returns the exit code."""
+    base: Settings = PUBLISHED if options.preset == "published" else CircleSettings()
+    if options.verticals:
+        base = PRESETS[options.preset]
+    varied = {name: text for name, text in vars(options.grid).items() if text is not None}
+    grid = combinations(type(base), varied, options.most)
+    settings = [replace(base, **combination) for combination in grid]
+    if options.verticals and options.tilt is not None:
+        raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
+
+    demand_recording(options.run)
+    run = open_calibrated(options.run, options.camera, options.source)
+    output = run.output("tune") if options.output is None else options.output
+    outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}
+    for path in outputs.values():
+        if path.exists() and not options.force:
+            raise OutputExistsError(path)
+    path = options.reference or run.folder / ("map.lines" if options.verticals else "map.circles")
+    if not path.is_file():
+        raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
+    reference = FramesByImage(path)
+    _, selection = select_frames(run.frames, options.frames, options.every)
+    chosen = [
+        frame for _, frame in selection if frame.image is not None or frame.content is not None
+    ]
+    wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
+    frames = [(frame, rows) for frame, rows in wanted if rows is not None]
+    if not frames:
+        raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
+
+    gates = CompareOptions(**vars(options.gates), only_identified=options.only_identified)
+    count = len(grid) * len(frames)
+    workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
+    tilts = None if options.tilt is None else read_tilts(options.tilt)
+    with progress_bar("trials", count) as advance:
+        trials = list(
+            tune_run(run, frames, settings, gates, workers, tilts=tilts, on_progress=advance)
+        )
+    records = trial_records(grid, trials, "deg" if options.verticals else "m")
+    head = {
+        "version": __version__,
+        "run": run.name,
+        "reference": path.name,
+        "frames": [frame.step.prefix for frame, _ in frames],
+        "gate": asdict(gates),
+        "camera": run.camera.content_hash,
+        "settings": {name: _plain(value) for name, value in asdict(base).items()},
+        "varied": varied,
+    }
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(records[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**r, "front": int(r["front"]), "knee": int(r["knee"])} for r in records)
+    document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
+    title = f"{len(grid)} settings on {len(frames)} frames of {run.name}"
+    contents = {
+        "table.csv": table.getvalue().encode(),
+        "table.json": f"{document}\n".encode(),
+        "curve.png": curve_picture(grid, trials, title),
+    }
+    output.mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        with write_whole(outputs[name], overwrite=options.force) as stream:
+            stream.write(content)
+    print(f"{output}: {title}: {', '.join(contents)}")
+    for record in records:
+        if record["knee"]:
+            values = " ".join(f"--{name.replace('_', '-')} {record[name]}" for name in varied)
+            print(
+                f"knee: {values}: recall {record['recall']:.3f}, "
+                f"precision {record['precision']:.3f}"
+            )
+    failures = sorted({failure for trial in trials for failure in trial.failures})
+    print_failures(len(failures), failures)
+    return EXIT_FRAMES_FAILED if failures else 0
+
+
+def _plain(value: Any) -> Any:
+    """A setting for JSON: what it does not have (infinity, tuples) as words."""
+    plain = isinstance(value, bool | int | str) or (
+        isinstance(value, float) and math.isfinite(value)
+    )
+    return value if plain else str(value)
+
+
+#: The value of each parameter that is varied.
+Combination = dict[str, Any]
+
+
+def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
+    """The values of a parameter that are to be tried, each once.
+
+    `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
+    of `parameter_value`.
+    """
+    words = text.split(",")
+    if ":" in text:
+        expected = f"{name} is {text!r}: expected FROM:TO:STEP with a step above 0, TO not below"
+        try:
+            # Decimal numbers: 0.3 and twice 0.1 are 0.5, and its digits are those of a file.
+            first, last, step = (Decimal(part.strip()) for part in text.split(":"))
+            if not (last - first).is_finite() or step <= 0 or not 0 <= (last - first) / step <= 1e5:
+                raise ValueError
+            words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
+        except (InvalidOperation, ValueError):
+            raise DetectError(expected) from None
+    return tuple(dict.fromkeys(parameter_value(kind, name, word.strip()) for word in words))
+
+
+def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
+    """All combinations of the values of parameters, written as for `parameter_values`.
+
+    Each has the names and values in the order of `varied`; the last varies fastest. Raises
+    DetectError if nothing is varied, there are more than `most`, or as `parameter_values` does.
+    """
+    if not varied:
+        raise DetectError(
+            "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
+        )
+    values = {name: parameter_values(kind, name, text) for name, text in varied.items()}
+    count = math.prod(len(v) for v in values.values())
+    if count > most:
+        raise DetectError(f"the grid has {count} combinations: expected at most {most} (--most)")
+    return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
+
+
+Settings = CircleSettings | LineSettings
+FloatArray = NDArray[np.float64]
+
+# Largest number of points that are labelled.
+_MOST_NAMED = 12
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Result of one setting, as in `detect.comparison.result.Comparison`.
+
+    `matched` are the reference rows that were found. The median error is in metres (discs) or
+    degrees (verticals), the normalised one squared per degree of freedom. Frames in `failures`
+    could not be worked on: they count as frames without detections.
+    """
+
+    reference: int
+    detected: int
+    matched: int
+    recall: float | None
+    precision: float | None
+    error_median: float | None
+    normalised_error: float | None
+    failures: tuple[str, ...] = ()
+
+
+def tune_run(
+    run: Run,
+    frames: Sequence[tuple[RunFrame, Frame]],
+    settings: Sequence[Settings],
+    options: CompareOptions,
+    workers: Workers,
+    *,
+    tilts: ByPrefix[FrameTilt] | None = None,
+    on_progress: Callable[[], None] | None = None,
+) -> Iterator[Trial]:
+    """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
+
+    `frames` come with their reference rows; `tilts`, by image prefix, correct positions of discs.
+    `on_progress` is called after every frame of every setting.
+    """
+    kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
+    changes: list[dict[str, Any]] = [{kind: each} for each in settings]
+    plans = [FramePlan(run.camera, **change) for change in changes]
+    known = Known(tilts=tilts)
+    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
+    reference = [rows for _, rows in frames]
+    work = (task._replace(plan=plan) for plan in plans for task in tasks)
+    with closing(detect_chunks(work, plans[0], workers)) as chunks:
+        done = chain.from_iterable(chunks)
+        for _ in plans:
+            found: list[Frame] = []
+            failures: list[str] = []
+            for _, each in islice(done, len(tasks)):
+                found += frames_of_rows(
+                    parse_rows(io.BytesIO(each.rows[kind].encode("utf-8", "surrogateescape")))
+                )
+                failures += [] if each.error is None else [each.error]
+                if on_progress is not None:
+                    on_progress()
+            result: DiscComparison | LineComparison
+            if kind == "circles":
+                discs = compare_frames(reference, found, options)
+                result, error_median = discs, discs.error_median_m
+            else:
+                lines = compare_line_frames(reference, found, options)
+                result, error_median = lines, lines.bearing_median_deg
+            yield Trial(
+                result.reference, result.detected, result.found, result.recall, result.precision,
+                error_median, result.normalised_error.per_dof, tuple(failures),
+            )  # fmt: skip
+
+
+def trial_records(
+    combinations: Sequence[Combination], trials: Sequence[Trial], unit: str
+) -> list[dict[str, Any]]:
+    """One record for each trial: the parameters, then the figures; `unit` is that of the errors."""
+    recall, precision = _rates(trials)
+    f1 = f1_score(recall, precision)
+    front, best = pareto_front(recall, precision), knee(recall, precision)
+    return [
+        {
+            **combination,
+            "reference": trial.reference,
+            "detected": trial.detected,
+            "matched": trial.matched,
+            "recall": _rounded(trial.recall),
+            "precision": _rounded(trial.precision),
+            "f1": _rounded(float(f1[k]) if np.isfinite(f1[k]) else None),
+            f"error_median_{unit}": _rounded(trial.error_median),
+            "normalised_error": _rounded(trial.normalised_error),
+            "front": k in front,
+            "knee": k == best,
+        }
+        for k, (combination, trial) in enumerate(zip(combinations, trials))
+    ]
+
+
+def curve_picture(
+    combinations: Sequence[Combination], trials: Sequence[Trial], title: str
+) -> bytes:
+    """Precision over recall as a PNG file: all trials, their front, and the knee."""
+    with figure_file((6.4, 6.2), "png") as (figure, content):
+        axes = figure.subplots()
+        names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
+        draw_rates(axes, *_rates(trials), names, _MOST_NAMED)
+        axes.margins(0.15)
+        axes.set_title(title, fontsize=10)
+        figure.legend(loc="outside lower center", fontsize=8, ncols=1)
+    return content.getvalue()
+
+
+def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
+    """(N,) recall and precision, NaN where there is none."""
+    rates = np.array([(t.recall, t.precision) for t in trials], np.float64).reshape(-1, 2)
+    return rates[:, 0], rates[:, 1]
+
+
+def _rounded(value: float | None) -> float | None:
+    """Six significant digits, as in the files of rows."""
+    return None if value is None else float(f"{value:.6g}")

@@ -1,1 +1,0 @@
-"""Settings tried over a grid, and what precision and recall they give."""
