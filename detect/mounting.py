@@ -81,31 +81,16 @@ def perform(options: Level) -> int:
 
 @dataclass(frozen=True)
 class Mounting:
-    """How a camera is mounted, compared with its calibration.
+    """How a camera is mounted, compared with its calibration."""
 
-    Attributes
-    ----------
-    pitch_rad, roll_rad : float
-        Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
-        level.
-    pitch_sigma_rad, roll_sigma_rad : float
-        Standard deviations, that of the lens included.
-    raised_m, raised_sigma_m : float
-        How much higher the camera is than calibrated; NaN if there are too few discs.
-    frames : int
-        Frames whose verticals have a tilt.
-    frames_with_discs : int
-        Those of them whose discs contribute to the height.
-    """
-
-    pitch_rad: float
+    pitch_rad: float  # rotation vector (pitch, roll, 0) that turns measured directions level
     roll_rad: float
-    pitch_sigma_rad: float
+    pitch_sigma_rad: float  # standard deviations, that of the lens included
     roll_sigma_rad: float
-    raised_m: float
+    raised_m: float  # higher than calibrated; NaN if there are too few discs
     raised_sigma_m: float
-    frames: int
-    frames_with_discs: int
+    frames: int  # that have a tilt by verticals
+    frames_with_discs: int  # those of them that contribute to the height
 
     def sentences(self) -> list[str]:
         """The result in words."""
@@ -128,22 +113,11 @@ class Mounting:
 def mounting_of_run(
     height_m: float, verticals: FrameTilts, outline_pitch_rad: FloatArray
 ) -> Mounting | None:
-    """The mounting that a run shows.
+    """The mounting that a run shows; None where too few frames have a tilt by verticals.
 
-    Parameters
-    ----------
-    height_m : float
-        Calibrated height of the camera.
-    verticals : FrameTilts
-        Tilts of N frames by their verticals.
-    outline_pitch_rad : (N, 3) float64
-        Pitch by the outlines of the discs, the height changed by each of `HEIGHT_STEPS`; NaN where
-        no outlines are.
-
-    Returns
-    -------
-    Mounting or None
-        None where too few frames have a tilt by verticals (`detect.run_tilt.LEAST_FRAMES`).
+    `height_m` is the calibrated height of the camera, `verticals` has the tilts of N frames, and
+    `outline_pitch_rad` (N, 3) the pitch by the outlines of discs, the height changed by each of
+    `HEIGHT_STEPS`; NaN where no outlines are.
     """
     run = tilt_of_run(verticals)
     if run is None:

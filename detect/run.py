@@ -29,26 +29,13 @@ from redetect.landmarks import read_steps
 
 @dataclass(frozen=True)
 class ImageRun:
-    """A run whose files were found and read, with or without a calibration.
+    """A run whose files were found and read, with or without a calibration."""
 
-    Attributes
-    ----------
-    folder : path
-        The run folder; of another source the folder that it is in.
-    frames : Frames
-    odometry : path or None
-        Where the STEP rows come from.
-    output_base : path
-        Results are called this, with an ending of their own.
-    has_times : bool
-        Whether the frames' times are known and written beside the results.
-    """
-
-    folder: Path
+    folder: Path  # of another source the folder that it is in
     frames: Frames
-    odometry: Path | None
-    output_base: Path
-    has_times: bool = False
+    odometry: Path | None  # where the STEP rows come from
+    output_base: Path  # results are called this, with an ending of their own
+    has_times: bool = False  # whether frames' times are known, and written beside the results
 
     @property
     def name(self) -> str:

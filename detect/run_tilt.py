@@ -76,37 +76,20 @@ def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
 
 @dataclass(frozen=True, eq=False)
 class AxisModel:
-    """Estimated model of one axis.
+    """Estimated model of one axis."""
 
-    Attributes
-    ----------
-    lean, lean_sigma : float
-        The constant, and its standard deviation (rad).
-    spread : float
-        Standard deviation of true tilts about it (rad).
-    """
-
-    lean: float
-    lean_sigma: float
-    spread: float
+    lean: float  # the constant (rad)
+    lean_sigma: float  # its standard deviation (rad)
+    spread: float  # standard deviation of true tilts about it (rad)
 
 
 @dataclass(frozen=True, eq=False)
 class RunTilt:
-    """The tilt of all frames of a run.
+    """The tilt of all frames of a run."""
 
-    Attributes
-    ----------
-    axes : (AxisModel, AxisModel)
-        Pitch and roll.
-    tilt : (N, 2) float64
-        Pitch and roll of each frame (rad).
-    variance : (N, 2) float64
-        Of them (rad^2), the constant's included; the two axes are assumed to be independent.
-    """
-
-    axes: tuple[AxisModel, AxisModel]
-    tilt: FloatArray
+    axes: tuple[AxisModel, AxisModel]  # pitch and roll
+    tilt: FloatArray  # (N, 2) pitch and roll of each frame (rad)
+    #: (N, 2) of them (rad^2), the constant's included; the axes are assumed to be independent
     variance: FloatArray
 
     def sentence(self) -> str:
@@ -122,19 +105,10 @@ class RunTilt:
 
 
 def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> RunTilt | None:
-    """The tilt of a run's frames from what each of them shows.
+    """The tilt of a run from that of each frame, in their order.
 
-    Parameters
-    ----------
-    verticals : FrameTilts
-        By the verticals of each frame, in the frames' order.
-    outlines : FrameTilts, optional
-        By the outlines of its discs.
-
-    Returns
-    -------
-    RunTilt or None
-        None if fewer than `LEAST_FRAMES` frames have a tilt by verticals.
+    By the verticals of each frame and, optionally, by the outlines of its discs; None if fewer than
+    `LEAST_FRAMES` frames have a tilt by verticals.
     """
     if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None
@@ -300,21 +274,9 @@ def smooth_axis(
     frame's measurement may be an outlier or a jump of the robot; the mean and the
     variance are those of the mixture.
 
-    Parameters
-    ----------
-    deviation : (N,) float64
-        Measured angles less the constant lean (rad); NaN where there is none.
-    sigma : (N,) float64
-        Their standard deviations (rad).
-    spread : float
-        Standard deviation of x (rad).
-
-    Returns
-    -------
-    log_likelihood : float
-        Of the measurements.
-    mean, variance : (N,) float64
-        Of the deviations given all frames (rad, rad^2).
+    Of (N,) measured angles less the lean (rad; NaN where there is none), their standard deviations
+    and that of x, returns the log-likelihood of the measurements, and the (N,) means and variances
+    of the deviations given all frames (rad, rad^2).
     """
     count = len(deviation)
     # Filtered and predicted: means of x and u, variances of both and their covariance.

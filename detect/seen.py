@@ -27,12 +27,11 @@ def image_positions(
     Parameters
     ----------
     camera : Camera
-        The camera as calibrated on the level robot.
+        As calibrated on the level robot.
     floor_xy : (..., 2) array_like
         Robot X and Y, metres.
     levelled_by : (float, float), optional
-        Pitch and roll (rad) that turned the positions level
-        (`redetect.landmarks.Frame.levelled_by`).
+        Pitch and roll (rad) that turned the positions level.
     raised_m : float
         How much higher the camera is than calibrated, metres.
     """
@@ -47,21 +46,11 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level positions of discs that the calibrated camera sees on the floor.
+    """Level positions (m) of discs that the calibrated camera sees on the floor.
 
-    Parameters
-    ----------
-    camera, raised_m
-        As in `image_positions`.
-    floor_xy : (N, 2) or (M, N, 2) array_like
-        Positions computed without knowledge of the tilt, metres.
-    levelled_by : (2,) or (M, 2) array_like
-        Pitch and roll (rad).
-
-    Returns
-    -------
-    (N, 2) or (M, N, 2) float64
-        Metres; NaN where the levelled ray does not meet the floor.
+    Of positions (N, 2) or (M, N, 2) that were computed without knowledge of the tilt, levelled by
+    (2,) or (M, 2) pitch and roll (rad); the rest as in `image_positions`. NaN where the levelled
+    ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)

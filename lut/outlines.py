@@ -115,21 +115,13 @@ class CentreGroups(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DiscTable:
-    """The centres that are tested, and the pixels of their outlines; compared by identity.
+    """The centres that are tested, and the pixels of their outlines; compared by identity."""
 
-    Attributes
-    ----------
-    samples : (N, K, 2) uint32
-        Index in scan order of the pixel of the inner and of the outer sample in each direction,
-        every second direction first; H * W outside the image, or where it does not count.
-    pixels : (N, 2) int32
-        Pixel (u, v) of each centre, in scan order.
-    floor_xy : (H, W, 2) float32
-        Floor position (robot X, Y in metres) that each pixel sees; NaN above the horizon.
-    """
-
+    #: (N, K, 2) index in scan order of the pixel of the inner and of the outer sample in each
+    #: direction, every second direction first; H * W outside the image, or where it does not count
     samples: NDArray[np.uint32]
-    pixels: NDArray[np.int32]
+    pixels: NDArray[np.int32]  # (N, 2) pixel (u, v) of each centre, in scan order
+    #: (H, W, 2) floor position (robot X, Y, m) that each pixel sees; NaN above the horizon
     floor_xy: NDArray[np.float32]
 
     @cached_property
@@ -161,22 +153,8 @@ def floor_positions(camera: Camera) -> FloatArray:
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """Compute the outlines' pixels around the centres that are tested.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    shape : DiscShape
-        Outlines and limits.
-
-    Returns
-    -------
-    DiscTable
-        A camera that sees no usable floor (looking up, say) gets a table without centres.
-
-    Raises
-    ------
-    TableError
-        If the camera is not above the floor.
+    A camera that sees no usable floor (looking up, say) gets a table without centres; one that is
+    not above the floor raises a TableError.
     """
     if not camera.centre[2] > 0.0:
         raise TableError(

@@ -36,39 +36,24 @@ _LARGEST_ELEVATION = math.radians(45.0)
 
 @dataclass(frozen=True, eq=False)
 class VerticalTable:
-    """The anchor and the verticals of a calibration; hashed and compared by identity.
+    """The anchor and the verticals of a calibration; hashed and compared by identity."""
 
-    Attributes
-    ----------
-    anchor_elevation_rad : float
-        Elevation of the anchor: 0 where that is the horizon.
-    anchor_row : (W,) float64
-        Row at which the anchor crosses each column; NaN where it does so outside the image or not
-        at all.
-    bearing_rad : (W,) float64
-        Bearing of that point, 0 forward, positive to the left; NaN as above.
-    first_row, last_row : (W,) int32
-        Rows over which the vertical through it is seen without a break, inside the image and within
-        45 deg of the image's vertical; ``first_row > last_row`` where there are none.
-    column : (H, W) float32
-        Column at which the vertical named by its second index crosses each row; NaN outside those
-        rows. In Fortran order, so that following a vertical reads memory in sequence.
-    elevation_tan : (H, W) float32
-        Tangent of the elevation above the horizon at which it does so; NaN as `column`.
-    robot_from_camera : (3, 3) float64
-        Rotation camera -> robot.
-    row_aspect : float
-        Height of a row in widths of a column (2 for single fields of interlaced frames).
-    """
-
-    anchor_elevation_rad: float
+    anchor_elevation_rad: float  # elevation of the anchor: 0 where that is the horizon
+    #: (W,) row at which the anchor crosses each column; NaN where not inside the image
     anchor_row: NDArray[np.float64]
+    #: (W,) bearing of that point, positive to the left; NaN as above
     bearing_rad: NDArray[np.float64]
+    #: (W,) rows over which the vertical through it is seen without a break, inside the image and
+    #: within 45 deg of the image's vertical; first > last where there are none
     first_row: NDArray[np.int32]
     last_row: NDArray[np.int32]
+    #: (H, W) column at which the vertical named by the second index crosses each row; NaN outside
+    #: those rows. In Fortran order, so that following a vertical reads memory in sequence.
     column: NDArray[np.float32]
+    #: (H, W) tangent of the elevation at which it does so; NaN as `column`
     elevation_tan: NDArray[np.float32]
-    robot_from_camera: NDArray[np.float64]
+    robot_from_camera: NDArray[np.float64]  # (3, 3) rotation
+    #: height of a row in widths of a column (2 for single fields of interlaced frames)
     row_aspect: float
 
     @property
@@ -78,18 +63,10 @@ class VerticalTable:
 
 
 def build_vertical_table(camera: Camera) -> VerticalTable:
-    """Compute the anchor and the verticals through it.
+    """Compute the anchor and the verticals through it, for a calibrated camera in any pose.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera, in any pose.
-
-    Returns
-    -------
-    VerticalTable
-        Columns whose anchor lies outside the image have no vertical; a camera that looks more than
-        45 deg past the horizon gets a table without verticals.
+    Columns whose anchor lies outside the image have no vertical; a camera that looks more than 45
+    deg past the horizon gets a table without verticals.
     """
     height, width = camera.height, camera.width
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
@@ -142,22 +119,11 @@ def _anchor(camera: Camera, normalised: NDArray[np.float64]) -> tuple[float, NDA
 def anchor_rows(
     camera: Camera, normalised: NDArray[np.float64], elevation_rad: float
 ) -> NDArray[np.float64]:
-    """Row at which a line of constant elevation crosses each column.
+    """(W,) rows at which a line of constant elevation (0: the horizon) crosses each column.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    normalised : (H, W, 2) float64
-        `camera.undistort` of all pixels.
-    elevation_rad : float
-        0 for the horizon.
-
-    Returns
-    -------
-    (W,) float64
-        NaN where the line does not cross the column inside the image; where it does so more than
-        once (a camera rolled far over), the crossing nearest to the image's middle row.
+    `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN where the line does not cross
+    the column inside the image; where it does so more than once (a camera rolled far over), the
+    crossing nearest to the image's middle row.
     """
     height, width = camera.height, camera.width
     above = _above(camera, normalised, math.sin(elevation_rad))

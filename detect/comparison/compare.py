@@ -114,8 +114,7 @@ def compare_runs(
     redetect.landmarks.LandmarkFileError
         If a file cannot be read.
     CompareError
-        If an image has two frames in a file, or a covariance that is needed is not positive
-        definite.
+        If an image has two frames in a file, or a covariance is needed and not positive definite.
     """
     reference = Path(run) / "map.circles" if reference is None else reference
     detected = Path(run) / "detected.circles" if detected is None else detected

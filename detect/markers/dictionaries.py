@@ -45,40 +45,19 @@ _CELL_PX, _MARGIN_PX = 5, 20
 
 @dataclass(frozen=True, eq=False)
 class MarkerDictionary:
-    """A set of markers.
-
-    Attributes
-    ----------
-    name : str
-        As in `dictionary_names`.
-    ids : (N,) int64
-        The markers' numbers.
-    patterns : (N, G, G) bool
-        The cells of the sampled grid, True for white; row 0 is the marker's top.
-    centres : (G,) float64
-        Where the grid's columns (and rows) have their centres, in widths of the marker from its
-        left (upper) edge.
-    cell : float
-        Width of a cell, in widths of the marker.
-    """
+    """A set of markers; its name is one of `dictionary_names`."""
 
     name: str
-    ids: NDArray[np.int64]
-    patterns: NDArray[np.bool_]
-    centres: FloatArray
-    cell: float
+    ids: NDArray[np.int64]  # (N,)
+    patterns: NDArray[np.bool_]  # (N, G, G) cells, True for white; row 0 is the marker's top
+    centres: FloatArray  # (G,) where columns and rows have their centres, in widths of the marker
+    cell: float  # width of a cell, in widths of the marker
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def only(self, ids: tuple[int, ...]) -> MarkerDictionary:
-        """The same dictionary with the given markers alone.
-
-        Raises
-        ------
-        DetectError
-            If it has no marker of such a number.
-        """
+        """The same dictionary with the given markers alone; a DetectError if it lacks one."""
         wanted = np.unique(np.array(ids, dtype=np.int64))
         missing = np.setdiff1d(wanted, self.ids)
         if len(missing):
@@ -97,18 +76,7 @@ def dictionary_names() -> tuple[str, ...]:
 
 @functools.cache
 def marker_dictionary(name: str) -> MarkerDictionary:
-    """A set of markers by its name.
-
-    Parameters
-    ----------
-    name : str
-        One of `dictionary_names`.
-
-    Raises
-    ------
-    DetectError
-        If there is none of that name.
-    """
+    """A set of markers by its name, one of `dictionary_names`; else a DetectError."""
     if name not in dictionary_names():
         raise DetectError(
             f"{name!r:.60}: no such dictionary of markers: expected one of "
@@ -179,19 +147,9 @@ class Templates:
 
 @functools.lru_cache(maxsize=16)
 def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
-    """Templates of a dictionary's markers.
+    """Templates of a dictionary's markers: of those expected, or of all if none is named.
 
-    Parameters
-    ----------
-    name : str
-        The dictionary.
-    ids : tuple of int
-        The markers expected; none for all.
-
-    Raises
-    ------
-    DetectError
-        If there is no such dictionary or marker.
+    Raises DetectError if there is no such dictionary or marker.
     """
     dictionary = marker_dictionary(name)
     if ids:

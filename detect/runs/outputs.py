@@ -25,7 +25,7 @@ from redetect.landmarks import format_head
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the tilts that a second pass makes (`detect.runs.level_run`).
+#: The kind of the tilts that a second pass makes (`detect.runs.rows`).
 RUN_TILT = "run tilt"
 
 _LOG_BEGIN = b'{\n "program": "redetect",'

@@ -1,10 +1,13 @@
-"""The rows of frames, their JSON and their pictures, from what is detected in them."""
+"""The rows of frames, their JSON and their pictures, from what is detected in them.
+
+And the second pass over a run: its discs levelled by the tilt of all its frames.
+"""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,12 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.circles import CircleDetections
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks
 from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
+from detect.levelling import level_discs
 from detect.lines import LineDetections
+from detect.run_tilt import frame_tilts, tilt_of_run
 from detect.runs.frame import (
     COSTS_THE_FRAME,
     FrameDetections,
@@ -27,10 +33,12 @@ from detect.runs.frame import (
     tables_of,
 )
 from detect.runs.known import KnownOfFrame
+from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
     FramePlan,
     FrameRows,
     FrameTask,
+    RunSummary,
     json_record,
     rows_of_failure,
     time_row,
@@ -41,6 +49,7 @@ from detect.verticals.detections import carry_ids
 from detect.verticals.response import line_response
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
+    FrameTilt,
     format_levelling,
     format_no_tilt,
     format_outline_tilt,
@@ -48,7 +57,11 @@ from redetect.landmarks import (
     format_tilt,
     frames_of_rows,
     parse_rows,
+    tilt_as_written,
 )
+
+#: Prefix, lines and tilt of a frame.
+_Tilted = tuple[str, int, FrameTilt | None]
 
 #: Largest number of pixels that are decoded at once.
 PIXELS_AT_ONCE = 1 << 25
@@ -206,3 +219,66 @@ def _drawn(
         yield ".png", picture
     if plan.draw_response and found.lines is not None and plan.lines and table:
         yield ".response.png", draw_response(line_response(image, table, plan.lines), table)
+
+
+def level_run(
+    camera: Camera,
+    tilt_sigma_deg: float,
+    read: Callable[[], Iterable[Mapping[str, str]]],
+    summary: RunSummary,
+) -> Iterator[Mapping[str, str]]:
+    """The rows of each frame with levelled discs, and `RUN_TILT`.
+
+    Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
+    levelled by its own; `tilt_sigma_deg` is the standard deviation of an unknown one. The summary
+    is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
+    """
+    unknown_variance = math.radians(tilt_sigma_deg) ** 2
+    frames: list[_Tilted] = []
+    outlines: list[FrameTilt | None] = []
+    for rows in read():
+        own, *by_outlines = map(_tilt_of_row, _lines(rows["tilt"]))
+        frames.append(own)
+        outlines.append(by_outlines[0][2] if by_outlines else None)
+    summary.tilt = tilt_of_run(frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines))
+    for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
+        if summary.tilt is not None:
+            pitch, roll = summary.tilt.tilt[k].tolist()
+            cpp, crr = summary.tilt.variance[k].tolist()
+            tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
+        elif tilt is None and unknown_variance > 0.0:
+            tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
+        circles = rows["circles"]
+        yield {
+            **rows,
+            "circles": circles if tilt is None else _levelled(circles, tilt, camera),
+            RUN_TILT: f"{format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)}\n",
+        }
+
+
+def _levelled(circles: str, tilt: FrameTilt, camera: Camera) -> str:
+    """A frame's rows, its STEP first."""
+    step, *rows = _lines(circles)
+    head = f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n"
+    if not rows:
+        return head
+    words = [row.split() for row in rows]
+    numbers = np.array([word[1:7] for word in words], np.float64)
+    covariance = numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
+    floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
+    level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
+    ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
+    return head + landmark_rows("LANDMARK_C", level, ids)
+
+
+def _lines(text: str) -> list[str]:
+    return text.rstrip("\n").split("\n")  # `splitlines` splits names at other characters, too
+
+
+def _tilt_of_row(row: str) -> _Tilted:
+    keyword, prefix, *words = row.split()
+    if keyword == "NOTILT":
+        return prefix, int(words[0]), None
+    pitch, roll, cpp, cpr, crr = map(float, words[:5])
+    lines = int(words[5])
+    return prefix, lines, FrameTilt(prefix, pitch, roll, cpp, cpr, crr, lines)

@@ -209,14 +209,9 @@ Matrix = NDArray[np.float64]
 class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
-    Parameters
-    ----------
-    path : path
-        A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
-    image_topic, base_frame : str
-        As in `SourceOptions`.
-    bits : int or None
-        Significant bits of 16-bit images; by default what the first one needs.
+    The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; topic and frame as in
+    `SourceOptions`. 16-bit images have as many significant bits as the first one needs, if not
+    named.
     """
 
     def __init__(

@@ -62,19 +62,11 @@ def decode_gray(
 
 
 def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArray[np.uint8]:
-    """Bring pixels to 8-bit grey values, contiguous and writable.
+    """Bring pixels to (H, W) uint8 grey values, contiguous and writable.
 
-    Parameters
-    ----------
-    pixels : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) uint8 or uint16 array
-        Grey values, or blue, green, red and perhaps opacity; of any byte order and strides.
-    name, bits
-        As of `decode_gray`.
-
-    Raises
-    ------
-    FrameError
-        If it is another array, or has values that need more bits.
+    They are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps
+    opacity, of 8 or 16 bits, any byte order and strides; else, or if they need more bits, a
+    FrameError. `name` and `bits` as of `decode_gray`.
     """
     dtype = pixels.dtype.newbyteorder("=")
     if dtype not in (np.uint8, np.uint16):

@@ -22,46 +22,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """One frame of a run: its STEP row, and the image taken after it.
-
-    Attributes
-    ----------
-    step : Step
-    image : path or None
-        The image's file; None where there is none.
-    content : bytes or (H, W) uint8 array or None
-        The encoded image or its grey values, where it comes from no file of its own.
-    time_s : float or None
-        When it was taken, where that is known.
-    bits : int
-        Significant bits of a file with more than 8.
-    failure : str or None
-        Why there is no image, although there should be.
-    """
+    """One frame of a run: its STEP row, and the image taken after it."""
 
     step: Step
-    image: Path | None
+    image: Path | None  # its file, where it has one
+    #: The encoded image or (H, W) uint8 grey values, where it comes from no file of its own.
     content: bytes | NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
-    time_s: float | None = None
-    bits: int = 16
-    failure: str | None = None
+    time_s: float | None = None  # when it was taken, where that is known
+    bits: int = 16  # significant bits of a file with more than 8
+    failure: str | None = None  # why there is no image, although there should be
 
 
 class Frames(Protocol):
     """The frames of a run, made on demand.
 
-    Iterating again starts over (with a live camera: from then on).
-
-    Attributes
-    ----------
-    ships_images : bool
-        Whether frames carry contents of images, not paths.
-    expected : int or None
-        Approximate number of frames, if it is known.
-    left_out : int
-        How many images, so far, are no part of the run.
-    why_left_out : str
-        Why; printed after their number.
+    Iterating again starts over (with a live camera: from then on). They ship images if they carry
+    contents, not paths. Their number is approximate, and so far some images may have been left out;
+    why is printed after how many.
     """
 
     ships_images: bool

@@ -32,8 +32,7 @@ def open_calibrated(
     Parameters
     ----------
     name : path
-        A run folder, a folder of images, an image or a pattern of images, a video, a bag, or
-        ``camera:0``.
+        A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
     camera_path : path, optional
         The calibration; by default the one beside the images.
     options : SourceOptions, optional

@@ -8,22 +8,11 @@ import stat
 
 
 def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
-    """The content of a file.
+    """The content of a regular file of at most `largest_bytes`, or of what a link leads to.
 
-    Parameters
-    ----------
-    path : path
-        A regular file, or a link to one; pipes and devices are refused, never waited for.
-    largest_bytes : int
-        A larger file is refused before it is read.
-    own : bool
-        Whether links are refused, and files that another user may have written to.
-
-    Raises
-    ------
-    OSError
-        If there is no such file, it cannot be read, is too large or something else; `strerror`
-        says so in words.
+    Pipes and devices are refused, never waited for; if it must be the user's `own`, so are links,
+    and files that another user may have written to. Raises an OSError whose `strerror` says why in
+    words.
     """
     try:
         links = os.O_NOFOLLOW if own else 0

@@ -80,16 +80,9 @@ Share = Annotated[float, SHARE]
 
 
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
-    """Refuse settings with a number out of its bounds.
+    """Refuse settings with a number out of its bounds; these are given by the attributes' names.
 
-    Parameters
-    ----------
-    settings : object
-        Has the numbers as attributes; each number of a tuple is checked.
-    error : type of exception
-        What is raised: names the setting, its value and what was expected.
-    bounds : Bounds
-        By the attributes' names.
+    Each number of a tuple is checked. The error names the setting, its value and what was expected.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)

@@ -18,20 +18,12 @@ from redetect.storage.version import __version__
 
 @dataclass(frozen=True)
 class Program:
-    """A program.
-
-    Attributes
-    ----------
-    name : str
-    description : str
-        What its `--help` says.
-    performed_by : mapping
-        Dataclasses of flags, one for each command, which has the class's name in small letters; and
-        the module whose `perform` carries it out.
-    """
+    """A program with its commands."""
 
     name: str
-    description: str
+    description: str  # what its `--help` says
+    #: Dataclasses of flags, one for each command, which has the class's name in small letters; and
+    #: the module whose `perform` carries it out.
     performed_by: Mapping[type, str]
 
     def main(self, arguments: list[str] | None = None) -> int:
@@ -44,11 +36,7 @@ class Program:
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help`, `--version` and on errors.
 
-        Parameters
-        ----------
-        arguments : sequence of str
-        defaults : sequence of commands
-            What the flags of these commands start from.
+        `defaults` are commands whose values the flags of these commands start from.
         """
         import tyro
         from tyro.conf import arg, subcommand

@@ -26,20 +26,11 @@ _ADVICE = (
 
 
 def exit_code_of(work: Callable[[], int]) -> int:
-    """Run a command and report its errors on one line.
+    """Run a command and report its errors on one line; returns its exit code, or one of those
+    above.
 
     All packages raise `OneLineError`, the system raises OSErrors, libraries ValueErrors. Anything
     else is a bug and shows its traceback.
-
-    Parameters
-    ----------
-    work : callable
-        Carries the command out; returns the exit code.
-
-    Returns
-    -------
-    int
-        The exit code of `work`, `EXIT_ERROR`, `EXIT_INTERRUPTED` or `EXIT_UNREAD`.
     """
     try:
         try:

@@ -17,21 +17,10 @@ from redetect.storage.messages import one_line
 def read_plain_array(
     stream: BinaryIO, dtype: np.dtype[Any], dimensions: int, largest_bytes: int
 ) -> NDArray[Any]:
-    """Read an array of numbers of a known type.
+    """Read an array of a known type from a stream, to the array's end.
 
-    Parameters
-    ----------
-    stream : binary stream
-        At the array's beginning; it is read to the array's end.
-    dtype : dtype
-    dimensions : int
-    largest_bytes : int
-        Arrays of more are refused before memory is taken.
-
-    Raises
-    ------
-    ValueError
-        If there is no such array; the message says what was found, on one line.
+    Arrays of more bytes than `largest_bytes` are refused before memory is taken. Raises a
+    ValueError that says on one line what was found instead.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
