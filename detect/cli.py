@@ -26,8 +26,7 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.terminal import show_announcements
 from detect.viewing_options import Compare, Draw, Export, Report, Tune, View
-from redetect.storage.command_line import Program
-from redetect.storage.exit_codes import EXIT_INTERRUPTED, exit_code_of
+from redetect.storage.command_line import EXIT_INTERRUPTED, Program, exit_code_of
 
 Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
 

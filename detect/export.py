@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
-from detect.sources.times import read_image_times
+from detect.sources.interface import read_image_times
 from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of

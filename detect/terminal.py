@@ -12,14 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 
-from rich.console import Console
-from rich.progress import (
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-)
-
 from detect.interrupts import raise_if_interrupted
 
 _log = logging.getLogger("redetect")
@@ -46,14 +38,8 @@ def on_compilation(call: Callable[[], object]) -> None:
     """Have something called before this process compiles a kernel."""
     from numba.core import event
 
-    class Compilation(event.Listener):
-        def on_start(self, _: object) -> None:
-            call()
-
-        def on_end(self, _: object) -> None:
-            pass
-
-    event.register("numba:compile", Compilation())
+    listener = {"on_start": lambda *_: call(), "on_end": lambda *_: None}
+    event.register("numba:compile", type("Compilation", (event.Listener,), listener)())
 
 
 _SHOWN_FAILURES = 10
@@ -69,6 +55,9 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     if not sys.stderr.isatty():
         yield raise_if_interrupted
         return
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
     rate = TextColumn("{task.fields[rate]}")
     progress = Progress(*columns, rate, console=Console(stderr=True))

@@ -23,10 +23,9 @@ from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
-from detect.report.parts import draw_rates, f1_score, figure_file, knee, pareto_front
+from detect.report.figures import draw_rates, f1_score, figure_file, knee, pareto_front
 from detect.run import Run
-from detect.runs.known import ByPrefix, FramesByImage, Known
-from detect.runs.plan import FramePlan, FrameTask
+from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import PUBLISHED, CircleSettings, parameter_value
 from detect.sources.interface import RunFrame

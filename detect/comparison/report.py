@@ -33,7 +33,7 @@ from detect.seen import Sight
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_whole
-from redetect.storage.exit_codes import EXIT_ERROR
+from redetect.storage.command_line import EXIT_ERROR
 
 
 def perform(command: Compare) -> int:

@@ -14,8 +14,8 @@ from camera import Camera
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.run import ImageRun
-from detect.runs.known import FramesByImage
 from detect.runs.outputs import LEVEL, LEVELLED
+from detect.runs.plan import FramesByImage
 from detect.seen import Sight
 from detect.settings import CircleSettings, parameter_value
 from detect.sources.image_files import image_name

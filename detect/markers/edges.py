@@ -2,7 +2,7 @@
 
 A blurred step between two grey levels is fitted along each edge of a rough quadrangle, to all
 pixels near it except near the corners. The fitted edges meet in the corners, whose covariances
-follow from theirs. Everything happens at straight positions (see `detect.markers.lens`).
+follow from theirs. Everything happens at straight positions (see `detect.markers.geometry`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.lens import Picture
-from detect.markers.quadrangle import is_convex
+from detect.markers.geometry import Picture, is_convex
 from detect.positive_definite import invert_positive, solve_positive
 
 FloatArray = NDArray[np.float64]

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from detect.markers.dictionaries import Templates
 from detect.markers.edges import LEAST_NOISE, OUTLIER, RefinedQuadrangle, robust_sigma
-from detect.markers.lens import Picture
+from detect.markers.geometry import (
+    Picture,
+    corners_by_homography,
+    corners_of,
+    signed_area,
+    square_homography,
+)
 from detect.markers.pattern_model import (
     BLACK,
     BLUR,
@@ -30,12 +36,6 @@ from detect.markers.pattern_model import (
     cell_sums,
     linearise,
     pattern_of,
-)
-from detect.markers.quadrangle import (
-    corners_by_homography,
-    corners_of,
-    signed_area,
-    square_homography,
 )
 
 FloatArray = NDArray[np.float64]

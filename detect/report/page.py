@@ -26,12 +26,15 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.report.figures import (
+    Part,
     RateCurve,
+    Section,
     bearings_figure,
     counts_figure,
     disc_rates,
     distance_figure,
     floor_figure,
+    knee,
     line_rates,
     rates_figure,
     tilt_figure,
@@ -39,7 +42,6 @@ from detect.report.figures import (
     whitened_figure,
 )
 from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
-from detect.report.parts import Part, Section, knee
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report

@@ -17,9 +17,8 @@ from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.run import ImageRun, Run, read_image
-from detect.runs.known import FramesByImage, Known, MapByImage
 from detect.runs.outputs import frames_tilt_place
-from detect.runs.plan import Drawing, FramePlan, Job, RunSummary
+from detect.runs.plan import Drawing, FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings

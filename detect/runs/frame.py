@@ -1,4 +1,6 @@
-"""The path of one frame: its image in, its verticals, tilts, discs and markers out.
+"""The path of one frame: its image in, its verticals, tilts, discs and markers out, and its rows.
+
+There is a second pass over a run: its discs levelled by the tilt of all its frames.
 
 Workers import this module; a process that delegates the work needs neither the detectors nor the
 compiler, and starts without them.
@@ -6,25 +8,59 @@ compiler, and starts without them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import io
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import zip_longest
-from typing import NamedTuple
+from itertools import groupby, zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
+from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks
+from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
-from detect.levelling import levelled
+from detect.levelling import level_discs, levelled
 from detect.lines import LineDetections, detect_lines
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.run import read_image
-from detect.runs.plan import FramePlan, FrameTask
+from detect.run_tilt import frame_tilts, tilt_of_run
+from detect.runs.outputs import RUN_TILT
+from detect.runs.plan import (
+    FramePlan,
+    FrameRows,
+    FrameTask,
+    KnownOfFrame,
+    RunSummary,
+    json_record,
+    rows_of_failure,
+    time_row,
+)
+from detect.seen import Sight
+from detect.settings import CircleSettings
+from detect.verticals.detections import carry_ids
+from detect.verticals.response import line_response
+from detect.viewing_options import CompareOptions
 from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
-from redetect.landmarks import FrameTilt, tilt_as_written
+from redetect.landmarks import (
+    FrameTilt,
+    format_levelling,
+    format_no_tilt,
+    format_outline_tilt,
+    format_record,
+    format_tilt,
+    frames_of_rows,
+    parse_rows,
+    tilt_as_written,
+)
 
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -132,3 +168,227 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     return tilt_as_written(
         FrameTilt(prefix, tilt.pitch_rad, tilt.roll_rad, cpp, cpr, crr, tilt.lines)
     )
+
+
+#: Prefix, lines and tilt of a frame.
+_Tilted = tuple[str, int, FrameTilt | None]
+
+#: Largest number of pixels that are decoded at once.
+PIXELS_AT_ONCE = 1 << 25
+
+
+def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRows]:
+    """The rows of frames; as many are worked on at a time as fit in memory."""
+    rows: list[FrameRows] = []
+    for own, group in groupby(tasks, lambda task: task.plan or plan):
+        alike, camera, at_once = list(group), own.camera, 1
+        if camera is not None and own.drawing is None and not own.draw_response:
+            at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
+        for first in range(0, len(alike), at_once):
+            batch = alike[first : first + at_once]
+            found = detect_batch(batch, own)
+            rows += [_rows_of(task, each, own) for task, each in zip(batch, found)]
+    return rows
+
+
+def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameRows:
+    if found.error is not None:
+        return rows_of_failure(task, found.error)
+    try:
+        rows = _rows_by_kind(task, found, plan)
+        return FrameRows(
+            task.frame.step.prefix,
+            rows,
+            {
+                "discs": len(found.discs or ()),
+                "lines": len(found.lines or ()),
+                "tilts": int(found.lines is not None and found.tilt is not None),
+                "markers": len(found.markers or ()),
+            },
+            {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
+            pictures=tuple(
+                (
+                    f"{Path(task.frame.step.prefix).name}{ending}",
+                    cv2.imencode(".png", picture)[1].tobytes(),
+                )
+                for ending, picture in _drawn(rows, found, plan)
+            ),
+        )
+    except COSTS_THE_FRAME as error:
+        return rows_of_failure(task, reason_of(error, task))
+
+
+def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> dict[str, str]:
+    step = task.frame.step
+    head = f"{format_record(step)}\n"
+    rows = {"times": time_row(task)}
+    if found.lines is not None:
+        rows["lines"] = head + _line_rows(found.lines, task.known)
+        tilt = found.tilt
+        own = format_no_tilt(step.prefix, len(found.lines)) if tilt is None else format_tilt(tilt)
+        rows["tilt"] = f"{own}\n"
+        if found.outline_tilt is not None:
+            rows["tilt"] += f"{format_outline_tilt(found.outline_tilt)}\n"
+    if found.discs is not None and found.seen is not None:
+        level = found.discs.levelled_by
+        note = "" if level is None else f"{format_levelling(level)}\n"
+        rows["circles"] = head + note + _disc_rows(found.discs, found.seen, task.known)
+        if plan.json:
+            rows["json"] = json_record({"frame": step.prefix, "discs": _disc_records(found.discs)})
+    if found.markers is not None:
+        rows["markers"] = head + "".join(
+            f"{format_record(marker)}\n" for marker in found.markers.landmarks()
+        )
+    return rows
+
+
+def landmark_rows(
+    keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
+) -> str:
+    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs."""
+    if not np.isfinite(numbers).all():
+        raise FrameError(f"{keyword}: a number of it is not finite")
+    row = keyword + " %g" * numbers.shape[1]
+    rows = "".join(" ".join([row, *map(str, own)]) + "\n" for own in ids)
+    return rows % tuple(numbers.ravel().tolist())
+
+
+def disc_numbers(
+    floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The (N, 6) numbers of rows of discs: x, y, quality, cxx, cxy, cyy."""
+    return np.column_stack([floor_xy, quality, covariance[:, 0], covariance[:, 1, 1]])
+
+
+def _line_rows(found: LineDetections, known: KnownOfFrame) -> str:
+    ids: list[tuple[int, ...]] = [(-1,)] * len(found)
+    if known.lines:
+        ids = [row.ids for row in carry_ids(found.landmarks(), known.lines)]
+    no_quality = np.zeros(len(found))
+    columns = [found.ends, found.alpha_rad, found.beta_rad, no_quality, found.sigma_rad]
+    return landmark_rows("LANDMARK_L", np.column_stack(columns), ids)
+
+
+def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame) -> str:
+    """The rows, with the IDs of a known row of the same disc, or of a map's, or -1."""
+    numbers = disc_numbers(discs.floor_xy, discs.quality, discs.covariance)
+    ids: list[tuple[int, ...]] = [(-1,)] * len(discs)
+    if known.discs:
+        alike = discs if known.discs_level else seen
+        named = ids_of_rows(alike.floor_xy, known.discs)
+        by_pixel = dict(zip(map(tuple, alike.pixels.tolist()), named))
+        ids = [by_pixel[u, v] or (-1,) for u, v in discs.pixels.tolist()]
+    if known.mapped:
+        taken = {number for own in ids for number in own}
+        left = [disc for disc in known.mapped if disc.id not in taken]
+        rows = [k for k, own in enumerate(ids) if own == (-1,)]
+        found = ids_of_map(discs.floor_xy[rows], discs.covariance[rows], left, known.slack_m)
+        for k, number in zip(rows, found.tolist()):
+            ids[k] = (number,)
+    return landmark_rows("LANDMARK_C", numbers, ids)
+
+
+def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
+    rows = disc_numbers(found.floor_xy, found.quality, found.covariance).tolist()
+    return [
+        {
+            "pixel": pixel,
+            "x_m": x,
+            "y_m": y,
+            "quality": quality,
+            "evidence": evidence if math.isfinite(evidence) else None,
+            "covariance_m2": covariance,
+        }
+        for pixel, (x, y, quality, *covariance), evidence in zip(
+            found.pixels.tolist(), rows, found.evidence.tolist()
+        )
+    ]
+
+
+def _drawn(
+    rows: Mapping[str, str], found: FrameDetections, plan: FramePlan
+) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """The pictures of a plan, by the endings of their names."""
+    if plan.drawing is None and not plan.draw_response:
+        return
+    image, table = found.pixels, tables_of(plan).verticals
+    kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
+    content = io.BytesIO(rows[kind].encode("utf-8", "surrogateescape"))
+    (frame,) = frames_of_rows(parse_rows(content))
+    if plan.drawing == "tracks" and found.lines is not None and table:
+        yield ".png", draw_tracks(image, table, found.lines)
+    elif plan.drawing is not None:
+        settings = plan.circles or CircleSettings()
+        sight = Sight(plan.camera, settings.radius_m) if plan.camera else None
+        frames: dict[str, Any] = {kind: frame}
+        seen = SeenRows(**frames, tilt=found.tilt)
+        name = Path(frame.step.prefix).name
+        picture = draw_rows(image, sight, seen, settings, CompareOptions(), name)
+        if found.markers is not None:
+            picture = draw_candidates(picture, found.markers)
+        yield ".png", picture
+    if plan.draw_response and found.lines is not None and plan.lines and table:
+        yield ".response.png", draw_response(line_response(image, table, plan.lines), table)
+
+
+def level_run(
+    camera: Camera,
+    tilt_sigma_deg: float,
+    read: Callable[[], Iterable[Mapping[str, str]]],
+    summary: RunSummary,
+) -> Iterator[Mapping[str, str]]:
+    """The rows of each frame with levelled discs, and `RUN_TILT`.
+
+    Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
+    levelled by its own; `tilt_sigma_deg` is the standard deviation of an unknown one. The summary
+    is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
+    """
+    unknown_variance = math.radians(tilt_sigma_deg) ** 2
+    frames: list[_Tilted] = []
+    outlines: list[FrameTilt | None] = []
+    for rows in read():
+        own, *by_outlines = map(_tilt_of_row, _lines(rows["tilt"]))
+        frames.append(own)
+        outlines.append(by_outlines[0][2] if by_outlines else None)
+    summary.tilt = tilt_of_run(frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines))
+    for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
+        if summary.tilt is not None:
+            pitch, roll = summary.tilt.tilt[k].tolist()
+            cpp, crr = summary.tilt.variance[k].tolist()
+            tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
+        elif tilt is None and unknown_variance > 0.0:
+            tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
+        circles = rows["circles"]
+        yield {
+            **rows,
+            "circles": circles if tilt is None else _levelled(circles, tilt, camera),
+            RUN_TILT: f"{format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)}\n",
+        }
+
+
+def _levelled(circles: str, tilt: FrameTilt, camera: Camera) -> str:
+    """A frame's rows, its STEP first."""
+    step, *rows = _lines(circles)
+    head = f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n"
+    if not rows:
+        return head
+    words = [row.split() for row in rows]
+    numbers = np.array([word[1:7] for word in words], np.float64)
+    covariance = numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
+    floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
+    level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
+    ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
+    return head + landmark_rows("LANDMARK_C", level, ids)
+
+
+def _lines(text: str) -> list[str]:
+    return text.rstrip("\n").split("\n")  # `splitlines` splits names at other characters, too
+
+
+def _tilt_of_row(row: str) -> _Tilted:
+    keyword, prefix, *words = row.split()
+    if keyword == "NOTILT":
+        return prefix, int(words[0]), None
+    pitch, roll, cpp, cpr, crr = map(float, words[:5])
+    lines = int(words[5])
+    return prefix, lines, FrameTilt(prefix, pitch, roll, cpp, cpr, crr, lines)

@@ -18,14 +18,14 @@ from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
 from detect.runs.plan import FramePlan, Job, RunSummary
-from detect.sources.times import TIMES_HEAD
+from detect.sources.interface import TIMES_HEAD
 from redetect.landmarks import format_head
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the tilts that a second pass makes (`detect.runs.rows`).
+#: The kind of the tilts that a second pass makes (`detect.runs.frame`).
 RUN_TILT = "run tilt"
 
 _LOG_BEGIN = b'{\n "program": "redetect",'

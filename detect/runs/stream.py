@@ -88,7 +88,7 @@ def detect_run(
         summary.images_without_step = job.run.images_without_step
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
-            from detect.runs.rows import level_run  # loads the compiler
+            from detect.runs.frame import level_run  # loads the compiler
 
             written = level_run(plan.camera, plan.circles.tilt_sigma_deg, files.rows, summary)
         files.finish(written, summary)

@@ -23,7 +23,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
@@ -98,7 +97,7 @@ def detect_chunks(
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     """Process a task in a worker; its input and output are small."""
-    from detect.runs.rows import rows_of_frames  # loads the compiler, which only workers need
+    from detect.runs.frame import rows_of_frames  # loads the compiler, which only workers need
 
     return rows_of_frames(chunk, plan)
 
@@ -177,7 +176,6 @@ _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
-_CLUSTER_LOOK_S = 5.0
 #: Time that processes have to end by themselves.
 _GRACE_S = 1.0
 
@@ -219,13 +217,9 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
         ) from None
     clients: list[Client] = []
 
-    @lru_cache(maxsize=1)
-    def threads(_: object) -> int:
-        return sum(sum(client.nthreads().values()) for client in clients)
-
     def window() -> int:  # a cluster grows
-        time_and_client = (time.monotonic() // _CLUSTER_LOOK_S, len(clients))
-        return 2 + _WINDOW_PER_WORKER * max(1, threads(time_and_client))
+        threads = sum(sum(client.nthreads().values()) for client in clients)
+        return 2 + _WINDOW_PER_WORKER * max(1, threads)
 
     chunk = 1 if large else _TOGETHER
     return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))

@@ -18,10 +18,17 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import significant_bits_of_file
-from detect.sources.interface import RunFrame, Source, frame_prefix, only_calibration, still
-from detect.sources.times import read_image_times
+from detect.sources.interface import (
+    Frames,
+    RunFrame,
+    Source,
+    frame_prefix,
+    only_calibration,
+    read_image_times,
+    still,
+)
 from redetect.landmarks import Step, read_steps
-from redetect.storage.inside import leads_out, link_out
+from redetect.storage.bounded import leads_out, link_out
 from redetect.storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
@@ -165,7 +172,7 @@ WILDCARDS = frozenset("*?[")
 _SAMPLES = 5
 
 
-class RunFrames:
+class RunFrames(Frames):
     """The frames of a run folder: in the order of the odometry, or of names."""
 
     ships_images = False

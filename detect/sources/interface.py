@@ -1,13 +1,14 @@
-"""Frames of a run, and what all sources of images have in common."""
+"""Frames of a run, their times, and what all sources of images have in common."""
 
 from __future__ import annotations
 
+import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,46 +34,29 @@ class RunFrame:
     failure: str | None = None  # why there is no image, although there should be
 
 
-class Frames(Protocol):
+class Frames(ABC):
     """The frames of a run, made on demand.
-
-    Iterating again starts over (with a live camera: from then on). They ship images if they carry
-    contents, not paths. Their number is approximate, and so far some images may have been left out;
-    why is printed after how many.
-    """
-
-    ships_images: bool
-
-    @property
-    def expected(self) -> int | None: ...
-
-    @property
-    def left_out(self) -> int: ...
-
-    @property
-    def why_left_out(self) -> str: ...
-
-    def __iter__(self) -> Generator[RunFrame, None, None]: ...
-
-
-class Source(ABC):
-    """Images in order, as frames of a run in which the robot does not move.
 
     Iterating again starts over (with a live camera: from then on).
     """
 
-    name: str  # in messages
-    output_base: Path  # results are called this, with an ending of their own
     ships_images = True  # it gives contents of images, not files
-    expected: int | None = None  # approximate number of images, where it is known
-    size: tuple[int, int] | None = None  # width and height, where they are known beforehand
-    times_own = True  # images have times by themselves; of others, they can be named
-    has_times = True
-    left_out = 0
+    expected: int | None = None  # approximate number of frames, where it is known
+    left_out = 0  # how many images, so far, are no part of the run
     why_left_out = "images are left out"
 
     @abstractmethod
     def __iter__(self) -> Generator[RunFrame, None, None]: ...
+
+
+class Source(Frames):
+    """Images in order, as frames of a run in which the robot does not move."""
+
+    name: str  # in messages
+    output_base: Path  # results are called this, with an ending of their own
+    size: tuple[int, int] | None = None  # width and height, where they are known beforehand
+    times_own = True  # images have times by themselves; of others, they can be named
+    has_times = True
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside it, or that it holds; None if there is none.
@@ -111,3 +95,46 @@ def only_calibration(folder: Path, stem: str) -> Camera | None:
         names = ", ".join(path.name for path in found[:4])
         raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
     return read_camera(found[0]) if found else None
+
+
+#: The head of a file of times.
+TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
+
+_LONGEST_ROW = 65536
+
+
+def read_image_times(path: Path) -> dict[str, float]:
+    """The times of images (s), by their prefixes."""
+    times = {}
+    for number, words in text_rows(path, "file of times", "surrogateescape"):
+        try:
+            prefix, seconds = words[0], float(words[1])
+        except (IndexError, ValueError):
+            prefix, seconds = "", math.nan
+        if len(words) != 2 or not math.isfinite(seconds):
+            raise DetectError(
+                f"{path}:{number}: {' '.join(words)[:60]!a}: expected an image's prefix and seconds"
+            )
+        times[prefix] = seconds
+    return times
+
+
+def format_time(prefix: str, time_s: float) -> str:
+    """The row of an image, without line end."""
+    return f"{prefix} {time_s:.6f}"
+
+
+def text_rows(path: Path, what: str, errors: str = "strict") -> Iterator[tuple[int, list[str]]]:
+    """Number and words of each row of a text file, between blanks or commas, ``#`` comments."""
+    try:
+        with path.open(encoding="utf-8-sig", errors=errors) as stream:
+            for number, line in enumerate(stream, start=1):
+                words = line[:_LONGEST_ROW].partition("#")[0].replace(",", " ").split()
+                if words:
+                    yield number, words
+    except FileNotFoundError:
+        raise DetectError(f"{path}: no such {what}") from None
+    except UnicodeDecodeError:
+        raise DetectError(f"{path}: is no text: expected a {what}") from None
+    except OSError as error:
+        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,8 +23,7 @@ from numpy.typing import NDArray
 from detect.errors import DetectError
 from detect.options import Axes
 from detect.sources.image_files import NameIndex, last_part
-from detect.sources.interface import Frames, RunFrame, Source
-from detect.sources.times import text_rows
+from detect.sources.interface import Frames, RunFrame, Source, text_rows
 from redetect.landmarks import Step, read_steps, wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -201,7 +201,7 @@ def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
     return math.atan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
 
 
-class FramesAlong:
+class FramesAlong(Frames):
     """The frames of a source along its odometry, as one of the functions below gives them."""
 
     def __init__(
@@ -212,7 +212,7 @@ class FramesAlong:
     ) -> None:
         self._source, self._framed = source, framed
         self.ships_images, self.expected = source.ships_images, source.expected
-        self.left_out, self.why_left_out = 0, why_left_out
+        self.why_left_out = why_left_out
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
@@ -280,27 +280,18 @@ def frames_along_rows(source: Source, path: Path) -> FramesAlong:
     return FramesAlong(source, framed, "images are not named by a STEP row: left out")
 
 
-class FirstFrames:
+class FirstFrames(Frames):
     """The first `count` frames of others."""
 
     def __init__(self, frames: Frames, count: int) -> None:
-        self._frames = frames
-        self._count = count
-        self.ships_images = frames.ships_images
+        self._frames, self._count = frames, count
+        self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
         self.expected = count if frames.expected is None else min(frames.expected, count)
-        self.why_left_out = frames.why_left_out
-
-    @property
-    def left_out(self) -> int:
-        """Images that are no part of the run, so far."""
-        return self._frames.left_out
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with closing(iter(self._frames)) as frames:
-            for number, frame in enumerate(frames, start=1):
-                yield frame
-                if number == self._count:
-                    return
+            yield from islice(frames, self._count)
+            self.left_out = self._frames.left_out
 
 
 def _image_name(step: Step) -> str:

@@ -1,10 +1,23 @@
-"""Reads untrusted files: regular files of bounded size only."""
+"""Reads untrusted files: of bounded size, regular ones, plain arrays, within a folder."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
+import posixpath
+import re
 import stat
+import tokenize
+import warnings
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from redetect.storage.messages import one_line
 
 
 def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
@@ -47,3 +60,101 @@ def writable_by_others(state: os.stat_result) -> str | None:
     if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return f"can be written to by others (mode {stat.S_IMODE(state.st_mode):o})"
     return None
+
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+#: What Windows takes for a device in any folder, whatever the ending.
+_DEVICE = re.compile(
+    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
+)
+
+
+def leads_out(name: str, *folders: str) -> str | None:
+    r"""Why a name may not be taken for one of a file within a folder, by its letters alone.
+
+    Parameters
+    ----------
+    name : str
+        With / or \ between folders.
+    folders : str
+        Absolute paths of folders in any of which the file may be; without them any folder will do,
+        and its name is not known.
+
+    Returns
+    -------
+    str or None
+        What is wrong with the name, as the end of a message that starts with it; None if nothing.
+    """
+    parts = name.replace("\\", "/")
+    if "\0" in name:
+        return "has a NUL in it"
+    if parts.startswith("/") or _DRIVE.match(parts):
+        return "is an absolute path"
+    if ".." in parts and not any(
+        _within(posixpath.normpath(f"{home}/{parts}"), home) for home in folders or ("/any/folder",)
+    ):
+        return "leads out of the folder"
+    if _DEVICE.search(parts):
+        return "is the name of a device"
+    return None
+
+
+def link_out(path: Path, *folders: Path) -> bool:
+    """Whether a path is in none of the folders, after all links are resolved."""
+    real = os.path.realpath(path)
+    return not any(real == home or _within(real, home) for home in map(os.path.realpath, folders))
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """Path of a file that another file names, in the other file's folder.
+
+    Raises
+    ------
+    ValueError
+        If it would be elsewhere; the message says why, as the end of one that starts with the name.
+    """
+    why = leads_out(name)
+    if why is None and link_out(folder / name, folder):
+        why = "is a link that leads out of the folder"
+    if why is not None:
+        raise ValueError(why)
+    return folder / name
+
+
+def _within(path: str, folder: str) -> bool:
+    return path.startswith(folder.rstrip("/") + "/")
+
+
+def read_plain_array(
+    stream: BinaryIO, dtype: np.dtype[Any], dimensions: int, largest_bytes: int
+) -> NDArray[Any]:
+    """Read an array of a known type from a stream, to the array's end.
+
+    Arrays of more bytes than `largest_bytes` are refused before memory is taken. Raises a
+    ValueError that says on one line what was found instead.
+    """
+    expected = f"expected {dimensions}-dimensional {dtype}, row by row"
+    try:
+        version = npy.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"version {version} of its header is not known")
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # headers that Python 2 wrote are not guessed at
+            shape, fortran, stored = read(stream)
+        if stored.hasobject or stored != dtype or len(shape) != dimensions or fortran:
+            raise ValueError(f"it is {stored} of shape {shape}")
+        size = dtype.itemsize * math.prod(shape)
+        if min(shape, default=0) < 0 or size > largest_bytes:
+            raise ValueError(f"its shape {shape} does not fit in {largest_bytes} bytes")
+        data = stream.read(size)
+    # A damaged header can raise almost any exception.
+    except (
+        ValueError, SyntaxError, TypeError, OverflowError, EOFError, MemoryError, RecursionError,
+        tokenize.TokenError, Warning,
+    ) as error:  # fmt: skip
+        said = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
+        raise ValueError(f"{said}: {expected}") from None
+    if len(data) != size:
+        raise ValueError(f"{len(data)} bytes of data: expected {size}: {expected}")
+    return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)

@@ -15,7 +15,7 @@ from detect.circles import (
     refined_covariance,
 )
 from detect.lines import detect_lines
-from detect.markers.lens import picture_of
+from detect.markers.geometry import picture_of
 from detect.settings import CircleSettings
 from lut import build_disc_table, build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, pinhole, render, tilted

@@ -13,8 +13,7 @@ from detect.comparison.compare import compare_line_frames, compare_runs
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.known import FramesByImage, Known
-from detect.runs.plan import FramePlan, Job, RunSummary
+from detect.runs.plan import FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.viewing_options import CompareOptions

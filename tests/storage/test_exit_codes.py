@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from redetect.storage.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
+from redetect.storage.command_line import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
 from redetect.storage.messages import OneLineError
 
 
@@ -59,7 +59,7 @@ def test_nobody_reads_on_what_is_printed(lines: int, unbuffered: str) -> None:
     """As with ``| head``: a quiet end, whether it shows while printing or at the last flush."""
     code = f"""if True:
         import sys
-        from redetect.storage.exit_codes import exit_code_of
+        from redetect.storage.command_line import exit_code_of
         sys.stdin.read()
         sys.exit(exit_code_of(lambda: [print("row") for _ in range({lines})] and 0))
     """

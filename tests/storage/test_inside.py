@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redetect.storage.inside import leads_out
+from redetect.storage.bounded import leads_out
 
 NAMES = st.text(st.sampled_from("conprauxlt019.-_e \\/:"), max_size=9)
 

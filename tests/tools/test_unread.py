@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from redetect.storage.exit_codes import EXIT_UNREAD
+from redetect.storage.command_line import EXIT_UNREAD
 
 
 @pytest.mark.parametrize("command", ["evaluation accuracy", "slam_evaluation map"])

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 from tools.benchmark.suite import Settings
 
 _FILE_WIDTH = 110

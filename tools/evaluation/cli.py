@@ -20,7 +20,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings
 from redetect.landmarks import FrameTilt
 from redetect.storage import write_whole
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
@@ -507,8 +507,7 @@ def _detect(
     run: Path, settings: CircleSettings, output: Path, tilts: dict[str, FrameTilt] | None = None
 ) -> None:
     from detect.run import open_run
-    from detect.runs.known import Known
-    from detect.runs.plan import FramePlan, Job
+    from detect.runs.plan import FramePlan, Job, Known
     from detect.runs.stream import detect_run
 
     opened = open_run(run)

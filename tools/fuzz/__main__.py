@@ -20,7 +20,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 from tools.fuzz.readers import READERS
 
 _FAULTS = (

@@ -26,8 +26,8 @@ from detect.sources.gray import (
     gray_of_pixels,
     significant_bits_of_file,
 )
+from detect.sources.interface import read_image_times
 from detect.sources.poses import step_between, tick_poses, tum_poses
-from detect.sources.times import read_image_times
 from lut.cache import cached_vertical_table
 from redetect.storage.image_header import claimed_size
 from redetect.storage.parts import left_part

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 
 if TYPE_CHECKING:
     from tools.reenactment.prepare import Quality

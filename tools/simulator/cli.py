@@ -10,7 +10,7 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 from tools.simulator.drive import DriveStyle
 from tools.simulator.laser.commands import LaserSession
 from tools.simulator.laser.commands import perform as perform_laser

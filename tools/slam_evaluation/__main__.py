@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 
 #: The module whose `main` carries a study out.
 STUDIES = {

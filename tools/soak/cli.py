@@ -12,7 +12,7 @@ from typing import Annotated, Optional
 import tyro
 
 from redetect.storage import OutputExistsError, write_whole
-from redetect.storage.exit_codes import exit_code_of
+from redetect.storage.command_line import exit_code_of
 from tools.soak.long_run import link_run, soak
 from tools.soak.short_runs import repeat_short_runs
 

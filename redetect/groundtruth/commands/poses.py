@@ -23,7 +23,7 @@ from redetect.groundtruth.markers.session import (
 from redetect.groundtruth.markers.track import report_entry, track_robot
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_whole
-from redetect.storage.exit_codes import EXIT_ERROR
+from redetect.storage.command_line import EXIT_ERROR
 
 
 def perform(command: Poses) -> int:

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.lasers.scanners import MOST_READINGS
 from redetect.storage import write_whole
+from redetect.storage.bounded import read_plain_array
 from redetect.storage.messages import excerpt, one_line
-from redetect.storage.plain_arrays import read_plain_array
 
 FloatArray = NDArray[np.float64]
 

@@ -31,9 +31,8 @@ from redetect.groundtruth.json_file import read_json
 from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
 from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
 from redetect.groundtruth.markers.network_estimation import BoardView, DoubleBoard
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
-from redetect.storage.inside import path_inside
 from redetect.storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, layout_of, linearise
 from redetect.slam.mapping.solve import factor, normal_equations
 from redetect.storage import write_whole
-from redetect.storage.plain_arrays import read_plain_array
+from redetect.storage.bounded import read_plain_array
 
 FloatArray = NDArray[np.float64]
 

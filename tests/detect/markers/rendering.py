@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import templates_of
-from detect.markers.quadrangle import square_homography
+from detect.markers.geometry import square_homography
 
 FloatArray = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.markers import candidates as regions
-from detect.markers import edges, quadrangle
-from detect.markers import identification as identities
+from detect.markers import detect as identities
+from detect.markers import edges, geometry
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from detect.markers.settings import PUBLISHED, MarkerSettings
@@ -300,7 +300,7 @@ def test_a_marker_at_the_border_is_counted() -> None:
 def test_a_disc_is_no_quadrangle() -> None:
     grey = np.full((120, 120), 200.0)
     cv2.circle(grey, (60, 60), 30, 40.0, -1)
-    assert quadrangle.NO_QUADRANGLE in squares(painted(grey)).rejected
+    assert geometry.NO_QUADRANGLE in squares(painted(grey)).rejected
 
 
 def test_a_ring_segment_is_not_solid() -> None:

@@ -18,13 +18,13 @@ from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
 from detect.markers.dictionaries import templates_of
 from detect.markers.edges import robust_sigma
-from detect.markers.lens import picture_of
-from detect.markers.quadrangle import (
+from detect.markers.geometry import (
     corners_by_homography,
     corners_of,
     count_same,
     is_convex,
     largest_quadrangle,
+    picture_of,
     rough_corners,
     signed_area,
     square_homography,

@@ -11,12 +11,10 @@ from typing import Any
 import pytest
 
 from detect.run import open_run
-from detect.runs import rows as rows_module
-from detect.runs.frame import FrameDetections, detect_batch
+from detect.runs import frame as rows_module
+from detect.runs.frame import FrameDetections, detect_batch, rows_of_frames
 from detect.runs.journal import Journal, task_digest
-from detect.runs.known import KnownOfFrame
-from detect.runs.plan import FramePlan, FrameRows, FrameTask
-from detect.runs.rows import rows_of_frames
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, KnownOfFrame
 from detect.settings import PUBLISHED
 from detect.sources.interface import RunFrame
 from redetect.landmarks import FrameTilt

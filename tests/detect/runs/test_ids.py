@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from detect.runs.known import MapByImage
+from detect.runs.plan import MapByImage
 from redetect.landmarks import CircleLandmark, LandmarkFileError, read_frames
 
 FRAMES = 30

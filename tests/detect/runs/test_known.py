@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from detect.runs.known import FramesByImage, Known
+from detect.runs.plan import FramesByImage, Known
 from redetect.landmarks import LandmarkFileError, read_frames
 
 LINES = """\

@@ -13,8 +13,8 @@ import pytest
 from camera import Camera
 from detect.cli import main
 from detect.run_tilt import LEAST_FRAMES
+from detect.runs.frame import level_run
 from detect.runs.plan import RunSummary
-from detect.runs.rows import level_run
 from detect.seen import level_seen
 from redetect.landmarks.reading import frames_of_rows, parse_rows
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.errors import FrameError
-from detect.runs.rows import disc_numbers, landmark_rows
+from detect.runs.frame import disc_numbers, landmark_rows
 from redetect.landmarks import CircleLandmark, LineLandmark, circle_landmarks, format_record
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

@@ -13,12 +13,11 @@ import pytest
 
 from detect.line_settings import LineSettings
 from detect.run import open_run
-from detect.runs.known import FramesByImage, Known
-from detect.runs.plan import KEPT_FAILURES, FramePlan, Job, RunSummary
+from detect.runs.plan import KEPT_FAILURES, FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
-from detect.sources.interface import RunFrame
+from detect.sources.interface import Frames, RunFrame
 from redetect.landmarks import read_frames, read_tilts
 
 LIGHT = CircleSettings(polarity="light")
@@ -171,12 +170,8 @@ def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) 
     assert summary.failures[0].startswith("none.0: no image")
 
 
-class Arriving:
+class Arriving(Frames):
     """Frames of a run that come one by one, as those of a camera do, and who waits for them."""
-
-    why_left_out = ""
-    left_out = 0
-    expected = None
 
     def __init__(self, frames: list[RunFrame], *, ships_images: bool) -> None:
         self.ships_images = ships_images

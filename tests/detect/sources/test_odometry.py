@@ -14,9 +14,9 @@ from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import RunFrames
+from detect.sources.interface import format_time, read_image_times
 from detect.sources.opening import open_source
 from detect.sources.poses import TimedPose, pose_between, step_between, tick_poses, tum_poses
-from detect.sources.times import format_time, read_image_times
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
 

@@ -21,7 +21,7 @@ from detect.cli import main
 from detect.comparison.compare import compare_runs
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.report.parts import f1_score, knee, pareto_front
+from detect.report.figures import f1_score, knee, pareto_front
 from detect.run import open_run
 from detect.runs.plan import FramePlan
 from detect.runs.workers import Workers, local_workers
