@@ -28,7 +28,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
 from detect.sources.opening import open_calibrated
 from detect.terminal import progress_bar
-from redetect.storage import OutputExistsError
+from redetect.storage.parts import demand_place
 
 FloatArray = NDArray[np.float64]
 
@@ -42,8 +42,7 @@ _TOGETHER = 5.0
 
 def perform(options: Level) -> int:
     """Carry the command out; returns the exit code."""
-    if options.output.exists() and not options.force:
-        raise OutputExistsError(options.output)
+    demand_place(options.output, overwrite=options.force)
     run = open_calibrated(options.run, options.camera)
     camera, height_m = run.camera, float(run.camera.centre[2])
     plan = FramePlan(
@@ -54,12 +53,12 @@ def perform(options: Level) -> int:
         for frame in run.frames:
             advance()
             (found,) = detect_batch([FrameTask(frame)], plan)
-            if found.error is not None or found.seen is None:
+            if found.error is not None or found.seen is None or found.image is None:
                 print(f"left out: {found.error}", file=sys.stderr)
                 continue
             outlines = [
                 tilt_of_outlines(
-                    found.pixels, camera, found.seen.floor_xy, options.radius_m, share * height_m
+                    found.image, camera, found.seen.floor_xy, options.radius_m, share * height_m
                 )
                 for share in HEIGHT_STEPS
             ]

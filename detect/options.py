@@ -15,7 +15,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.settings import CircleSettings, Levelling
-from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import NotNegative, demand_fields, whole
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -105,19 +105,16 @@ class SourceOptions:
 
     odometry: str = ""
     odometry_axes: Axes = "robotics"
-    wheel_base_m: float = 0.0
-    metres_per_tick: float = 0.0
+    wheel_base_m: NotNegative = 0.0
+    metres_per_tick: NotNegative = 0.0
     times: str = ""
     image_topic: str = ""
     base_frame: str = ""
-    frames: int = 0
+    frames: Annotated[int, whole(0)] = 0
     bits: int = 0
 
     def __post_init__(self) -> None:
-        demand(
-            self, DetectError,
-            frames=whole(0), wheel_base_m=NOT_NEGATIVE, metres_per_tick=NOT_NEGATIVE,
-        )  # fmt: skip
+        demand_fields(self, DetectError)
         if self.bits and not 8 <= self.bits <= 16:
             raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
 
@@ -184,10 +181,10 @@ class DiscIdOptions:
     ids_from: MaybePath = None
     ids_from_map: MaybePath = None
     path: MaybePath = None
-    id_slack_m: float = 0.1
+    id_slack_m: NotNegative = 0.1
 
     def __post_init__(self) -> None:
-        demand(self, DetectError, id_slack_m=NOT_NEGATIVE)
+        demand_fields(self, DetectError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
-from detect.sources.gray import bounded_content, decode_gray
-from detect.sources.image_files import IMAGE_SUFFIXES, RunFrames, bits_of_images, images_of_folder
-from detect.sources.interface import Frames, RunFrame
+from detect.sources.gray import bounded_content, decode_gray, wrong_size
+from detect.sources.image_files import RunFrames, bits_of_images, images_of_folder
+from detect.sources.interface import Frames, RunFrame, only_calibration
 from redetect.landmarks import read_steps
 
 
@@ -77,10 +77,6 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
     bits : int, optional
         Significant bits of 16-bit images; by default what some of them need.
 
-    Returns
-    -------
-    Run
-
     Raises
     ------
     DetectError
@@ -88,19 +84,24 @@ def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None 
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
-    if not folder.is_dir():
-        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
-    camera = read_camera(camera_path if camera_path is not None else _only_camera(folder))
-    return _image_run(folder, bits).calibrated(camera)
+    run = open_images(folder, camera_path, bits=bits)
+    if isinstance(run, Run):
+        return run
+    raise DetectError(
+        f"{folder}: no calibration: expected a .cam file in it, or one named by --camera; "
+        "`camera calibrate` makes one, `camera convert` brings one over from other programs"
+    )
 
 
 def open_images(
     folder: Path, camera_path: Path | None = None, *, bits: int | None = None
 ) -> ImageRun:
     """Read a run folder as `open_run` does; without a calibration it is no `Run`."""
-    if folder.is_dir() and camera_path is None and not any(folder.glob("*.cam")):
-        return _image_run(folder, bits)
-    return open_run(folder, camera_path, bits=bits)
+    if not folder.is_dir():
+        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
+    camera = camera_in(folder) if camera_path is None else read_camera(camera_path)
+    run = _image_run(folder, bits)
+    return run if camera is None else run.calibrated(camera)
 
 
 def _image_run(folder: Path, bits: int | None) -> ImageRun:
@@ -161,38 +162,13 @@ def read_image(
         path = os.path.join(working_folder or "", frame.image)  # noqa: PTH118 - faster than a Path
         image = decode_gray(bounded_content(path, frame.image, size), name, frame.bits, size)
     if camera is not None and image.shape != (camera.height, camera.width):
-        raise FrameError(
-            f"{name}: is {image.shape[1]}x{image.shape[0]} px: "
-            f"expected {camera.width}x{camera.height}, the calibration's size: "
-            "name the calibration of these images by --camera"
-        )
+        raise wrong_size(name, (image.shape[1], image.shape[0]), (camera.width, camera.height))
     return image
 
 
 def camera_in(folder: Path) -> Camera | None:
     """The calibration in a run folder; None where there is none."""
-    return read_camera(_only_camera(folder)) if any(folder.glob("*.cam")) else None
-
-
-def _only_camera(folder: Path) -> Path:
-    cameras = sorted(folder.glob("*.cam"))
-    if not cameras:
-        if not any(p.is_dir() or p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir()):
-            raise DetectError(
-                f"{folder}: neither images nor a calibration: expected a run folder, or a folder "
-                "of images with a .cam file in it or named by --camera"
-            )
-        raise DetectError(
-            f"{folder}: no calibration: expected a .cam file in it, or one named by --camera; "
-            "`camera calibrate` makes one, `camera convert` brings one over from other programs"
-        )
-    own = folder / f"{folder.resolve().name}.cam"
-    if own in cameras:
-        return own
-    if len(cameras) > 1:
-        names = ", ".join(path.name for path in cameras[:4])
-        raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
-    return cameras[0]
+    return only_calibration(folder, folder.resolve().name)
 
 
 def _odometry(folder: Path) -> Path | None:

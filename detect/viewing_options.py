@@ -24,7 +24,7 @@ from detect.options import (
     SourceOptions,
 )
 from detect.settings import CircleSettings
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
+from redetect.storage.bounds import ABOVE_0, NotNegative, Positive, demand_fields
 
 ErrorCovariance = Literal["detected", "reference", "sum"]
 
@@ -45,14 +45,12 @@ class Gates:
         or by this many standard deviations of the detected one.
     """
 
-    gate_m: MaybeFloat = None
-    tolerance_deg: float = 0.5
-    sigmas: float = 2.0
+    gate_m: Annotated[MaybeFloat, ABOVE_0] = None
+    tolerance_deg: Positive = 0.5
+    sigmas: NotNegative = 2.0
 
     def __post_init__(self) -> None:
-        demand(self, CompareError, tolerance_deg=ABOVE_0, sigmas=NOT_NEGATIVE)
-        if self.gate_m is not None:
-            demand(self, CompareError, gate_m=ABOVE_0)
+        demand_fields(self, CompareError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,17 +75,11 @@ class CompareOptions(Gates):
         row's, or, where both err independently, their sum.
     """
 
-    sigma: MaybeFloat = None
-    least_px: float = 3.0
+    sigma: Annotated[MaybeFloat, ABOVE_0] = None
+    least_px: Positive = 3.0
     only_identified: bool = False
     all_frames: bool = False
     error_covariance: ErrorCovariance = "detected"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        demand(self, CompareError, least_px=ABOVE_0)
-        if self.sigma is not None:
-            demand(self, CompareError, sigma=ABOVE_0)
 
     @property
     def on_floor(self) -> bool:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
 
 FloatArray = NDArray[np.float64]
@@ -66,30 +66,19 @@ class DiscShape:
         tested, metres on the floor across the row; 0: none is left out.
     """
 
-    inner_radius_m: float = 0.06
-    outer_radius_m: float = 0.14
-    samples: int = 16
-    border_px: int = 12
-    far_limit_m_per_px: float = 0.05
-    least_pairs: int = 0
-    apart_px: float = 0.0
-    stride_m: float = 0.0
-    rows_m: float = 0.0
+    inner_radius_m: Positive = 0.06
+    outer_radius_m: Positive = 0.14
+    samples: Annotated[int, whole(3, 128)] = 16
+    border_px: Annotated[int, whole(0)] = 12
+    far_limit_m_per_px: Limit = 0.05
+    least_pairs: Annotated[int, whole(0)] = 0
+    apart_px: NotNegative = 0.0
+    stride_m: NotNegative = 0.0
+    rows_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            TableError,
-            inner_radius_m=ABOVE_0,
-            outer_radius_m=ABOVE_0,
-            samples=whole(3, 128),
-            border_px=whole(0),
-            far_limit_m_per_px=LIMIT,
-            least_pairs=whole(0, self.samples),
-            apart_px=NOT_NEGATIVE,
-            stride_m=NOT_NEGATIVE,
-            rows_m=NOT_NEGATIVE,
-        )
+        demand_fields(self, TableError)
+        demand(self, TableError, least_pairs=whole(0, self.samples))
         if not self.inner_radius_m < self.outer_radius_m:
             raise TableError(
                 f"inner_radius_m is {self.inner_radius_m:g}: expected less than outer_radius_m "

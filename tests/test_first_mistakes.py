@@ -41,7 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             ["no calibration", "--camera"],
             marks=pytest.mark.skipif(find_spec("rerun") is None, reason="rerun is not installed"),
         ),
-        ("detect circles empty", ["neither images nor a calibration", "expected a run folder"]),
+        ("detect circles empty", ["no images", "expected a run folder"]),
         ("detect circles gone", ["no such folder or file", "expected a run folder"]),
         ("detect circles calibrated -o gone/x.circles", ["no such folder: gone: make it first"]),
         ("detect circles calibrated -o ids/map.circles", ["exists already", "--force"]),

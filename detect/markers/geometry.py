@@ -160,21 +160,21 @@ def _farthest_points(hull: FloatArray) -> FloatArray:
     return np.asarray(chain[rivals.argmax(axis=1) == np.arange(len(chain))])
 
 
-@njit(cache=True, error_model="numpy")
 def signed_area(corners: FloatArray) -> float:
     """Area of a quadrangle (4, 2); positive if it is clockwise as seen in the image (v down)."""
-    a, b = corners[2] - corners[0], corners[3] - corners[1]
-    return float(0.5 * (a[0] * b[1] - a[1] * b[0]))
+    return float(_areas(corners))
 
 
-@njit(cache=True, error_model="numpy")
+def _areas(corners: FloatArray) -> FloatArray:
+    """(...,) areas of quadrangles (..., 4, 2)."""
+    a, b = corners[..., 2, :] - corners[..., 0, :], corners[..., 3, :] - corners[..., 1, :]
+    return np.asarray(0.5 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]))
+
+
 def is_convex(corners: FloatArray) -> bool:
     """Whether a clockwise quadrangle (4, 2) is strictly convex."""
-    for k in range(4):
-        a, b, c = corners[k], corners[(k + 1) % 4], corners[(k + 2) % 4]
-        if not (b[0] - a[0]) * (c[1] - b[1]) > (b[1] - a[1]) * (c[0] - b[0]):
-            return False
-    return True
+    along = corners[_NEXT] - corners
+    return bool(np.all(along[:, 0] * along[_NEXT, 1] > along[:, 1] * along[_NEXT, 0]))
 
 
 def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
@@ -191,21 +191,12 @@ def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
     return bool(np.any(inside(others, quadrangle.mean(axis=0)) | inside(quadrangle, middles)))
 
 
-@njit(cache=True, error_model="numpy")
 def count_same(first: FloatArray, others: FloatArray) -> int:
     """How many of (N, 4, 2) quadrangles have the same corners as one, in any order."""
-    total = 0
-    for other in others:
-        farthest = 0.0
-        for corner in first:
-            nearest = math.inf
-            for k in range(4):
-                apart = max(abs(corner[0] - other[k, 0]), abs(corner[1] - other[k, 1]))
-                nearest = min(nearest, apart)
-            farthest = max(farthest, nearest)
-        if farthest <= _SAME_PX + _SAME_WIDTHS * math.sqrt(abs(signed_area(other))):
-            total += 1
-    return total
+    apart = np.abs(first[:, None] - others[:, None]).max(axis=-1)
+    farthest = apart.min(axis=2).max(axis=1)
+    largest = _SAME_PX + _SAME_WIDTHS * np.sqrt(np.abs(_areas(others)))
+    return int(np.count_nonzero(farthest <= largest))
 
 
 def square_homography(corners: FloatArray) -> FloatArray:

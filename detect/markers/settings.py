@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from detect.errors import DetectError
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, SHARE, Bounds, demand, whole
+from redetect.storage.bounds import (
+    PROBABILITY,
+    Bounds,
+    NotNegative,
+    Positive,
+    Share,
+    demand,
+    demand_fields,
+    whole,
+)
 
 Darkness = Literal["ratio", "difference"]
 CornerAlgorithm = Literal["A", "B"]
@@ -77,59 +86,38 @@ class MarkerSettings:
     """
 
     dictionary: str = "rawseeds"
-    ids: tuple[int, ...] = ()
-    width_px: float = 0.0
-    thresholds: tuple[float, ...] = (0.5, 0.25, 0.12, 0.06, 0.03)
+    ids: Annotated[tuple[int, ...], whole(0)] = ()
+    width_px: NotNegative = 0.0
+    thresholds: Annotated[tuple[float, ...], PROBABILITY] = (0.5, 0.25, 0.12, 0.06, 0.03)
     darkness: Darkness = "ratio"
-    disc_widths: float = 0.5
+    disc_widths: Positive = 0.5
     pyramid: bool = True
-    dark_noise: float = 2.0
-    least_width_px: float = 9.0
-    area_factor: float = 6.0
-    least_holes: int = 0
-    most_holes: int = 40
-    least_solidity: float = 0.75
-    least_white: float = 0.0
-    most_white: float = 3.0
+    dark_noise: NotNegative = 2.0
+    least_width_px: Annotated[float, _LEAST_WIDTH] = 9.0
+    area_factor: Annotated[float, _AREA_FACTOR] = 6.0
+    least_holes: Annotated[int, whole(0)] = 0
+    most_holes: Annotated[int, whole(0)] = 40
+    least_solidity: Share = 0.75
+    least_white: NotNegative = 0.0
+    most_white: NotNegative = 3.0
     corners: CornerAlgorithm = "B"
-    least_square: float = 0.75
+    least_square: Share = 0.75
     joint: bool = True
-    least_contrast: float = 2.0
-    edge_balance: float = 0.3
-    largest_distance: float = 0.3
-    least_margin: float = 1.0
-    least_explained: float = 0.9
-    largest_cell_error: float = 0.45
-    systematic_px: float = 0.005
+    least_contrast: NotNegative = 2.0
+    edge_balance: Share = 0.3
+    largest_distance: Share = 0.3
+    least_margin: NotNegative = 1.0
+    least_explained: Share = 0.9
+    largest_cell_error: Share = 0.45
+    systematic_px: NotNegative = 0.005
 
     def __post_init__(self) -> None:
         if not self.thresholds:
             raise DetectError("thresholds is (): expected at least one number")
-        demand(
-            self,
-            DetectError,
-            ids=whole(0),
-            width_px=NOT_NEGATIVE,
-            thresholds=PROBABILITY,
-            disc_widths=ABOVE_0,
-            dark_noise=NOT_NEGATIVE,
-            least_width_px=_LEAST_WIDTH,
-            area_factor=_AREA_FACTOR,
-            most_holes=whole(0),
-            least_holes=whole(0, self.most_holes),
-            least_solidity=SHARE,
-            most_white=NOT_NEGATIVE,
-            least_white=Bounds(f"0 to most_white ({self.most_white})", 0.0, self.most_white,
-                               below=True),
-            least_square=SHARE,
-            least_contrast=NOT_NEGATIVE,
-            edge_balance=SHARE,
-            largest_distance=SHARE,
-            least_margin=NOT_NEGATIVE,
-            least_explained=SHARE,
-            largest_cell_error=SHARE,
-            systematic_px=NOT_NEGATIVE,
-        )  # fmt: skip
+        demand_fields(self, DetectError)
+        most_white = Bounds(f"0 to most_white ({self.most_white})", 0.0, self.most_white)
+        most_holes = whole(0, self.most_holes)
+        demand(self, DetectError, least_holes=most_holes, least_white=most_white)
 
 
 DEFAULT = MarkerSettings()

@@ -72,9 +72,7 @@ def _circles(command: Circles, run: Run) -> Job:
     if command.json is not None:
         places["json"] = command.json
     settings = _with_radius(command.settings, run) if command.find_radius else command.settings
-    plan = FramePlan(
-        run.camera, circles=settings, drawing=None if command.draw is None else "discs"
-    )
+    plan = FramePlan(run.camera, circles=settings, drawing="discs")
     tilts = None if command.tilt is None else read_tilts(command.tilt)
     known = replace(_known_discs(command.ids), tilts=tilts)
     return Job(run, plan, places, known, command.draw)
@@ -87,13 +85,7 @@ def _lines(command: Lines, run: Run) -> Job:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
     drawing: Drawing = "tracks" if command.rejected else "lines"
-    draws = command.draw is not None
-    plan = FramePlan(
-        run.camera,
-        lines=settings,
-        drawing=drawing if draws else None,
-        draw_response=draws and command.response,
-    )
+    plan = FramePlan(run.camera, lines=settings, drawing=drawing, draw_response=command.response)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     known = Known(lines=_frames(command.ids_from))
     return Job(run, plan, places, known, command.draw)
@@ -101,11 +93,8 @@ def _lines(command: Lines, run: Run) -> Job:
 
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
-    plan = FramePlan(
-        run.camera if isinstance(run, Run) else None,
-        markers=command.settings,
-        drawing=None if command.draw is None else "markers",
-    )
+    camera = run.camera if isinstance(run, Run) else None
+    plan = FramePlan(camera, markers=command.settings, drawing="markers")
     return Job(run, plan, {"markers": _output(command, run, "markers")}, pictures=command.draw)
 
 
@@ -171,15 +160,12 @@ def _known_discs(options: DiscIdOptions) -> Known:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
-    mapped = None
+    known = Known(discs=_frames(options.ids_from), slack_m=options.id_slack_m)
+    if options.ids_from is not None:
+        known = replace(known, discs_level=read_head(options.ids_from).level)
     if options.ids_from_map is not None and options.path is not None:
-        mapped = MapByImage(options.ids_from_map, options.path)
-    return Known(
-        discs=_frames(options.ids_from),
-        discs_level=options.ids_from is not None and read_head(options.ids_from).level,
-        mapped=mapped,
-        slack_m=options.id_slack_m,
-    )
+        known = replace(known, mapped=MapByImage(options.ids_from_map, options.path))
+    return known
 
 
 def _workers(command: DetectorFlags, job: Job) -> Workers:

@@ -79,12 +79,6 @@ class FrameDetections:
     markers: MarkerDetections | None = None
     error: str | None = None  # why the frame cannot be worked on
 
-    @property
-    def pixels(self) -> NDArray[np.uint8]:
-        """The image, where there is one."""
-        assert self.image is not None
-        return self.image
-
 
 class Tables(NamedTuple):
     """The tables by the calibration that a plan needs."""
@@ -309,9 +303,10 @@ def _drawn(
     rows: Mapping[str, str], found: FrameDetections, plan: FramePlan
 ) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     """The pictures of a plan, by the endings of their names."""
-    if plan.drawing is None and not plan.draw_response:
+    image = found.image
+    if image is None or (plan.drawing is None and not plan.draw_response):
         return
-    image, table = found.pixels, tables_of(plan).verticals
+    table = tables_of(plan).verticals
     kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
     content = io.BytesIO(rows[kind].encode("utf-8", "surrogateescape"))
     (frame,) = frames_of_rows(parse_rows(content))
@@ -390,5 +385,4 @@ def _tilt_of_row(row: str) -> _Tilted:
     if keyword == "NOTILT":
         return prefix, int(words[0]), None
     pitch, roll, cpp, cpr, crr = map(float, words[:5])
-    lines = int(words[5])
-    return prefix, lines, FrameTilt(prefix, pitch, roll, cpp, cpr, crr, lines)
+    return prefix, int(words[5]), FrameTilt(prefix, pitch, roll, cpp, cpr, crr, int(words[5]))

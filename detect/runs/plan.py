@@ -63,9 +63,6 @@ class KnownOfFrame(NamedTuple):
     slack_m: float = 0.1
 
 
-NOTHING = KnownOfFrame()
-
-
 @dataclass(frozen=True)
 class Known:
     """Prior data on the frames of a run, by the prefixes of their images."""
@@ -163,7 +160,8 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: What is drawn into the image: "tracks" are all of the lines', with why some are no lines.
+    #: What is drawn into the image, if pictures have a place: "tracks" are all of the lines', with
+    #: why some are no lines.
     drawing: Drawing | None = None
     draw_response: bool = False  # of the lines' filter
     #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
@@ -205,7 +203,7 @@ class FrameTask(NamedTuple):
     """A frame to be processed, prior data on it, and its plan if it is not the run's. Small."""
 
     frame: RunFrame
-    known: KnownOfFrame = NOTHING
+    known: KnownOfFrame = KnownOfFrame()
     plan: FramePlan | None = None
 
     @property

@@ -54,20 +54,19 @@ def detect_run(
 
     Raises
     ------
-    lut.TableError
-        If there can be no table for the camera.
-    redetect.storage.OutputExistsError
-        If an output exists and must not be replaced.
-    WorkerError
-        If there are no workers.
     DetectError
         If another run is writing the same files, a frame fails where every frame is demanded, or
         there is no such dictionary of markers.
+    lut.TableError, redetect.storage.OutputExistsError, WorkerError
+        If there can be no table for the camera, an output exists and must not be replaced, or there
+        are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
-    job = replace(job, plan=plan)
-    if job.pictures is not None:
+    if job.pictures is None:
+        plan = replace(plan, drawing=None, draw_response=False)
+    else:
         make_folder(job.pictures)
+    job = replace(job, plan=plan)
     workers = workers or local_workers(1, large=job.ships_images)
     summary = RunSummary()
 

@@ -144,8 +144,13 @@ def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -
             f"expected at most {MOST_PIXELS} pixels"
         )
     if size is not None and size != claimed:
-        raise FrameError(
-            f"{name}: is {width}x{height} px: "
-            f"expected {size[0]}x{size[1]}, the calibration's size: "
-            "name the calibration of these images by --camera"
-        )
+        raise wrong_size(name, claimed, size)
+
+
+def wrong_size(name: object, found: tuple[int, int], expected: tuple[int, int]) -> FrameError:
+    """The error of an image that has not the calibration's width and height."""
+    return FrameError(
+        f"{name}: is {found[0]}x{found[1]} px: "
+        f"expected {expected[0]}x{expected[1]}, the calibration's size: "
+        "name the calibration of these images by --camera"
+    )

@@ -120,7 +120,9 @@ def images_of_folder(folder: Path) -> ImageNames:
             if len(found):
                 return found
     kinds = " ".join(sorted(IMAGE_SUFFIXES))
-    raise DetectError(f"{folder}: no images: expected {kinds} in it or in {folder / 'images'}")
+    raise DetectError(
+        f"{folder}: no images: expected a run folder, or {kinds} in it or in {folder / 'images'}"
+    )
 
 
 class NameIndex:

@@ -82,12 +82,13 @@ Share = Annotated[float, SHARE]
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
     """Refuse settings with a number out of its bounds; these are given by the attributes' names.
 
-    Each number of a tuple is checked. The error names the setting, its value and what was expected.
+    Each number of a tuple is checked, None is passed over. The error names the setting, its value
+    and what was expected.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if not allowed.hold(number):
+            if number is not None and not allowed.hold(number):
                 shown = f"{number:g}" if isinstance(number, float) else excerpt(number)
                 raise error(f"{name} is {shown}: expected {allowed.expected}")
 

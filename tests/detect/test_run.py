@@ -166,7 +166,7 @@ def test_no_folder(tmp_path: Path) -> None:
 
 def test_no_images(run_folder: Path) -> None:
     touch(run_folder, "notes.md")
-    with pytest.raises(DetectError, match=r"no images: expected .*\.jpg .*\.png"):
+    with pytest.raises(DetectError, match=r"no images: expected a run folder, or .*\.jpg .*\.png"):
         open_run(run_folder)
 
 
