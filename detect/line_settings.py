@@ -32,155 +32,97 @@ class LineSettings:
     Lengths along a line are given in widths of a pixel, so that they mean the same for full frames
     and for single fields, whose rows are twice as high; parameters of the filter are in rows.
     Parameters named `largest_...` may be infinite: no limit.
-
-    Parameters
-    ----------
-    sigma_across_px, sigma_along_rows : float
-        Gaussian window of the filter, across and along the line.
-    regulariser : float
-        Added to the variance in the window, grey values squared: steps much smaller than its root
-        give no response.
-    threshold : float
-        Least response of a point, 0 to 1; an ideal step has 2/pi.
-    border_rows : int
-        Rows at the upper and lower border that are left out.
-    start_band_rows, start_spacing_rows : int
-        Tracks start on the horizon and on every `start_spacing_rows`-th row up to `start_band_rows`
-        from it.
-    gap_rows : int
-        Rows without a point that a track bridges.
-    guided : bool
-        Whether tracks are followed a second time, along the verticals of the estimated tilt.
-    first_edges : int
-        In the first pass only this many edges are followed, those with the highest responses on the
-        horizon, if they determine the tilt beyond doubt; 0: all edges, always.
-    guided_pull, guided_reach_px : float
-        In the second pass, the share of a point's offset by which the track is corrected, and the
-        largest offset.
-    refine_steps_px : tuple of (float, float)
-        Steps in which lines are refined on the grey values: width of the Gaussian and largest
-        displacement of a line by the step; none for the eigen-decomposition of the tracked points
-        alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
-        agrees with them in the end, the edge is isolated and the wide one is right.
-    fine_scale_px, coarse_scale_px : float
-        Widths whose contrasts are compared: their ratio is the edge's sharpness.
-    least_rows : int
-        Least number of points of a line.
-    least_length_px : float
-        The same as a length.
-    least_evidence : float
-        Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
-    least_sharpness : float
-        Edges fainter than the image's median must have this part of the sharpness that a quarter of
-        its lines stay below: fainter and softer ones are shadows and glare.
-    soft_evidence : float
-        Unless they have this evidence.
-    largest_horizon_gap_px : float
-        Largest distance of a line's end from the horizon (or from the anchor that replaces it where
-        the camera does not see it: `lut.verticals`).
-    largest_scatter_px : float
-        Largest root-mean-square distance of the points from the line.
-    largest_shift_px : float
-        Largest displacement of a line by the refinement.
-    largest_noise_px : float
-        Largest standard deviation of a line's place at the horizon due to noise.
-    bend_px : float
-        Standard deviation of a line's lean over its length due to causes other than noise.
-    lean_noise : float
-        Variance of a line's lean due to noise, relative to that of noise which is independent from
-        row to row: the surroundings of an edge and its blur are correlated over many rows.
-    largest_lean_deg, largest_lean_sigmas, largest_lean_px : float
-        How far a line may lean from the vertical: its angle, standard deviations due to noise, and
-        pixels over its length, added in squares.
-    largest_tilt_deg : float
-        Largest absolute pitch and roll.
-    tilt_prior_deg : float
-        Standard deviation of the tilt; decides only between tilts that the lines support alike.
-    building_deg : float
-        Standard deviation of real verticals about the vertical.
-    proposers : int
-        Candidates for the tilt come from pairs of this many lines, the strongest.
-    least_lines : int
-        With fewer lines that agree there is no tilt.
-    stray_share : float
-        Share of lines that are no verticals: the tilt's covariance is then the mean square error
-        of `detect.verticals.tilt`; 0 for that of least squares.
-    weight_limit : float
-        Votes of a line in the consensus grow with its evidence up to this.
-    same_edge_px : float
-        Of two lines of equal polarity closer than this at the horizon only the stronger is kept.
-    join_px : float
-        Lines closer than this at the horizon are joined to one row.
-    join_share : float
-        Lines with less than this part of the other's evidence are dropped instead.
-    joined : "evidence" or "equal"
-        Joined lines are weighted by their evidence, and the row has the ends of the strongest; or
-        all have equal weight, and ends and inclination are means as well, as in the data set's own
-        rows.
-    shoulder_px, shoulder_share : float
-        Lines closer than this to another one, with at most this share of its contrast, are dropped:
-        they are effects of light beside an edge.
-    sigma_px : float
-        Standard deviation of an edge about the line of the building that it shows.
-    blurred_sharpness : float
-        Images whose edges have a median sharpness below this are processed again,
-    blurred_widths : tuple of float
-        with a filter wider by whichever of these factors suits the blur (see
-        `detect.verticals.blur`); none: never.
-    alpha : "level" or "published"
-        Bearings compensated for the tilt, or with the sign that the data set's own rows have.
     """
 
-    sigma_across_px: Positive = 0.8
-    sigma_along_rows: Positive = 2.0
+    sigma_across_px: Positive = 0.8  #: Gaussian window of the filter across the line.
+    sigma_along_rows: Positive = 2.0  #: Gaussian window of the filter along the line.
+    #: Added to the variance in the window, grey values squared: steps much smaller than its root
+    #: give no response.
     regulariser: Positive = 40.0
-    threshold: ShareAbove0 = 0.12
+    threshold: ShareAbove0 = 0.12  #: Least response of a point, 0 to 1; an ideal step has 2/pi.
+    #: Rows at the upper and lower border that are left out.
     border_rows: Annotated[int, whole(0)] = 2
+    #: Tracks start on the horizon and on rows up to this far from it,
     start_band_rows: Annotated[int, whole(0)] = 20
-    start_spacing_rows: Annotated[int, whole(1)] = 4
-    gap_rows: Annotated[int, whole(0)] = 6
+    start_spacing_rows: Annotated[int, whole(1)] = 4  #: on every n-th of them.
+    gap_rows: Annotated[int, whole(0)] = 6  #: Rows without a point that a track bridges.
+    #: Whether tracks are followed a second time, along the verticals of the estimated tilt.
     guided: bool = True
+    #: In the first pass only this many edges are followed, those with the highest responses on the
+    #: horizon, if they determine the tilt beyond doubt; 0: all edges, always.
     first_edges: Annotated[int, whole(0)] = 10
+    #: In the second pass, the share of a point's offset by which the track is corrected.
     guided_pull: ShareAbove0 = 0.07
-    guided_reach_px: Positive = 0.75
+    guided_reach_px: Positive = 0.75  #: In the second pass, the largest offset of a point.
+    #: Steps in which lines are refined on the grey values: width of the Gaussian and largest
+    #: displacement of a line by the step; none for the eigen-decomposition of the tracked points
+    #: alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
+    #: agrees with them in the end, the edge is isolated and the wide one is right.
     refine_steps_px: tuple[tuple[float, float], ...] = (
         (1.2, math.inf),
         (0.8, 1.5),
         (0.8, 1.5),
         (1.8, 0.1),
     )
-    fine_scale_px: Positive = 0.8
+    fine_scale_px: Positive = 0.8  #: Fine width at which an edge's contrast is measured, and
+    #: the coarse one: the ratio of the contrasts is the edge's sharpness.
     coarse_scale_px: Positive = 1.6
-    least_rows: Annotated[int, whole(5)] = 14
-    least_length_px: NotNegative = 24.0
+    least_rows: Annotated[int, whole(5)] = 14  #: Least number of points of a line.
+    least_length_px: NotNegative = 24.0  #: The same as a length.
+    #: Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
     least_evidence: NotNegative = 7.0
+    #: Edges fainter than the image's median must have this part of the sharpness that a quarter of
+    #: its lines stay below: fainter and softer ones are shadows and glare.
     least_sharpness: NotNegative = 0.87
-    soft_evidence: NotNegative = 40.0
+    soft_evidence: NotNegative = 40.0  #: Unless they have this evidence.
+    #: Largest distance of a line's end from the horizon (or from the anchor that replaces it where
+    #: the camera does not see it: `lut.verticals`).
     largest_horizon_gap_px: LimitOr0 = 11.0
+    #: Largest root-mean-square distance of the points from the line.
     largest_scatter_px: LimitOr0 = 1.0
-    largest_shift_px: LimitOr0 = 1.0
+    largest_shift_px: LimitOr0 = 1.0  #: Largest displacement of a line by the refinement.
+    #: Largest standard deviation of a line's place at the horizon due to noise.
     largest_noise_px: LimitOr0 = 0.3
+    #: Standard deviation of a line's lean over its length due to causes other than noise.
     bend_px: NotNegative = 0.06
+    #: Variance of a line's lean due to noise, relative to that of noise which is independent from
+    #: row to row: the surroundings of an edge and its blur are correlated over many rows.
     lean_noise: NotNegative = 3.0
-    largest_lean_deg: LimitOr0 = 0.7
-    largest_lean_sigmas: LimitOr0 = 8.0
-    largest_lean_px: LimitOr0 = 1.5
-    largest_tilt_deg: Positive = 8.0
+    largest_lean_deg: LimitOr0 = 0.7  #: How far a line may lean from the vertical: by this angle,
+    largest_lean_sigmas: LimitOr0 = 8.0  #: this many standard deviations due to noise,
+    largest_lean_px: LimitOr0 = 1.5  #: and this many pixels over its length, added in squares.
+    largest_tilt_deg: Positive = 8.0  #: Largest absolute pitch and roll.
+    #: Standard deviation of the tilt; decides only between tilts that the lines support alike.
     tilt_prior_deg: Positive = 2.0
-    building_deg: Positive = 0.025
+    building_deg: Positive = 0.025  #: Standard deviation of real verticals about the vertical.
+    #: Candidates for the tilt come from pairs of this many lines, the strongest.
     proposers: Annotated[int, whole(2, 1000)] = 24
-    least_lines: Annotated[int, whole(2)] = 3
+    least_lines: Annotated[int, whole(2)] = 3  #: With fewer lines that agree there is no tilt.
+    #: Share of lines that are no verticals: the tilt's covariance is then the mean square error of
+    #: `detect.verticals.tilt`; 0 for that of least squares.
     stray_share: Annotated[float, from_to(0.0, 0.5)] = 0.15
+    #: Votes of a line in the consensus grow with its evidence up to this.
     weight_limit: Positive = 3.0
+    #: Of two lines of equal polarity closer than this at the horizon only the stronger is kept.
     same_edge_px: NotNegative = 2.0
-    join_px: NotNegative = 2.7
+    join_px: NotNegative = 2.7  #: Lines closer than this at the horizon are joined to one row.
+    #: Lines with less than this part of the other's evidence are dropped instead.
     join_share: NotNegative = 0.5
+    #: Joined lines are weighted by their evidence, and the row has the ends of the strongest; or
+    #: all have equal weight, and ends and inclination are means as well, as in the data set's own
+    #: rows.
     joined: Joining = "evidence"
+    #: Lines closer than this to another one are effects of light beside an edge, and dropped,
     shoulder_px: NotNegative = 5.0
-    shoulder_share: NotNegative = 0.5
+    shoulder_share: NotNegative = 0.5  #: if they have at most this share of its contrast.
+    #: Standard deviation of an edge about the line of the building that it shows.
     sigma_px: Positive = 0.9
+    #: Images whose edges have a median sharpness below this are processed again,
     blurred_sharpness: Share = 0.62
+    #: with a filter wider by whichever of these factors suits the blur (see
+    #: `detect.verticals.blur`); none: never.
     blurred_widths: Annotated[tuple[float, ...], _WIDTH] = (1.5, 2.0, 3.0, 4.0, 6.0)
+    #: Bearings compensated for the tilt, or with the sign that the data set's own rows have.
     alpha: BearingConvention = "level"
 
     def __post_init__(self) -> None:

@@ -30,40 +30,22 @@ LineEnds = Literal["lf", "crlf"]
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """Options of all commands that process the frames of a run.
+    """Options of all commands that process the frames of a run."""
 
-    Parameters
-    ----------
-    run : Path
-        Run folder, folder or pattern of images, video or bag, as for `detect circles`.
-    output : Path
-        The file to write.
-    camera : Path
-        Calibration, if it is not the one in the run folder.
-    force : bool
-        Replace existing files.
-    """
-
+    #: Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    camera: MaybePath = None
-    force: bool = False
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None  #: The file to write.
+    camera: MaybePath = None  #: Calibration, if it is not the one in the run folder.
+    force: bool = False  #: Replace existing files.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PickedFrames:
-    """Selects the frames of a run.
+    """Selects the frames of a run."""
 
-    Parameters
-    ----------
-    every : int
-        Only every n-th frame.
-    frames : tuple of str
-        Only these frames: names of images, positions in the run, and ranges FROM:TO or
-        FROM:TO:STEP of positions without the last.
-    """
-
-    every: int = 1
+    every: int = 1  #: Only every n-th frame.
+    #: Only these frames: names of images, positions in the run, and ranges FROM:TO or FROM:TO:STEP
+    #: of positions without the last.
     frames: tuple[str, ...] = ()
 
 
@@ -73,44 +55,27 @@ Axes = Literal["robotics", "dataset"]
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of a source besides its name.
+    """Options of a source besides its name."""
 
-    Parameters
-    ----------
-    odometry : str
-        Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-        z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
-        nav_msgs/Odometry topic of the bag (/odom), or none.
-    odometry_axes : str
-        Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
-        backward).
-    wheel_base_m : float
-        Distance of the two wheels whose ticks are counted.
-    metres_per_tick : float
-        Way of a wheel from one tick to the next.
-    times : str
-        File of the images' times, rows `prefix seconds`; by default <folder>.times among the
-        images.
-    image_topic : str
-        The images of a bag, if there are several topics of them.
-    base_frame : str
-        The frame of the robot's base, on the floor, in a bag that holds the calibration itself
-        (camera_info and tf_static); by default base_footprint.
-    frames : int
-        Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
-    bits : int
-        Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
-        the values of the first images.
-    """
-
+    #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
+    #: z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
+    #: nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
+    #: Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
+    #: backward).
     odometry_axes: Axes = "robotics"
-    wheel_base_m: NotNegative = 0.0
-    metres_per_tick: NotNegative = 0.0
+    wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
+    metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
+    #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
     times: str = ""
-    image_topic: str = ""
+    image_topic: str = ""  #: The images of a bag, if there are several topics of them.
+    #: The frame of the robot's base, on the floor, in a bag that holds the calibration itself
+    #: (camera_info and tf_static); by default base_footprint.
     base_frame: str = ""
+    #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0)] = 0
+    #: Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
+    #: the values of the first images.
     bits: int = 0
 
     def __post_init__(self) -> None:
@@ -137,50 +102,34 @@ class DetectorFlags(RunFlags):
     output : Path
         The file to write; by default detected.circles, .lines or .markers in the run folder, or
         named after the video or bag and beside it.
-    preset : str
-        Values that the other flags start from.
-    line_ends : str
-        How lines end in files of landmarks; the data set's own end with CR and LF.
-    jobs : int
-        Processes that share the work, 1 for none beside this one; by default one for every 500
-        frames, at most as many as there are cores. What is written is the same.
-    cluster : str
-        Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
-    strict : bool
-        Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
-    resume : bool
-        Take over the frames that an unfinished run of the same command kept, and go on after them.
     """
 
-    preset: Preset = "default"
+    preset: Preset = "default"  #: Values that the other flags start from.
+    #: How lines end in files of landmarks; the data set's own end with CR and LF.
     line_ends: LineEnds = "lf"
+    #: Processes that share the work, 1 for none beside this one; by default one for every 500
+    #: frames, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
+    #: Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     cluster: MaybeStr = None
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    #: Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
     strict: bool = False
+    #: Take over the frames that an unfinished run of the same command kept, and go on after them.
     resume: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiscIdOptions:
-    """Where the IDs of discs come from.
+    """Where the IDs of discs come from."""
 
-    Parameters
-    ----------
-    ids_from : Path
-        A .circles file whose IDs are carried over to the rows of the same discs, levelled or not.
-    ids_from_map : Path
-        A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
-        fall on,
-    path : Path
-        seen from the frame's pose in this path (path.csv of `slam map`),
-    id_slack_m : float
-        with this standard deviation of map and path added to the covariances, metres.
-    """
-
+    #: A .circles file whose IDs are carried over to the rows of the same discs, levelled or not.
     ids_from: MaybePath = None
+    #: A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
+    #: fall on,
     ids_from_map: MaybePath = None
-    path: MaybePath = None
+    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`),
+    #: with this standard deviation of map and path added to the covariances, metres.
     id_slack_m: NotNegative = 0.1
 
     def __post_init__(self) -> None:
@@ -199,22 +148,16 @@ class Circles(DetectorFlags):
     preset : str
         Values that the other flags start from: `published` is the detector that made the data set's
         rows (all of them and only those), `report` what the report prints of it.
-    tilt : Path
-        Tilts of the frames (written by `detect lines`): positions are corrected for them.
-    draw : Path
-        Folder for images with the outlines and qualities drawn in.
-    json : Path
-        Write the rows with their pixels and evidence as JSON as well.
-    find_radius : bool
-        Find the radius of the discs in some of the images first; so says --radius-m auto, too.
     """
 
     preset: DiscPreset = "default"  # type: ignore[assignment]
+    #: Tilts of the frames (written by `detect lines`): positions are corrected for them.
     tilt: MaybePath = None
+    #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    draw: MaybePath = None
-    json: MaybePath = None
+    draw: MaybePath = None  #: Folder for images with the outlines and qualities drawn in.
+    json: MaybePath = None  #: Write the rows with their pixels and evidence as JSON as well.
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
@@ -230,27 +173,19 @@ class Lines(DetectorFlags):
     preset : str
         Values that the other flags start from: `published` gives the data set's own rows as far as
         they are known, `report` is what the report prints of their detector.
-    tilt : Path
-        The tilt file to write; by default the output's name with the ending .tilt.
-    ids_from : Path
-        A .lines file whose IDs are carried over where the match is unambiguous.
-    join_threshold : float
-        Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
-    draw : Path
-        Folder for images with the lines and their standard deviations drawn in.
-    rejected : bool
-        Draw all tracks instead, the rejected ones with the reason.
-    response : bool
-        Draw the filter's response as well, into files of their own.
     """
 
     preset: Literal["default", "published", "report"] = "default"  # type: ignore[assignment]
+    #: The tilt file to write; by default the output's name with the ending .tilt.
     tilt: MaybePath = None
+    #: A .lines file whose IDs are carried over where the match is unambiguous.
     ids_from: MaybePath = None
+    #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
     join_threshold: MaybeFloat = None
+    #: Folder for images with the lines and their standard deviations drawn in.
     draw: MaybePath = None
-    rejected: bool = False
-    response: bool = False
+    rejected: bool = False  #: Draw all tracks instead, the rejected ones with the reason.
+    response: bool = False  #: Draw the filter's response as well, into files of their own.
     settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -270,10 +205,9 @@ class Markers(DetectorFlags):
         without one, edges are taken to be straight in the images.
     preset : str
         Values that the other flags start from: `published` is the report's detector.
-    draw : Path
-        Folder for images with the markers drawn in, and with what was rejected.
     """
 
+    #: Folder for images with the markers drawn in, and with what was rejected.
     draw: MaybePath = None
     settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
@@ -290,19 +224,16 @@ class All(DetectorFlags):
     output : Path
         Folder for detected.circles, detected.lines and detected.tilt; by default the run's, or
         named after the video or bag and beside it.
-    line_ids_from : Path
-        A .lines file whose IDs are carried over where the match is unambiguous.
-    find_radius : bool
-        Find the radius of the discs in some of the images first; so says --circles.radius-m auto,
-        too.
-    tilt : str
-        What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
-        lean, and the estimated deviation of each frame from it).
     """
 
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
+    #: A .lines file whose IDs are carried over where the match is unambiguous.
     line_ids_from: MaybePath = None
+    #: What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
+    #: lean, and the estimated deviation of each frame from it).
     tilt: Levelling = "run"
+    #: Find the radius of the discs in some of the images first; so says --circles.radius-m auto,
+    #: too.
     find_radius: bool = False
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)

@@ -31,86 +31,56 @@ _OUTSIDE = Bounds("more than 1, the disc's edge", 1.0, above=True, below=True)
 
 @dataclass(frozen=True)
 class CircleSettings:
-    """All settings of the disc detector.
+    """All settings of the disc detector."""
 
-    Parameters
-    ----------
-    radius_m : float
-        Radius of the discs, metres.
-    inner_ring : float
-        Radius of the outline inside the disc's edge, as a share of the disc's.
-    outer_ring : float
-        Radius of the outline outside the disc's edge, as a share of the disc's.
-    samples : int
-        Samples on each outline.
-    pairs_inside : float
-        Samples are counted in pairs, an inner and an outer one, and at least this share of them
-        must be inside the image; 0: samples are counted singly.
-    apart_px : float
-        How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-        outwards: the length on the floor of this many pixels down the image.
-    stride : float
-        From one centre to the next along a row: this share of the distance between the outlines,
-        in pixels as long as one down the image, rounded up; 0: every pixel is a centre.
-    threshold : float
-        Least quality (between-class / total variance), 0 to 1.
-    border_px : int
-        Centres keep this distance from the image's border, pixels.
-    far_limit : float
-        Centres are so near that the floor moves at most this share of the radius per image row;
-        infinite: however far.
-    polarity : {"any", "light", "dark"}
-        Which discs to detect: lighter than the floor, darker, or both.
-    rows_apart : float
-        If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
-        each row of a disc is at most this share of the distance between the disc's edge and the
-        nearer outline from an evaluated row, and centres along a row, up to half of that; 0: every
-        centre is evaluated.
-    least_contrast : float
-        Without a fit: the mean grey values of the outlines differ by more than this.
-    noise_floor : float
-        Least contrast between the outlines, in standard deviations of the image's noise (or in
-        grey levels, where the noise is less than one).
-    separation : float
-        Of detections closer than this on the floor, in radii, only the best is reported; 0 reports
-        all.
-    verify : bool
-        Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
-        Without this and `refine` nothing is fitted.
-    evidence : float
-        Least evidence (log-odds, see `detect.discs.fit.disc_evidence`).
-    blur_px : float
-        Standard deviation of the optics' blur along u, pixels. Blurred edges are evidence against a
-        disc unless the camera blurs everything: the data set's own does, by about 6.
-    refine : bool
-        Report the fitted position and its covariance instead of the pixel's.
-    systematic_px : float
-        Systematic error of a refined position, pixels: added to its covariance.
-    tilt_sigma_deg : float
-        Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
-        refined position's covariance if the frame's tilt is unknown.
-    """
-
-    radius_m: Positive = 0.10
+    radius_m: Positive = 0.10  #: Radius of the discs, metres.
+    #: Radius of the outline inside the disc's edge, as a share of the disc's.
     inner_ring: Annotated[float, _INSIDE] = 0.6
+    #: Radius of the outline outside the disc's edge, as a share of the disc's.
     outer_ring: Annotated[float, _OUTSIDE] = 1.4
-    samples: Annotated[int, whole(3, 128)] = 16
+    samples: Annotated[int, whole(3, 128)] = 16  #: Samples on each outline.
+    #: Samples are counted in pairs, an inner and an outer one, and at least this share of them must
+    #: be inside the image; 0: samples are counted singly.
     pairs_inside: Share = 0.0
+    #: How far the samples of a pair that fall on the same pixel are moved, one inwards and one
+    #: outwards: the length on the floor of this many pixels down the image.
     apart_px: NotNegative = 0.0
+    #: From one centre to the next along a row: this share of the distance between the outlines, in
+    #: pixels as long as one down the image, rounded up; 0: every pixel is a centre.
     stride: NotNegative = 0.0
-    threshold: ShareAbove0 = 0.5
+    threshold: ShareAbove0 = 0.5  #: Least quality (between-class / total variance), 0 to 1.
+    #: Centres keep this distance from the image's border, pixels.
     border_px: Annotated[int, whole(0)] = 6
+    #: Centres are so near that the floor moves at most this share of the radius per image row;
+    #: infinite: however far.
     far_limit: Limit = 1.2
-    polarity: Polarity = "any"
+    polarity: Polarity = "any"  #: Which discs to detect: lighter than the floor, darker, or both.
+    #: If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
+    #: each row of a disc is at most this share of the distance between the disc's edge and the
+    #: nearer outline from an evaluated row, and centres along a row, up to half of that; 0: every
+    #: centre is evaluated.
     rows_apart: Share = 0.75
+    #: Without a fit: the mean grey values of the outlines differ by more than this.
     least_contrast: NotNegative = 0.0
+    #: Least contrast between the outlines, in standard deviations of the image's noise (or in grey
+    #: levels, where the noise is less than one).
     noise_floor: NotNegative = 3.0
+    #: Of detections closer than this on the floor, in radii, only the best is reported; 0 reports
+    #: all.
     separation: NotNegative = 1.4
+    #: Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
+    #: Without this and `refine` nothing is fitted.
     verify: bool = True
+    #: Least evidence (log-odds, see `detect.discs.fit.disc_evidence`).
     evidence: Annotated[float, FINITE] = 0.6
+    #: Standard deviation of the optics' blur along u, pixels. Blurred edges are evidence against a
+    #: disc unless the camera blurs everything: the data set's own does, by about 6.
     blur_px: NotNegative = 1.0
-    refine: bool = True
+    refine: bool = True  #: Report the fitted position and its covariance instead of the pixel's.
+    #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
+    #: Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
+    #: refined position's covariance if the frame's tilt is unknown.
     tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
 
     def __post_init__(self) -> None:

@@ -31,23 +31,13 @@ ErrorCovariance = Literal["detected", "reference", "sum"]
 
 @dataclass(frozen=True, kw_only=True)
 class Gates:
-    """Which detected and reference rows are the same landmark.
+    """Which detected and reference rows are the same landmark."""
 
-    Parameters
-    ----------
-    gate_m : float
-        Compare discs on the floor: they are the same within this distance, metres. By default they
-        are compared in the image where there is a calibration, and within 0.1 m where there is
-        none.
-    tolerance_deg : float
-        Bearings of the same line differ by at most this,
-    sigmas : float
-        or by this many standard deviations of the detected one.
-    """
-
+    #: Compare discs on the floor: they are the same within this distance, metres. By default they
+    #: are compared in the image where there is a calibration, and within 0.1 m where there is none.
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
-    tolerance_deg: Positive = 0.5
-    sigmas: NotNegative = 2.0
+    tolerance_deg: Positive = 0.5  #: Bearings of the same line differ by at most this,
+    sigmas: NotNegative = 2.0  #: or by this many standard deviations of the detected one.
 
     def __post_init__(self) -> None:
         demand_fields(self, CompareError)
@@ -55,30 +45,21 @@ class Gates:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(Gates):
-    """Which rows are the same landmark, and which rows count.
+    """Which rows are the same landmark, and which rows count."""
 
-    Parameters
-    ----------
-    sigma : float
-        Compare discs on the floor: they are the same within this Mahalanobis distance under the
-        reference row's covariance (standard deviations).
-    least_px : float
-        In the image, discs are the same if they differ by at most half the width and height of the
-        disc's own image, or by this (px), whichever is more.
-    only_identified : bool
-        Count only reference rows that have an ID. Detected rows that fit a reference row without
-        one are then neither right nor wrong: they are set aside.
-    all_frames : bool
-        Count frames that only one file has, too: all their rows are missed, or extra.
-    error_covariance : {"detected", "reference", "sum"}
-        Which covariance position errors of discs are measured in: the detected row's, the reference
-        row's, or, where both err independently, their sum.
-    """
-
+    #: Compare discs on the floor: they are the same within this Mahalanobis distance under the
+    #: reference row's covariance (standard deviations).
     sigma: Annotated[MaybeFloat, ABOVE_0] = None
+    #: In the image, discs are the same if they differ by at most half the width and height of the
+    #: disc's own image, or by this (px), whichever is more.
     least_px: Positive = 3.0
+    #: Count only reference rows that have an ID. Detected rows that fit a reference row without one
+    #: are then neither right nor wrong: they are set aside.
     only_identified: bool = False
+    #: Count frames that only one file has, too: all their rows are missed, or extra.
     all_frames: bool = False
+    #: Which covariance position errors of discs are measured in: the detected row's, the reference
+    #: row's, or, where both err independently, their sum.
     error_covariance: ErrorCovariance = "detected"
 
     @property
@@ -92,82 +73,46 @@ class Compare:
     """Compare detected rows with reference rows: found, missed, look-alikes, clutter, errors.
 
     Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
-
-    Parameters
-    ----------
-    run : Path
-        Run folder.
-    lines : bool
-        Compare verticals instead of discs.
-    reference : Path
-        Reference rows; by default map.circles (map.lines) in the run folder.
-    detected : Path
-        Detected rows; by default detected.circles (detected.lines) in the run folder.
-    unlisted : Path
-        Discs that may be detected but need not be: rows on them are neither right nor wrong; by
-        default unlisted.circles beside the reference, if it is there.
-    lookalikes : Path
-        What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
-        beside the reference, if it is there.
-    camera : Path
-        Calibration, by default the one in the run folder: discs are compared in the image, each row
-        where it was seen. Without one, or with --gate-m or --sigma, on the floor.
-    min_recall : float
-        Exit with 1 if the recall is lower.
-    min_precision : float
-        Exit with 1 if the precision is lower.
-    json : Path
-        Write the result as JSON.
-    force : bool
-        Replace an existing JSON file.
     """
 
-    run: Positional[Path]
-    lines: bool = False
+    run: Positional[Path]  #: Run folder.
+    lines: bool = False  #: Compare verticals instead of discs.
+    #: Reference rows; by default map.circles (map.lines) in the run folder.
     reference: MaybePath = None
+    #: Detected rows; by default detected.circles (detected.lines) in the run folder.
     detected: MaybePath = None
+    #: Discs that may be detected but need not be: rows on them are neither right nor wrong; by
+    #: default unlisted.circles beside the reference, if it is there.
     unlisted: MaybePath = None
+    #: What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
+    #: beside the reference, if it is there.
     lookalikes: MaybePath = None
+    #: Calibration, by default the one in the run folder: discs are compared in the image, each row
+    #: where it was seen. Without one, or with --gate-m or --sigma, on the floor.
     camera: MaybePath = None
-    min_recall: MaybeFloat = None
-    min_precision: MaybeFloat = None
-    json: MaybePath = None
-    force: bool = False
+    min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
+    min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
+    json: MaybePath = None  #: Write the result as JSON.
+    force: bool = False  #: Replace an existing JSON file.
     options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
 @dataclass(frozen=True)
 class RowFiles:
-    """Selects the files of rows.
+    """Selects the files of rows."""
 
-    Parameters
-    ----------
-    rows : Path
-        Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
-        they exist; by default the run's.
-    circles : Path
-        Rows of discs, if not detected.circles there.
-    lines : Path
-        Rows of verticals, if not detected.lines there.
-    markers : Path
-        Rows of square markers, if not detected.markers there.
-    tilt : Path
-        Tilts of the frames, if not detected.tilt there.
-    reference : Path
-        Reference rows of discs, by default map.circles in the run folder if it exists.
-    reference_lines : Path
-        Reference rows of verticals, by default map.lines in the run folder if it exists.
-    no_reference : bool
-        Hold nothing against reference rows, not even where there are some.
-    """
-
+    #: Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
+    #: they exist; by default the run's.
     rows: MaybePath = None
-    circles: MaybePath = None
-    lines: MaybePath = None
-    markers: MaybePath = None
-    tilt: MaybePath = None
+    circles: MaybePath = None  #: Rows of discs, if not detected.circles there.
+    lines: MaybePath = None  #: Rows of verticals, if not detected.lines there.
+    markers: MaybePath = None  #: Rows of square markers, if not detected.markers there.
+    tilt: MaybePath = None  #: Tilts of the frames, if not detected.tilt there.
+    #: Reference rows of discs, by default map.circles in the run folder if it exists.
     reference: MaybePath = None
+    #: Reference rows of verticals, by default map.lines in the run folder if it exists.
     reference_lines: MaybePath = None
+    #: Hold nothing against reference rows, not even where there are some.
     no_reference: bool = False
 
 
@@ -188,14 +133,10 @@ class Draw(PickedFrames, RowsFlags):
     ----------
     output : Path
         Folder for a PNG file per frame.
-    video : Path
-        Write an MP4 file as well, or instead.
-    fps : float
-        Frames of the video per second.
     """
 
-    video: MaybePath = None
-    fps: float = 10.0
+    video: MaybePath = None  #: Write an MP4 file as well, or instead.
+    fps: float = 10.0  #: Frames of the video per second.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
@@ -210,16 +151,13 @@ class View(PickedFrames, RowsFlags):
     ----------
     output : Path
         The recording (.rrd) to write; without it, the viewer is started.
-    path : Path
-        The robot's path (path.csv of `slam map`); by default the sum of the STEP rows.
-    map : Path
-        Map to show (map.csv of `slam map`), in the frame of --path.
     force : bool
         Replace an existing recording.
     """
 
+    #: The robot's path (path.csv of `slam map`); by default the sum of the STEP rows.
     path: MaybePath = None
-    map: MaybePath = None
+    map: MaybePath = None  #: Map to show (map.csv of `slam map`), in the frame of --path.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
@@ -233,16 +171,13 @@ class Report(RowsFlags):
     ----------
     output : Path
         The page; by default detected.html in the run folder.
-    worst : int
-        How many of the worst frames are shown.
-    time_frames : int
-        Detect this many frames again, with the settings that the files name, and state how long
-        that takes besides decoding; 0: none.
     force : bool
         Replace an existing page.
     """
 
-    worst: int = 5
+    worst: int = 5  #: How many of the worst frames are shown.
+    #: Detect this many frames again, with the settings that the files name, and state how long that
+    #: takes besides decoding; 0: none.
     time_frames: int = 0
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
@@ -285,31 +220,20 @@ class Tune(PickedFrames, RowsFlags):
     Parameters
     ----------
     output : Path
-        Folder for table.csv, table.json and curve.png; by default `detected.tune`
-        in the run folder.
-    verticals : bool
-        Tune the detector of verticals instead of that of discs.
-    preset : str
-        `default` or `published`: the values of all parameters that are not varied.
-    reference : Path
-        Reference rows; by default map.circles (map.lines) in the run folder.
-    tilt : Path
-        Tilts of the frames: positions of discs are corrected for them.
-    only_identified : bool
-        Count only reference rows that have an ID.
-    most : int
-        Refuse grids of more combinations than this.
-    jobs : int
-        Processes that share the work, 1 for none beside this one; by default one for every 500
-        frames to process, at most as many as there are cores. What is written is the same.
+        Folder for table.csv, table.json and curve.png; by default `detected.tune` in the run
+        folder.
     """
 
-    verticals: bool = False
+    verticals: bool = False  #: Tune the detector of verticals instead of that of discs.
+    #: `default` or `published`: the values of all parameters that are not varied.
     preset: Preset = "default"
+    #: Reference rows; by default map.circles (map.lines) in the run folder.
     reference: MaybePath = None
-    tilt: MaybePath = None
-    only_identified: bool = False
-    most: int = 1000
+    tilt: MaybePath = None  #: Tilts of the frames: positions of discs are corrected for them.
+    only_identified: bool = False  #: Count only reference rows that have an ID.
+    most: int = 1000  #: Refuse grids of more combinations than this.
+    #: Processes that share the work, 1 for none beside this one; by default one for every 500
+    #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
@@ -326,29 +250,18 @@ class Export:
     detect export drive.detected.circles --to mcap
 
     Cameras of COLMAP come from the calibration: camera convert e.cam cameras.txt
-
-    Parameters
-    ----------
-    file : Path
-        A .circles, .lines, .markers or .tilt file, or one of STEP rows.
-    to : str
-        csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
-        (extra [bags]).
-    output : Path
-        The file to write; by default the file's name and the format's. The steps go beside it, as
-        .steps.csv or .steps.parquet; MCAP has all in one.
-    times : Path
-        Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
-        detected together (detected.times).
-    rate_hz : float
-        Frame rate to use without times, the first frame at 0 s. MCAP needs one or the other.
-    force : bool
-        Replace existing files.
     """
 
-    file: Positional[Path]
+    file: Positional[Path]  #: A .circles, .lines, .markers or .tilt file, or one of STEP rows.
+    #: csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
+    #: (extra [bags]).
     to: Format = "csv"
+    #: The file to write; by default the file's name and the format's. The steps go beside it, as
+    #: .steps.csv or .steps.parquet; MCAP has all in one.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    #: Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
+    #: detected together (detected.times).
     times: MaybePath = None
+    #: Frame rate to use without times, the first frame at 0 s. MCAP needs one or the other.
     rate_hz: MaybeFloat = None
-    force: bool = False
+    force: bool = False  #: Replace existing files.

@@ -38,42 +38,29 @@ class TableError(OneLineError, ValueError):
 
 @dataclass(frozen=True)
 class DiscShape:
-    """Samples around a centre, and the nearest and farthest centres.
+    """Samples around a centre, and the nearest and farthest centres."""
 
-    Parameters
-    ----------
-    inner_radius_m, outer_radius_m : float
-        Radii of the two outlines on the floor, metres.
-    samples : int
-        Equally spaced samples on each outline; the first lies in the robot's +X direction.
-    border_px : int
-        Near limit: centres keep this distance from the image's border, pixels.
-    far_limit_m_per_px : float
-        Far limit: the floor moves at most this far from one image row to the next, metres;
-        infinite: however far.
-    least_pairs : int
-        Samples are counted in pairs, an inner and an outer one, at least this many of which must be
-        inside the image; 0: samples are counted singly.
-    apart_px : float
-        How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-        outwards: the length on the floor of this many pixels down the image.
-    stride_m : float
-        Centres along a row are left out as long as none is farther than half of this from one that
-        is tested, metres. If samples are counted in pairs, those are left out that are nearer than
-        this to a usable one, in pixels as long as one down the image, rounded up. 0: none is.
-    rows_m : float
-        Rows are left out as long as no centre in them is farther than this from a row that is
-        tested, metres on the floor across the row; 0: none is left out.
-    """
-
-    inner_radius_m: Positive = 0.06
-    outer_radius_m: Positive = 0.14
+    inner_radius_m: Positive = 0.06  #: Radius of the inner outline on the floor, metres.
+    outer_radius_m: Positive = 0.14  #: Radius of the outer one.
+    #: Equally spaced samples on each outline; the first lies in the robot's +X direction.
     samples: Annotated[int, whole(3, 128)] = 16
+    #: Near limit: centres keep this distance from the image's border, pixels.
     border_px: Annotated[int, whole(0)] = 12
+    #: Far limit: the floor moves at most this far from one image row to the next, metres; infinite:
+    #: however far.
     far_limit_m_per_px: Limit = 0.05
+    #: Samples are counted in pairs, an inner and an outer one, at least this many of which must be
+    #: inside the image; 0: samples are counted singly.
     least_pairs: Annotated[int, whole(0)] = 0
+    #: How far the samples of a pair that fall on the same pixel are moved, one inwards and one
+    #: outwards: the length on the floor of this many pixels down the image.
     apart_px: NotNegative = 0.0
+    #: Centres along a row are left out as long as none is farther than half of this from one that
+    #: is tested, metres. If samples are counted in pairs, those are left out that are nearer than
+    #: this to a usable one, in pixels as long as one down the image, rounded up. 0: none is.
     stride_m: NotNegative = 0.0
+    #: Rows are left out as long as no centre in them is farther than this from a row that is
+    #: tested, metres on the floor across the row; 0: none is left out.
     rows_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ from camera.formats.conversion import convert_to_camera
 from camera.formats.ros import camera_from_message
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import gray_of_pixels, significant_bits
-from detect.sources.interface import RunFrame, Source, numbered_prefix, only_calibration, still
+from detect.sources.interface import RunFrame, Source, numbered_prefix, still
 from detect.sources.poses import (
     DATASET_FROM_ROBOTICS,
     FARTHEST,
@@ -220,6 +220,7 @@ class Bag(Source):
         self.path = path
         self.name = str(path)
         self.stem = path.name if path.is_dir() else path.stem
+        self.beside = path.parent, self.stem
         self.output_base = path.with_name(f"{self.stem}.detected")
         self._bits = bits
         self._base_frame = base_frame or BASE_FRAME
@@ -255,7 +256,7 @@ class Bag(Source):
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""
-        beside = only_calibration(self.path.parent, self.stem)
+        beside = super().calibration(posed=posed)
         return beside or _recorded_calibration(self.path, self.topic, self._base_frame, posed)
 
     def poses(self, topic: str | None) -> PoseStream | None:

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.sources.gray import significant_bits_of_file
 from detect.sources.interface import (
@@ -23,7 +22,6 @@ from detect.sources.interface import (
     RunFrame,
     Source,
     frame_prefix,
-    only_calibration,
     read_image_times,
     still,
 )
@@ -228,6 +226,7 @@ class ImageFiles(Source):
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
         self.output_base = self._home / "detected"
+        self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names)
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
         self._times = read_image_times(times_file) if times or times_file.is_file() else {}
@@ -239,10 +238,6 @@ class ImageFiles(Source):
             path = self._names.path(place)
             step = still(frame_prefix(path.stem))
             yield RunFrame(step, path, time_s=self._times.get(path.stem), bits=self._bits)
-
-    def calibration(self, *, posed: bool) -> Camera | None:
-        """The ``.cam`` file in the run's folder."""
-        return only_calibration(self._home, self._home.resolve().name)
 
 
 def bits_of_images(names: ImageNames) -> int:

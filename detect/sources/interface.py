@@ -55,6 +55,7 @@ class Source(Frames):
     name: str  # in messages
     output_base: Path  # results are called this, with an ending of their own
     size: tuple[int, int] | None = None  # width and height, where they are known beforehand
+    beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
     times_own = True  # images have times by themselves; of others, they can be named
     has_times = True
 
@@ -63,7 +64,7 @@ class Source(Frames):
 
         One of several is refused, and, if `posed`, one whose pose above the floor is not known.
         """
-        return None
+        return None if self.beside is None else only_calibration(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry that it has itself: of a topic, or the only one; None if there is none."""

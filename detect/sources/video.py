@@ -24,10 +24,9 @@ from typing import Any, Protocol
 import cv2
 from numpy.typing import NDArray
 
-from camera import Camera
 from detect.errors import DetectError
 from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import RunFrame, Source, numbered_prefix, only_calibration, still
+from detect.sources.interface import RunFrame, Source, numbered_prefix, still
 
 _log = logging.getLogger("redetect")
 
@@ -37,7 +36,7 @@ class VideoFile(Source):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.name = str(path)
+        self.name, self.beside = str(path), (path.parent, path.stem)
         self.output_base = path.with_name(f"{path.stem}.detected")
         with _opened(path) as capture:
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -62,10 +61,6 @@ class VideoFile(Source):
                 number, last_s = number + 1, time_s
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
-
-    def calibration(self, *, posed: bool) -> Camera | None:
-        """The ``.cam`` file beside it: of its name, or the only one."""
-        return only_calibration(self.path.parent, self.path.stem)
 
 
 @contextmanager
