@@ -4,11 +4,11 @@ The verticals of one frame often have a common error: trunks, folds of a curtain
 leans. Those of a run determine how the camera leans relative to its calibration, and how far the
 robot tilts about that. The outlines of discs (`detect.discs.outline_tilt`) show a frame's
 deviation, too. The two constants differ where the calibration is not exact: that of the verticals
-is as wrong as the lens, that of the outlines as the height and the discs' radius. The truth is taken
-to be anywhere between them, and the mean is used. Each axis is an autoregression about a constant, measured with errors that last as long as
-their scene is in view (`smooth_axis`). The constants, the spread, and the factors by which errors
-are smaller or larger than a frame by itself can know maximise the likelihood: in one building all
-verticals are true, in another few.
+is as wrong as the lens, that of the outlines as the height and the discs' radius. The truth is
+taken to be anywhere between them, and the mean is used. Each axis is an autoregression about a
+constant, measured with errors that last as long as their scene is in view (`smooth_axis`). The
+constants, the spread, and the factors by which errors are smaller or larger than a frame by itself
+can know maximise the likelihood: in one building all verticals are true, in another few.
 """
 
 from __future__ import annotations
