@@ -42,6 +42,8 @@ COMMON_RAD = math.radians(0.15)
 #: The same where the calibration is right in lens and height, and how far the constants of outlines
 #: and verticals are apart then, and otherwise (rad; `_share_exact`).
 _EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
+#: How far the outlines' pitch moves (rad) if the camera hangs higher, per share of its height.
+OUTLINE_PITCH_PER_HEIGHT = 0.45
 #: Correlation of true deviations from frame to frame: a robot swings on its springs.
 MEMORY = 0.65
 #: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
@@ -91,6 +93,7 @@ class RunTilt:
     tilt: FloatArray  # (N, 2) pitch and roll of each frame (rad)
     #: (N, 2) of them (rad^2), the constant's included; the axes are assumed to be independent
     variance: FloatArray
+    height_sigma: float = 0.0  # of the camera's height, as a share of it
 
     def sentence(self) -> str:
         """The constant lean, and that it was used."""
@@ -131,7 +134,11 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
         axes.append(AxisModel(lean, math.sqrt(one.lean_variance + common), one.spread))
         tilts.append(tilt + 0.5 * apart)
         variances.append(of_deviation + share**2 * one.lean_variance + common)
-    return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1))
+    apart = found[0].apart
+    height_sigma = 0.0
+    if not math.isnan(apart):
+        height_sigma = math.sqrt((1.0 - exact) * apart**2 / 12.0) / OUTLINE_PITCH_PER_HEIGHT
+    return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1), height_sigma)
 
 
 def _are_enough(outlines: FrameTilts, verticals: FrameTilts) -> bool:

@@ -346,6 +346,7 @@ def level_run(
         frames.append(own)
         outlines.append(by_outlines[0][2] if by_outlines else None)
     summary.tilt = tilt_of_run(frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines))
+    height_sigma = 0.0 if summary.tilt is None else summary.tilt.height_sigma
     for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
         if summary.tilt is not None:
             pitch, roll = summary.tilt.tilt[k].tolist()
@@ -356,13 +357,13 @@ def level_run(
         circles = rows["circles"]
         yield {
             **rows,
-            "circles": circles if tilt is None else _levelled(circles, tilt, camera),
+            "circles": circles if tilt is None else _levelled(circles, tilt, camera, height_sigma),
             RUN_TILT: f"{format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)}\n",
         }
 
 
-def _levelled(circles: str, tilt: FrameTilt, camera: Camera) -> str:
-    """A frame's rows, its STEP first."""
+def _levelled(circles: str, tilt: FrameTilt, camera: Camera, height_sigma: float) -> str:
+    """A frame's rows, its STEP first; `height_sigma` is of the camera, as a share of its height."""
     step, *rows = _lines(circles)
     head = f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n"
     if not rows:
@@ -371,6 +372,8 @@ def _levelled(circles: str, tilt: FrameTilt, camera: Camera) -> str:
     numbers = np.array([word[1:7] for word in words], np.float64)
     covariance = numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
     floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
+    from_camera = floor_xy - camera.centre[:2]
+    level_covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
     level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
     ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
     return head + landmark_rows("LANDMARK_C", level, ids)

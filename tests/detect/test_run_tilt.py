@@ -162,6 +162,7 @@ def test_how_good_verticals_are_is_learned_by_outlines(seed: int, factor: float)
     assert run is not None
     # Outlines and verticals agree, and no lens is wrong here.
     assert all(axis.lean_sigma < 0.5 * COMMON_RAD for axis in run.axes)
+    assert run.height_sigma < 0.002
     normalised = np.mean((run.tilt - true) ** 2 / run.variance, axis=0)
     assert np.all((normalised > 0.4) & (normalised < 1.7)), normalised
 
@@ -179,3 +180,5 @@ def test_outlines_that_disagree_leave_the_lens_in_doubt() -> None:
     assert run is not None
     assert all(axis.lean_sigma > 0.9 * COMMON_RAD for axis in run.axes)
     assert run.variance.min() > (0.9 * COMMON_RAD) ** 2
+    # A pitch that is a degree off by a wrong height is that of one 4 % wrong, at the most.
+    assert run.height_sigma == pytest.approx(0.039 / math.sqrt(12.0), rel=0.2)
