@@ -1,21 +1,23 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
 The grammar is the data set's, read tolerantly: any white space, commas or none, keys in any order,
-``#`` comments. Keys that mean nothing here are kept and written back. Two keys are this project's:
-``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
-such terms.
+``#`` comments. Keys that mean nothing here are kept and written back. Three keys are this
+project's: ``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens
+that has such terms, and ``covariance: { ... }``, how well the parameters are known
+(`camera.uncertainty`): the lower triangle of their covariance.
 """
 
 from __future__ import annotations
 
 import os
 import re
+from itertools import pairwise
 from pathlib import Path
 
 from camera.brown import NOT_TANGENTIAL
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError
-from camera.model import Camera, Pose
+from camera.model import PARAMETERS, Camera, Pose
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 
@@ -88,6 +90,9 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
     a2, a3, b1, b2, b3 = numbers("coef", 5)
     p1, p2 = numbers("tangential", 2) if "tangential" in entries else NOT_TANGENTIAL
     k1, k2, k3 = numbers("polynomial", 3) if "polynomial" in entries else NO_POLYNOMIAL
+    covariance = None
+    if "covariance" in entries:
+        covariance = tuple(numbers("covariance", PARAMETERS * (PARAMETERS + 1) // 2))
     unknown = tuple((key, " ".join(token for token, _ in value)) for key, value in entries.items())
     try:
         return Camera(
@@ -104,6 +109,7 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             unknown=unknown,
             tangential=(p1, p2),
             polynomial=(k1, k2, k3),
+            covariance=covariance,
         )
     except CameraError as error:
         raise CameraError(f"{name}: {error}") from None
@@ -126,6 +132,10 @@ def format_camera(camera: Camera) -> str:
         lines.append(f"tangential: {{ {' '.join(_shortest(p) for p in camera.tangential)} }}")
     if any(camera.polynomial):
         lines.append(f"polynomial: {{ {' '.join(_shortest(k) for k in camera.polynomial)} }}")
+    if camera.covariance is not None:
+        ends = [row * (row + 1) // 2 for row in range(PARAMETERS + 1)]
+        rows = [camera.covariance[first:last] for first, last in pairwise(ends)]
+        lines += ["covariance: {", *(" ".join(map(_shortest, row)) for row in rows), "}"]
     lines += [f"{key}: {text}" for key, text in camera.unknown]
     return "\n".join([*lines, "}", ""])
 

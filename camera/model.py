@@ -41,6 +41,7 @@ from camera.distortion import (
 from camera.model_checks import (
     check_numbers,
     check_one_to_one,
+    checked_covariance,
     checked_pose,
     checked_whole,
     seen_share,
@@ -48,6 +49,9 @@ from camera.model_checks import (
 
 FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
+
+#: Number of a calibration's parameters: 14 intrinsics, position and rotation.
+PARAMETERS = 20
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class Camera:
         p1, p2 of the distortion (see `camera.brown`); the data set's cameras have none.
     polynomial : 3 floats
         k1, k2, k3 of the distortion (see `camera.brown`); the data set's cameras have none.
+    covariance : tuple of float, optional
+        Of the calibration's parameters (`camera.uncertainty`): the lower triangle, row by row.
 
     Raises
     ------
@@ -104,6 +110,7 @@ class Camera:
     unknown: tuple[tuple[str, str], ...] = field(default=())
     tangential: Tangential = NOT_TANGENTIAL
     polynomial: Polynomial = NO_POLYNOMIAL
+    covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
@@ -117,6 +124,9 @@ class Camera:
         if self.sensor_to_tcp is not None:
             pose = checked_pose("sensor2Tcp", self.sensor_to_tcp)
             object.__setattr__(self, "sensor_to_tcp", pose)
+        if self.covariance is not None:
+            covariance = checked_covariance(self.covariance, PARAMETERS)
+            object.__setattr__(self, "covariance", covariance)
         check_numbers(self)
         check_one_to_one(self)
 

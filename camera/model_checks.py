@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -144,6 +145,22 @@ def checked_pose(name: str, rows: ArrayLike) -> Pose:
     if np.linalg.det(rotation) < 0.0:
         raise CameraError(f"{name} is not a rotation but a reflection: its determinant is -1")
     return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in array)
+
+
+def checked_covariance(numbers: Iterable[float], count: int) -> tuple[float, ...]:
+    """Check the lower triangle of a covariance of `count` parameters and return it as a tuple."""
+    values = tuple(float(x) for x in numbers)
+    expected = count * (count + 1) // 2
+    if len(values) != expected:
+        raise CameraError(
+            f"covariance has {len(values)} numbers: expected {expected}, the lower triangle of "
+            f"{count} parameters"
+        )
+    if not all(map(math.isfinite, values)):
+        raise CameraError("covariance has a number that is not finite")
+    if min(values[k * (k + 3) // 2] for k in range(count)) < 0.0:
+        raise CameraError("covariance has a negative variance")
+    return values
 
 
 def checked_whole(name: str, value: int) -> int:

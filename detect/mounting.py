@@ -156,4 +156,4 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
     a, b, c = ((float(x), float(y), float(z), float(t)) for x, y, z, t in pose)
-    return replace(camera, robot_from_camera=(a, b, c))
+    return replace(camera, robot_from_camera=(a, b, c), covariance=None)

@@ -107,11 +107,17 @@ class RunTilt:
         )
 
 
-def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> RunTilt | None:
+def tilt_of_run(
+    verticals: FrameTilts,
+    outlines: FrameTilts | None = None,
+    common_variance: FloatArray | None = None,
+) -> RunTilt | None:
     """The tilt of a run from that of each frame, in their order.
 
     By the verticals of each frame and, optionally, by the outlines of its discs; None if fewer than
-    `LEAST_FRAMES` frames have a tilt by verticals.
+    `LEAST_FRAMES` frames have a tilt by verticals. `common_variance`, (2,) rad^2, is that of the
+    error of pitch and roll that all frames share, if the calibration states it: then the lean is
+    that of the verticals. Else how far outlines and verticals agree tells.
     """
     if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None
@@ -122,14 +128,17 @@ def tilt_of_run(verticals: FrameTilts, outlines: FrameTilts | None = None) -> Ru
     found = [_learned(axis) for axis in series]
     exact = _share_exact([one.apart for one in found])
     axes, tilts, variances = [], [], []
-    for axis, one in zip(series, found):
+    for k, (axis, one) in enumerate(zip(series, found)):
         tilt, of_deviation = axis.tilt(one)
         # How far a frame's tilt follows the constant: where it is well measured, not at all.
         shifted = axis.tilt(one._replace(lean=one.lean + _UNIT_RAD))[0]
         share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
-        apart = 0.0 if math.isnan(one.apart) else one.apart
-        common = COMMON_RAD**2 + apart**2 / 12.0  # the latter: uniform between the constants
-        common = exact * _EXACT_RAD**2 + (1.0 - exact) * common
+        if common_variance is not None:
+            apart, common = 0.0, float(common_variance[k])
+        else:
+            apart = 0.0 if math.isnan(one.apart) else one.apart
+            common = COMMON_RAD**2 + apart**2 / 12.0  # the latter: uniform between the constants
+            common = exact * _EXACT_RAD**2 + (1.0 - exact) * common
         lean = one.lean + 0.5 * apart
         axes.append(AxisModel(lean, math.sqrt(one.lean_variance + common), one.spread))
         tilts.append(tilt + 0.5 * apart)

@@ -20,6 +20,7 @@ from camera.calibration.projection import IDENTITY, intrinsics_of
 from camera.calibration.start import best_poses, board_poses
 from camera.errors import CalibrationError
 from camera.model import Camera, Pose
+from camera.uncertainty import with_covariance
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt
 
@@ -46,12 +47,15 @@ class FloorPose:
         Seen less projected, pixels.
     sigma_px : float
         Noise of a coordinate that the residuals show.
+    by_intrinsics : (6, 14) float64
+        How the pose follows errors of the intrinsics.
     """
 
     robot_from_camera: FloatArray
     covariance: FloatArray
     residuals: FloatArray
     sigma_px: float
+    by_intrinsics: FloatArray
 
     @property
     def rms_px(self) -> float:
@@ -126,22 +130,37 @@ def place_on_floor(
             "the points are seen from below the floor: X and Y are mirrored (X is to the left, Y "
             "backward, Z up), or the board lies with its print down"
         )
-    covariance = fit.pose_covariances[0]
-    if intrinsics_covariance is not None:
-        _, by_intrinsics, by_pose = project_estimate(estimate, points)
-        gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, COUNT)
-        covariance = covariance + gain @ intrinsics_covariance @ gain.T
     # From (rotation from the left in the camera frame, translation) of camera_from_robot.
     # R' = R exp(-w), t' = -R exp(-w) (T + dT): dt = -R dT + R (w x T).
     to_pose = np.zeros((6, 6))
     to_pose[:3, 3:] = -R
     to_pose[:3, :3] = -R @ cross_matrices(estimate.translations[0])
     to_pose[3:, :3] = -R
+    _, by_intrinsics, by_pose = project_estimate(estimate, points)
+    gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, COUNT)
+    follows = -to_pose @ gain
+    covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T
+    if intrinsics_covariance is not None:
+        covariance = covariance + follows @ intrinsics_covariance @ follows.T
     return FloorPose(
         robot_from_camera=np.column_stack([R, t]),
-        covariance=to_pose @ covariance @ to_pose.T,
+        covariance=covariance,
         residuals=fit.residuals,
         sigma_px=fit.sigma_px,
+        by_intrinsics=follows,
+    )
+
+
+def placed_camera(
+    camera: Camera, pose: FloorPose, intrinsics_covariance: FloatArray | None
+) -> Camera:
+    """The camera at a pose, with the covariance of both where that of its lens is known."""
+    camera = with_pose(camera, pose.robot_from_camera)
+    if intrinsics_covariance is None:
+        return replace(camera, covariance=None)
+    both = pose.by_intrinsics @ intrinsics_covariance
+    return with_covariance(
+        camera, np.block([[intrinsics_covariance, both.T], [both, pose.covariance]])
     )
 
 

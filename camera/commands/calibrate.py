@@ -23,18 +23,19 @@ from camera.calibration.floor import (
     FloorPose,
     on_floor,
     place_on_floor,
+    placed_camera,
     read_floor_points,
-    with_pose,
 )
 from camera.calibration.images import GreyImage, calibration_images, read_grey
-from camera.calibration.model import INTRINSICS
+from camera.calibration.model import COUNT, INTRINSICS
 from camera.calibration.pictures import pictures
 from camera.calibration.projection import UNPOSED, projection_sigma, with_intrinsics
 from camera.calibration.settings import CalibrationSettings
 from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
-from camera.model import Camera
+from camera.model import PARAMETERS, Camera
 from camera.options import Calibrate, Floor
+from camera.uncertainty import with_covariance
 from redetect.storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
@@ -78,7 +79,7 @@ def perform(options: Calibrate) -> int:
     if floor is not None:
         covariance = calibration.adjusted.covariance
         placed = place_on_floor(camera, floor.pixels, floor.xy, covariance, floor.radius_m)
-        camera = with_pose(camera, placed.robot_from_camera)
+        camera = placed_camera(camera, placed, covariance)
         print(describe_pose(placed))
     else:
         print(
@@ -144,10 +145,13 @@ def find_views(
 
 
 def camera_of(calibration: Calibration) -> Camera:
-    """The calibrated camera, without a pose."""
+    """The calibrated camera with the covariance of its lens, without a pose."""
     size = {"width": calibration.points.width, "height": calibration.points.height}
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    covariance[:COUNT, :COUNT] = calibration.adjusted.covariance
     try:
-        return with_intrinsics(UNPOSED, calibration.intrinsics, **size)
+        camera = with_intrinsics(UNPOSED, calibration.intrinsics, **size)
+        return with_covariance(camera, covariance)
     except CameraError as error:
         raise CalibrationError(
             f"the calibration is no possible camera: {error}; take pictures out to the image's "

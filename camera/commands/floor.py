@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from camera.calibration.floor import place_on_floor, with_pose
+from camera.calibration.floor import place_on_floor, placed_camera
+from camera.calibration.model import COUNT
 from camera.camfile import read_camera, write_camera
 from camera.commands.calibrate import describe_pose, floor_points
 from camera.errors import CalibrationError
 from camera.options import Floor
+from camera.uncertainty import covariance_of
 from redetect.storage import OutputExistsError
 
 
@@ -22,10 +24,12 @@ def perform(options: Floor) -> int:
             "of places on the floor (u,v,x,y) needs none"
         )
     seen = floor_points(options, options.floor, (camera.width, camera.height))
-    placed = place_on_floor(camera, seen.pixels, seen.xy, radius_m=seen.radius_m)
+    known = covariance_of(camera)
+    lens = None if known is None else known[:COUNT, :COUNT]
+    placed = place_on_floor(camera, seen.pixels, seen.xy, lens, seen.radius_m)
     print(describe_pose(placed))
-    write_camera(
-        with_pose(camera, placed.robot_from_camera), options.output, overwrite=options.force
-    )
+    if lens is None:
+        print("the lens's covariance is not in the .cam file: neither will the pose's be")
+    write_camera(placed_camera(camera, placed, lens), options.output, overwrite=options.force)
     print(f"written: {options.output}")
     return 0

@@ -180,7 +180,9 @@ def convert_to_camera(
     unknown = source.unknown if isinstance(source, Camera) else ()
 
     def camera_of(intrinsics: FloatArray) -> Camera:
-        return with_intrinsics(base, intrinsics, width=width, height=height, unknown=unknown)
+        return with_intrinsics(
+            base, intrinsics, width=width, height=height, unknown=unknown, covariance=None
+        )
 
     fx, fy, cx, cy = _pinhole(source)
     start = np.array(

@@ -193,6 +193,11 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     for kind, what in (("circles", "discs"), ("markers", "markers")):
         if kind in places:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
+    camera, circles = job.plan.camera, job.plan.circles
+    if camera and camera.covariance is not None and circles and circles.refine:
+        from detect.calibration_error import sentence_of  # loads the compiler
+
+        print(sentence_of(places["circles"], camera))
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

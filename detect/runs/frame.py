@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.calibration_error import common_covariance, common_tilt_variance, with_common
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
@@ -135,6 +136,9 @@ def _path(
             found.seen = found.discs = detect_circles(image, camera, tables.discs, settings)
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
+            if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
+                by_verticals = by_frame is not None
+                found.discs = with_common(found.discs, camera, by_verticals=by_verticals)
             if plan.levelling == "run":
                 tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
                 found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
@@ -345,24 +349,39 @@ def level_run(
         own, *by_outlines = map(_tilt_of_row, _lines(rows["tilt"]))
         frames.append(own)
         outlines.append(by_outlines[0][2] if by_outlines else None)
-    summary.tilt = tilt_of_run(frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines))
-    height_sigma = 0.0 if summary.tilt is None else summary.tilt.height_sigma
+    common = common_tilt_variance(camera)
+    summary.tilt = tilt_of_run(
+        frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines), common
+    )
+    # What a calibration says of its height is in its covariance, if it states one.
+    height_sigma = 0.0
+    if summary.tilt is not None and common is None:
+        height_sigma = summary.tilt.height_sigma
     for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
+        by_verticals = tilt is not None or summary.tilt is not None
+        shared = np.zeros(2)
         if summary.tilt is not None:
             pitch, roll = summary.tilt.tilt[k].tolist()
             cpp, crr = summary.tilt.variance[k].tolist()
             tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
-        elif tilt is None and unknown_variance > 0.0:
+            shared = shared if common is None else common
+        elif tilt is None and (unknown_variance > 0.0 or common is not None):
             tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
         circles = rows["circles"]
+        if tilt is not None:
+            # The part that is the calibration's comes with the calibration's other errors.
+            alone: FrameTilt = replace(tilt, cpp=tilt.cpp - shared[0], crr=tilt.crr - shared[1])
+            circles = _levelled(circles, alone, camera, height_sigma, by_verticals=by_verticals)
         yield {
             **rows,
-            "circles": circles if tilt is None else _levelled(circles, tilt, camera, height_sigma),
+            "circles": circles,
             RUN_TILT: f"{format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)}\n",
         }
 
 
-def _levelled(circles: str, tilt: FrameTilt, camera: Camera, height_sigma: float) -> str:
+def _levelled(
+    circles: str, tilt: FrameTilt, camera: Camera, height_sigma: float, *, by_verticals: bool
+) -> str:
     """A frame's rows, its STEP first; `height_sigma` is of the camera, as a share of its height."""
     step, *rows = _lines(circles)
     head = f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n"
@@ -374,6 +393,7 @@ def _levelled(circles: str, tilt: FrameTilt, camera: Camera, height_sigma: float
     floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
     from_camera = floor_xy - camera.centre[:2]
     level_covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
+    level_covariance += common_covariance(camera, numbers[:, :2], by_verticals=by_verticals)
     level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
     ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
     return head + landmark_rows("LANDMARK_C", level, ids)

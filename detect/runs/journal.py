@@ -110,7 +110,7 @@ def made_by(outputs: Sequence[Output], plan: FramePlan) -> str:
         # A process that has others do the work does not load the compiler, which takes long.
         (np.__version__, cv2.__version__, version("numba")),
         replace(plan, camera=None, working_folder=Path()),
-        plan.camera and plan.camera.content_hash,
+        plan.camera and (plan.camera.content_hash, plan.camera.covariance),
         [(output.kind, output.head, output.tail, output.crlf) for output in outputs],
     )
     return _digest_of(repr(values))

@@ -38,6 +38,9 @@ _TILT_ROWS = (
 )
 
 
+_COMMON = "  covariances include the calibration's (key covariance): its errors are the same in all"
+
+
 @dataclass(frozen=True)
 class Output:
     """A file of a run: `FrameRows.rows` of a kind, between head and tail and separated."""
@@ -102,6 +105,7 @@ def _circles_text(job: Job) -> list[str]:
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([level] if levelled else []),
+        *([_COMMON] if plan.camera and plan.camera.covariance and plan.circles.refine else []),
         *_made_with(plan, plan.circles),
     ]
 

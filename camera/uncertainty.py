@@ -1,0 +1,107 @@
+"""How well a calibration is known, and what its errors do to positions and tilts.
+
+The parameters are the intrinsics (`camera.calibration.model.INTRINSICS`) and the pose: position (m)
+and a small rotation from the left about the robot's axes (rad). Errors of a calibration are the
+same in all images: they are the common part of covariances, which no number of landmarks averages
+out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera.calibration.model import COUNT, cross_matrices, project_points
+from camera.calibration.projection import intrinsics_of
+from camera.model import PARAMETERS, Camera
+
+FloatArray = NDArray[np.float64]
+
+_LOWER = np.tril_indices(PARAMETERS)
+#: Directions in which verticals are imagined: bearings and elevations (rad).
+_BEARINGS = np.linspace(-np.pi, np.pi, 145)
+_ELEVATIONS = np.linspace(-0.7, 0.7, 57)
+
+
+def with_covariance(camera: Camera, covariance: FloatArray) -> Camera:
+    """The camera with the (20, 20) covariance of its parameters, rounded to seven digits."""
+    numbers = (float(f"{x:.7g}") for x in covariance[_LOWER])
+    return replace(camera, covariance=tuple(numbers))
+
+
+def covariance_of(camera: Camera) -> FloatArray | None:
+    """The (20, 20) covariance of a camera's parameters, if it states any."""
+    if camera.covariance is None:
+        return None
+    lower = np.zeros((PARAMETERS, PARAMETERS))
+    lower[_LOWER] = camera.covariance
+    return np.asarray(lower + np.tril(lower, -1).T)
+
+
+def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
+    """Derivatives of where on the floor pixels are taken to see, by the camera's parameters.
+
+    Parameters
+    ----------
+    camera : Camera
+    floor_xy : (N, 2) float64
+        Positions on the floor (m).
+
+    Returns
+    -------
+    (N, 2, 20) float64
+        Of the position that the same pixel gets.
+    """
+    offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
+    _, by_intrinsics, by_point = project_points(
+        intrinsics_of(camera), offset @ camera.camera_from_robot.T
+    )
+    by_place = by_point @ camera.camera_from_robot
+    by_parameters = np.concatenate(
+        [by_intrinsics, -by_place, by_place @ cross_matrices(offset)], axis=-1
+    )
+    return np.asarray(-np.linalg.solve(by_place[:, :, :2], by_parameters))
+
+
+def tilt_by_parameters(camera: Camera) -> FloatArray:
+    """(2, 20) derivatives of pitch and roll, as verticals all over the image show them.
+
+    A camera that is wrong takes true verticals for ones that lean; the tilt that turns them
+    vertical is fitted by least squares.
+    """
+    bearing, elevation = np.meshgrid(_BEARINGS, _ELEVATIONS, indexing="ij")
+    ray = np.stack([np.sin(bearing), -np.cos(bearing), np.tan(elevation)], axis=-1)
+    pixel = camera.project(ray @ camera.camera_from_robot.T)
+    size = np.array([camera.width, camera.height])
+    seen = np.all((pixel > -0.5) & (pixel < size - 0.5), axis=-1)
+    usable = seen.sum(axis=1) >= 2
+    ray, seen = ray[usable], seen[usable]
+    if len(ray) < 2:
+        return np.zeros((2, PARAMETERS))
+    rows, last = np.arange(len(ray)), len(_ELEVATIONS) - 1
+    lower, upper = ray[rows, seen.argmax(axis=1)], ray[rows, last - seen[:, ::-1].argmax(axis=1)]
+    normal = np.cross(lower, upper)
+    turned = np.zeros((len(ray), PARAMETERS))
+    for end, other, sign in ((lower, upper, 1.0), (upper, lower, -1.0)):
+        moved = _ray_by_parameters(camera, end)
+        # (moved x other)_z, and its negative for the second of the two rays.
+        turned += sign * (moved[:, 0] * other[:, 1:2] - moved[:, 1] * other[:, :1])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # n_z + pitch n_y - roll n_x = 0 (`detect.verticals.tilt`).
+    level = np.column_stack([normal[:, 1], -normal[:, 0]]) / length
+    return np.asarray(-np.linalg.lstsq(level, turned / length, rcond=None)[0])
+
+
+def _ray_by_parameters(camera: Camera, ray: FloatArray) -> FloatArray:
+    """(N, 3, 20) derivatives of the (N, 3) robot-frame directions that pixels are taken to see."""
+    in_camera = ray @ camera.camera_from_robot.T
+    depth = in_camera[:, 2:]
+    normalised = in_camera / depth
+    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), normalised)
+    by_parameters = np.zeros((len(ray), 3, PARAMETERS))
+    moved = -np.linalg.solve(by_point[:, :, :2], by_intrinsics) * depth[..., None]
+    by_parameters[:, :, :COUNT] = camera.rotation[:, :2] @ moved
+    by_parameters[:, :, COUNT + 3 :] = -cross_matrices(ray)
+    return by_parameters

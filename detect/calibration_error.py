@@ -1,0 +1,97 @@
+"""The part of discs' covariances that is the calibration's: the same error in all rows.
+
+With the covariance C of the calibration's parameters (`camera.uncertainty`) and the derivatives J
+of a position by them, it is J C J^T. Where positions are levelled by verticals, the tilt that the
+same camera sees in these follows its errors, too: what its mounting leans by falls out, and what
+the lens does to verticals comes in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
+from detect.circles import CircleDetections
+from detect.seen import level_seen
+from redetect.landmarks import read_frames
+
+FloatArray = NDArray[np.float64]
+
+#: Over which angle levelled positions are differenced, either way (rad).
+_STEP_RAD = 1e-6
+
+
+def common_covariance(camera: Camera, floor_xy: FloatArray, *, by_verticals: bool) -> FloatArray:
+    """What the calibration's errors contribute to positions on the floor.
+
+    Parameters
+    ----------
+    camera : Camera
+        Zero is returned if it does not state its covariance.
+    floor_xy : (N, 2) float64
+        Metres.
+    by_verticals : bool
+        Whether the positions are levelled by the verticals that the camera sees.
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        Square metres.
+    """
+    covariance = covariance_of(camera)
+    if covariance is None or len(floor_xy) == 0:
+        return np.zeros((len(floor_xy), 2, 2))
+    jacobian = floor_by_parameters(camera, floor_xy)
+    if by_verticals:
+        steps = _STEP_RAD * np.vstack([np.eye(2), -np.eye(2)])
+        p, r, minus_p, minus_r = level_seen(
+            camera, np.broadcast_to(floor_xy, (4, *floor_xy.shape)), steps
+        )
+        by_tilt = np.stack([p - minus_p, r - minus_r], axis=-1) / (2.0 * _STEP_RAD)
+        jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)
+    return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
+
+
+@lru_cache(maxsize=4)
+def _tilt_by_parameters(camera: Camera) -> FloatArray:
+    return tilt_by_parameters(camera)
+
+
+def common_tilt_variance(camera: Camera) -> FloatArray | None:
+    """(2,) variances of pitch and roll that all frames' verticals share, if the camera knows them.
+
+    Square radians.
+    """
+    covariance = covariance_of(camera)
+    if covariance is None:
+        return None
+    jacobian = _tilt_by_parameters(camera)
+    return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
+
+
+def with_common(found: CircleDetections, camera: Camera, *, by_verticals: bool) -> CircleDetections:
+    """The same discs, their covariances with what the calibration contributes."""
+    common = common_covariance(camera, found.floor_xy, by_verticals=by_verticals)
+    return replace(found, covariance=found.covariance + common)
+
+
+def sentence_of(circles: Path, camera: Camera) -> str:
+    """How much of the variances of the rows of a file is the calibration's own."""
+    shares = []
+    for frame in read_frames(circles):
+        rows = frame.circles
+        xy = np.array([(row.px, row.py) for row in rows]).reshape(-1, 2)
+        by_verticals = frame.levelled_by is not None and any(frame.levelled_by)
+        common = common_covariance(camera, xy, by_verticals=by_verticals)
+        shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
+    share = 100.0 * float(np.median(shares)) if shares else 0.0
+    return (
+        f"{share:.0f} % of the discs' variance (median) are the calibration's, as its file states: "
+        "the same error in all rows"
+    )

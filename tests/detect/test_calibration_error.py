@@ -1,0 +1,97 @@
+"""The calibration's part of discs' covariances: against cameras that are wrong, and in files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera import Camera, read_camera, write_camera
+from camera.model import PARAMETERS
+from camera.uncertainty import with_covariance
+from detect.calibration_error import common_covariance
+from detect.cli import main
+from detect.seen import level_seen
+from detect.verticals.tilt import Verticals, consensus
+from redetect.landmarks import read_frames
+from tests.camera.test_uncertainty import moved
+
+SIGMAS = np.array(
+    [1.0, 0.5, 1.0, 0.7, *[1e-9] * 5, 1e-9, 1e-9, *[1e-9] * 3, *[2e-3] * 3, 3e-3, 3e-3, 2e-3]
+)
+COVARIANCE = np.diag(SIGMAS**2)
+FLOOR = np.array([[0.0, -1.2], [0.8, -1.8], [-1.1, -2.5]])
+
+
+def normals_of_verticals(truth: Camera, wrong: Camera) -> np.ndarray:
+    """Planes through true verticals, as the wrong camera has them."""
+    bearing = np.linspace(-0.6, 0.6, 25)
+    ray = np.stack([np.sin(bearing), -np.cos(bearing), np.zeros(25)], axis=-1)
+    low, high = (
+        wrong.directions_robot(truth.project_robot(truth.centre + ray + [0, 0, z]))
+        for z in (-0.5, 0.1)
+    )
+    normal = np.cross(low, high)
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("by_verticals", [False, True])
+def test_errors_are_as_large_as_stated(published_camera: Camera, by_verticals: bool) -> None:
+    rng = np.random.default_rng(2)
+    pixels = published_camera.project_floor(FLOOR)
+    squared = []
+    for _ in range(200):
+        wrong = moved(published_camera, SIGMAS * rng.standard_normal(PARAMETERS))
+        found = wrong.floor_from_pixel(pixels)
+        if by_verticals:
+            normal = normals_of_verticals(published_camera, wrong)
+            tilt, _ = consensus(Verticals(normal, np.full(25, 1e-8), np.full(25, 0.1), np.ones(25)))
+            assert tilt is not None
+            found = level_seen(wrong, found, (tilt.pitch_rad, tilt.roll_rad))
+        stated = common_covariance(
+            with_covariance(wrong, COVARIANCE), FLOOR, by_verticals=by_verticals
+        )
+        error = found - FLOOR
+        squared.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(stated), error) / 2.0)
+    assert np.mean(squared) == pytest.approx(1.0, abs=0.3)
+
+
+def rows(path: Path) -> np.ndarray:
+    return np.array(
+        [(r.px, r.py, r.cxx, r.cxy, r.cyy) for f in read_frames(path) for r in f.circles]
+    )
+
+
+@pytest.mark.parametrize("command", ["circles", "all"])
+def test_rows_state_it_and_the_command_says_its_share(
+    small_run: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (calibration,) = small_run.glob("*.cam")
+    assert main([command, str(small_run)]) == 0
+    before = rows(small_run / "detected.circles")
+    camera = with_covariance(read_camera(calibration), COVARIANCE)
+    write_camera(camera, calibration, overwrite=True)
+    capsys.readouterr()
+    assert main([command, str(small_run), "--force"]) == 0
+    told = capsys.readouterr().out
+    after = rows(small_run / "detected.circles")
+
+    by_verticals = command == "all" and _has_tilt(small_run)
+    common = common_covariance(camera, before[:, :2], by_verticals=by_verticals)
+    np.testing.assert_allclose(after[:, :2], before[:, :2], atol=1e-5)
+    added = after[:, 2:] - before[:, 2:]
+    # Levelled rows have moved a little since their derivatives were taken.
+    np.testing.assert_allclose(added[:, 0], common[:, 0, 0], rtol=0.3, atol=1e-9)
+    np.testing.assert_allclose(added[:, 2], common[:, 1, 1], rtol=0.3, atol=1e-9)
+    share = np.median((common[:, 0, 0] + common[:, 1, 1]) / (after[:, 2] + after[:, 4]))
+    said = re.search(r"(\d+) % of the discs' variance", told)
+    assert said is not None
+    assert int(said[1]) == pytest.approx(100.0 * share, rel=0.3)
+    head = (small_run / "detected.circles").read_text().split("STEP e", 1)[0]
+    assert "covariances include the calibration's" in head
+
+
+def _has_tilt(run: Path) -> bool:
+    return "\nTILT " in (run / "detected.frames.tilt").read_text()
