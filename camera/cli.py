@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import sys
 
-from camera.options import Calibrate, Convert, Floor, Level
+from camera.options import Board, Calibrate, Convert, Floor, Level
 from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "camera",
-    "Calibrate a camera, place it on the floor, convert its calibration.\n\n"
+    "Print boards, calibrate a camera, place it on the floor, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
+        Board: "camera.commands.board",
         Calibrate: "camera.commands.calibrate",
         Floor: "camera.commands.floor",
         # Needs detection, so the command is implemented in `detect`.

@@ -104,6 +104,52 @@ class Calibrate:
 
 
 @dataclass(frozen=True)
+class Board:
+    """Print a calibration board, or discs, as a PDF at true scale.
+
+    Example: camera board --columns 9 --rows 6 --square-m 0.025 -o board.pdf
+
+    Example: camera board --board discs --circle-m 0.2 -o disc.pdf
+
+    Parameters
+    ----------
+    board : str
+        As in `camera calibrate`, or `discs`: landmarks for the floor.
+    columns : int
+        As in `camera calibrate`; of discs, how many side by side.
+    rows : int
+        Likewise.
+    square_m : float
+        As in `camera calibrate`.
+    marker_m : float
+        As in `camera calibrate`.
+    dictionary : str
+        As in `camera calibrate`.
+    circle_m : float
+        Diameter of the circles or discs (m).
+    page : str
+        The paper, upright or not; `auto`: the smallest that it fits on.
+    output : Path
+        The PDF to write.
+    force : bool
+        Replace an existing file.
+    """
+
+    output: Annotated[Path, arg(aliases=["-o"])]
+    board: Literal["checkerboard", "charuco", "circles", "asymmetric-circles", "discs"] = (
+        "checkerboard"
+    )
+    columns: int = 1
+    rows: int = 1
+    square_m: float = 0.025
+    marker_m: float = 0.0
+    dictionary: str = "DICT_5X5_100"
+    circle_m: float = 0.0
+    page: Literal["auto", "A4", "A3", "A2", "A1", "A0"] = "auto"
+    force: bool = False
+
+
+@dataclass(frozen=True)
 class Floor:
     """Give a calibrated camera its pose, from a board or known places on the floor.
 
@@ -242,4 +288,4 @@ class Level:
     force: bool = False
 
 
-Command = Calibrate | Floor | Level | Convert
+Command = Board | Calibrate | Floor | Level | Convert
