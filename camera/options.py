@@ -48,7 +48,8 @@ class Calibrate:
     half : bool
         Pictures are half-height: every second line of square pixels, as the data set's.
     free_aspect : bool
-        Horizontal and vertical scale are independent of each other.
+        Horizontal and vertical scale are independent of each other, unless the pictures do not tell
+        their ratio. --no-free-aspect: pixels are square (with --half, twice as high as wide).
     coefficients : str
         Number of free radial distortion coefficients, 0 to 5; `auto`: as many as make the error in
         pictures that were held out smaller.
@@ -76,6 +77,9 @@ class Calibrate:
         back right, 180: at the front left. With 180 the board appears upright in the image.
     output : Path
         The .cam file. Beside it: .json with everything, and pictures of residuals and coverage.
+    pictures : Path
+        Folder for pictures to check by: the corners found and projected in each photograph; of the
+        floor's photograph its grid and the horizon, and the floor from above.
     force : bool
         Replace existing files.
     """
@@ -90,7 +94,7 @@ class Calibrate:
     dictionary: str = "DICT_5X5_100"
     circle_m: float = 0.0
     half: bool = False
-    free_aspect: bool = False
+    free_aspect: bool = True
     coefficients: Literal["auto", "0", "1", "2", "3", "4", "5"] = "auto"
     tangential: Literal["auto", "on", "off"] = "auto"
     polynomial: Literal["auto", "on", "off"] = "auto"
@@ -100,6 +104,7 @@ class Calibrate:
     floor: MaybePath = None
     floor_origin: tuple[float, float] = (0.0, 0.0)
     floor_yaw: float = 0.0
+    pictures: MaybePath = None
     force: bool = False
 
 
@@ -185,8 +190,11 @@ class Floor:
         From the robot's X axis to the board's x axis, counterclockwise seen from above (degrees).
     output : Path
         The .cam file to write.
+    pictures : Path
+        Folder for pictures to check by: the floor's grid and the horizon in the photograph, and the
+        floor from above.
     force : bool
-        Replace an existing file.
+        Replace existing files.
     """
 
     camera: Positional[Path]
@@ -201,6 +209,7 @@ class Floor:
     circle_m: float = 0.0
     floor_origin: tuple[float, float] = (0.0, 0.0)
     floor_yaw: float = 0.0
+    pictures: MaybePath = None
     force: bool = False
 
 

@@ -86,6 +86,21 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
     raise _not_found(board)
 
 
+def corners_counted(image: GreyImage) -> tuple[int, int] | None:
+    """How many inner corners a checkerboard in an image has, the larger number first.
+
+    None if none of at least 3 x 3 is found. Part of a board may be taken for all of it.
+    """
+    reduced = next(_reductions(image), image)
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for searched in (reduced, _twice_as_high(reduced)):
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(searched, (3, 3), flags)
+        if found:
+            rows, columns = np.asarray(meta).shape[:2]
+            return max(rows, columns), min(rows, columns)
+    return None
+
+
 def _reductions(image: GreyImage) -> Iterator[GreyImage]:
     """The image as small as it is searched, smallest first."""
     height, width = image.shape

@@ -29,7 +29,7 @@ PAGES = {
     "A0": (0.841, 1.189),
 }
 #: Left blank by printers, and for the line of text at the bottom (m).
-_MARGIN_M, _TEXT_M = 0.004, 0.014
+_MARGIN_M, _TEXT_M = 0.004, 0.012
 _RULER_M = 0.1
 _M_PER_INCH = 0.0254
 

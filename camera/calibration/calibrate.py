@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _OUTLIER_FACTOR = 3.0
 # Residual, in standard deviations, beyond which a point is an outlier.
 _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
+# Pictures that leave the ratio of the scales more uncertain than this don't tell it.
+_ASPECT_SIGMA = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +162,46 @@ def calibrate(
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
     return Calibration(adjusted, points, names, outliers, lens, holdout, spread, tuple(warnings))
+
+
+class Aspect(NamedTuple):
+    """scaleY / scaleX, and its standard deviation; 0 where it was held fixed."""
+
+    value: float
+    sigma: float
+
+
+def aspect_of(calibration: Calibration) -> Aspect:
+    """The ratio of the scales that a calibration found."""
+    x, y = (float(value) for value in calibration.intrinsics[:2])
+    by_scales = np.array([-y / x**2, 1.0 / x])
+    variance = float(by_scales @ calibration.adjusted.covariance[:2, :2] @ by_scales)
+    return Aspect(y / x, np.sqrt(variance) if variance > 1e-18 else 0.0)
+
+
+def calibrate_freely(
+    views: Sequence[BoardView],
+    board: Board,
+    size: tuple[int, int],
+    settings: CalibrationSettings,
+) -> Calibration:
+    """As `calibrate`, with scales independent of each other if the views tell their ratio.
+
+    Else it is that of the settings, and a warning says so.
+    """
+    try:
+        free = calibrate(views, board, size, replace(settings, aspect=None))
+    except CalibrationError:
+        return calibrate(views, board, size, settings)
+    sigma = aspect_of(free).sigma
+    if settings.aspect is None or sigma <= _ASPECT_SIGMA:
+        return free
+    fixed = calibrate(views, board, size, settings)
+    warning = (
+        f"the pictures leave scaleY / scaleX open by {sigma:.2g}: it is taken to be "
+        f"{settings.aspect:g}; hold the board upright and across, and tilt it more"
+    )
+    return replace(fixed, warnings=(*fixed.warnings, warning))
 
 
 def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Points:

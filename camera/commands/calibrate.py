@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from errno import ENOENT
+from itertools import islice
 from math import degrees, radians
 from os import strerror
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.boards.board import Board
 from camera.boards.charuco import dictionary_of
-from camera.boards.points import find_board
-from camera.calibration.calibrate import BoardView, Calibration, calibrate
+from camera.boards.points import corners_counted, find_board
+from camera.calibration.calibrate import (
+    BoardView,
+    Calibration,
+    aspect_of,
+    calibrate,
+    calibrate_freely,
+)
+from camera.calibration.check_pictures import drawn_corners, drawn_floor, rectified_floor
 from camera.calibration.checks import coverage
 from camera.calibration.floor import (
     FloorPose,
@@ -40,6 +51,8 @@ from redetect.storage import OutputExistsError, write_whole
 
 FloatArray = NDArray[np.float64]
 
+#: How many pictures are looked through for the true size of a checkerboard, and how many agree.
+_COUNTED_PICTURES, _VOTES = 8, 2
 _WHETHER = {"auto": None, "on": True, "off": False}
 
 
@@ -61,17 +74,23 @@ def perform(options: Calibrate) -> int:
         raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
     board = board_of(options)
     settings = CalibrationSettings(
-        aspect=None if options.free_aspect else 0.5 if options.half else 1.0,
+        aspect=0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
         tangential=_WHETHER[options.tangential],
         polynomial=_WHETHER[options.polynomial],
         keep_outliers=options.keep_outliers,
     )
-    images = calibration_images(options.images, options.every, options.max_images)
-    views, size = find_views(images, board)
+
+    def images() -> Iterator[tuple[str, GreyImage]]:
+        return calibration_images(options.images, options.every, options.max_images)
+
+    if board.kind == "checkerboard":
+        board = true_board(images(), board)
+    views, size = find_views(images(), board)
     # Found before the calibration, which takes minutes.
-    floor = None if options.floor is None else floor_points(options, options.floor, size)
-    calibration = calibrate(views, board, size, settings)
+    floor = None if options.floor is None else floor_points(options, board, options.floor, size)
+    calibrated = calibrate_freely if options.free_aspect else calibrate
+    calibration = calibrated(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
@@ -86,6 +105,14 @@ def perform(options: Calibrate) -> int:
             "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
             "board on the floor"
         )
+    if options.pictures is not None:
+        for name, image in images():
+            if name in calibration.names:
+                picture = drawn_corners(image, calibration, calibration.names.index(name))
+                place = options.pictures / f"{_file_name(name)}.corners.png"
+                write_picture(picture, place, force=options.force)
+        if options.floor is not None:
+            write_floor_pictures(options, options.floor, camera)
     drawn = pictures(calibration, camera)
     for name, path in names.items():
         with write_whole(path, overwrite=options.force) as stream:
@@ -96,6 +123,32 @@ def perform(options: Calibrate) -> int:
         stream.write(format_camera(camera).encode())
     print(f"written: {output}, {report.name}, {', '.join(p.name for p in names.values())}")
     return 0
+
+
+def write_floor_pictures(options: Calibrate | Floor, floor: Path, camera: Camera) -> None:
+    """The floor's grid in its photograph, and the floor from above; of a table, nothing."""
+    if options.pictures is None:
+        return
+    if floor.suffix.lower() == ".csv":
+        print(f"{floor}: no photograph, so there is no picture of the floor's grid")
+        return
+    image = read_grey(floor)
+    for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
+        place = options.pictures / f"{_file_name(floor.name)}.{name}.png"
+        write_picture(draw(image, camera), place, force=options.force)
+
+
+def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> None:
+    """Write a PNG file, its folder if need be."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with write_whole(place, overwrite=force) as stream:
+        stream.write(cv2.imencode(".png", picture)[1].tobytes())
+    print(f"written: {place}")
+
+
+def _file_name(name: str) -> str:
+    """Of a picture, or a frame of a video."""
+    return name.replace(":", "-")
 
 
 def board_of(options: Calibrate | Floor) -> Board:
@@ -109,6 +162,45 @@ def board_of(options: Calibrate | Floor) -> Board:
         dictionary=options.dictionary,
         circle_m=options.circle_m,
     )
+
+
+def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
+    """The board with as many corners as pictures show, where they contradict what is given.
+
+    A larger board contains the given one. A smaller one may be part of a board that is badly seen:
+    it counts if the given one is in none of the pictures that are looked through.
+    """
+    given = max(board.columns, board.rows), min(board.columns, board.rows)
+    votes: Counter[tuple[int, int]] = Counter()
+    seen: list[GreyImage] = []
+    for _, image in islice(images, _COUNTED_PICTURES):
+        counted = corners_counted(image)
+        seen.append(image)
+        if counted is not None:
+            votes[counted] += 1
+        if votes[given] >= _VOTES:
+            return board
+    counted, count = votes.most_common(1)[0] if votes else (given, 0)
+    if counted == given or count < _VOTES:
+        return board
+    is_larger = counted[0] >= given[0] and counted[1] >= given[1]
+    if not is_larger and any(_has_board(image, board) for image in seen):
+        return board
+    columns, rows = counted if board.columns >= board.rows else counted[::-1]
+    print(
+        f"the board has {columns} x {rows} inner corners, by {count} of the first {len(seen)} "
+        f"pictures: taken for that instead of {board.columns} x {board.rows}",
+        file=sys.stderr,
+    )
+    return replace(board, columns=columns, rows=rows)
+
+
+def _has_board(image: GreyImage, board: Board) -> bool:
+    try:
+        find_board(image, board)
+    except CalibrationError:
+        return False
+    return True
 
 
 def find_views(
@@ -167,11 +259,13 @@ class FloorPoints(NamedTuple):
     radius_m: float = 0.0
 
 
-def floor_points(options: Calibrate | Floor, path: Path, size: tuple[int, int]) -> FloorPoints:
+def floor_points(
+    options: Calibrate | Floor, board: Board | None, path: Path, size: tuple[int, int]
+) -> FloorPoints:
     """Points on the floor of a .csv file, or of a picture of the board."""
     if path.suffix.lower() == ".csv":
         return FloorPoints(*read_floor_points(path))
-    board = board_of(options)
+    board = board or board_of(options)
     if board.looks_turned:
         raise CalibrationError(
             f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
@@ -201,6 +295,9 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     ]
     views = len(calibration.names)
     lines.insert(0, f"intrinsics from {len(calibration.points.board)} points in {views} pictures:")
+    ratio = aspect_of(calibration)
+    if ratio.sigma > 0.0:
+        lines.append(f"scaleY / scaleX {ratio.value:.5f} +- {ratio.sigma:.5f}")
     lines.append(
         f"RMS residual {calibration.adjusted.rms_px:.3f} px (u and v together), noise "
         f"{calibration.adjusted.sigma_px:.3f} px per coordinate"
