@@ -81,8 +81,8 @@ class Compare:
     reference: MaybePath = None
     #: Detected rows; by default detected.circles (detected.lines) in the run folder.
     detected: MaybePath = None
-    #: Discs that may be detected but need not be: rows on them are neither right nor wrong; by
-    #: default unlisted.circles beside the reference, if it is there.
+    #: Discs (lines) that may be detected but need not be: rows on them are neither right nor wrong;
+    #: by default unlisted.circles (unlisted.lines) beside the reference, if it is there.
     unlisted: MaybePath = None
     #: What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
     #: beside the reference, if it is there.

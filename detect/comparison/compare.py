@@ -192,20 +192,28 @@ def compare_frames(
     )
 
 
+def unlisted_lines(reference: str | os.PathLike[str], unlisted: Path | None = None) -> list[Frame]:
+    """Read ``unlisted.lines`` beside a reference file, or another file."""
+    usual = Path(reference).parent / "unlisted.lines"
+    return list(read_frames(unlisted or usual)) if unlisted or usual.is_file() else []
+
+
 def compare_line_frames(
     reference: Iterable[Frame],
     detected: Iterable[Frame],
     options: CompareOptions | None = None,
     *,
+    unlisted: Iterable[Frame] = (),
     names: tuple[str, str] = ("reference", "detected"),
 ) -> LineComparison:
     """Compare the lines of two sets of frames, called `names` in messages.
 
-    Errors as of `compare_runs`.
+    Detected rows on `unlisted` lines are neither right nor wrong. Errors as of `compare_runs`.
     """
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    common = match_runs("lines", *sides, options, names)
+    known = {image_name(frame.step.prefix): frame for frame in unlisted}
+    common = match_runs("lines", *sides, options, names, unlisted=known)
     first, second = ([row for m in common.frames for row in m.paired[side]] for side in (0, 1))
 
     def difference(name: str) -> FloatArray:
@@ -360,8 +368,8 @@ def pair_of(
 def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     """Match the rows of one frame one to one.
 
-    Detected rows that fit an unlisted disc (or a reference row without ID, if these do not count),
-    and no reference row that counts, are set aside. Raises CompareError if the gate needs a
+    Detected rows that fit an unlisted disc or line (or a reference row without ID, if these do not
+    count), and no reference row that counts, are set aside. Raises CompareError if the gate needs a
     reference disc's covariance and that is not positive definite.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)

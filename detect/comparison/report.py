@@ -14,7 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import read_camera
-from detect.comparison.compare import beside_reference, compare_line_frames, compare_runs
+from detect.comparison.compare import (
+    beside_reference,
+    compare_line_frames,
+    compare_runs,
+    unlisted_lines,
+)
 from detect.comparison.result import (
     CommonLean,
     Comparison,
@@ -38,8 +43,8 @@ from redetect.storage.command_line import EXIT_ERROR
 
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
-    if command.lines and (command.unlisted or command.lookalikes):
-        raise DetectError("--unlisted and --lookalikes are of discs: expected neither with --lines")
+    if command.lines and command.lookalikes:
+        raise DetectError("--lookalikes are of discs: expected none with --lines")
     kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
@@ -55,6 +60,7 @@ def perform(command: Compare) -> int:
             read_frames(reference),
             read_frames(detected),
             command.options,
+            unlisted=unlisted_lines(reference, command.unlisted),
             names=(str(reference), str(detected)),
         )
     else:
@@ -169,7 +175,8 @@ def summary_rows(c: Comparison) -> dict[str, str]:
         nothing = f"no reference row{unknown}"
     rows["clutter"] = f"{of}: on {nothing}"
     if c.set_aside:
-        what = "what has no ID or is not listed" if only else "discs in view that are not listed"
+        kind = "discs" if isinstance(c, DiscComparison) else "lines"
+        what = "what has no ID or is not listed" if only else f"{kind} in view that are not listed"
         rows["not counted"] = f"{c.set_aside} more detected rows: on {what}"
     rows |= {
         "recall": number(c.recall, 4),

@@ -26,6 +26,8 @@ _DISC_POINTS = 60
 _DISC_REACH_M = 8.0
 _EDGE_POINTS = 80
 _EDGE_REACH_M = 12.0
+#: As good as infinitely far.
+_FAR_M = 1e6
 _SLACK_M = 0.02
 _EDGE_CONTRAST_ROWS = 20
 _EDGE_CONTRAST_GREY = 12.0
@@ -59,7 +61,9 @@ class SeenEdge:
     `ends` are pixels of its top and bottom, `normalised` the same undistorted; `bearing_rad` is its
     true bearing from the camera's centre in the level robot frame; `contrast` the median step in
     grey values across it, `rows` the number of image rows that show it, `peak_px` its distance from
-    the nearest peak of the image's gradient.
+    the nearest peak of the image's gradient; `crosses`: it is seen where it crosses the horizon,
+    `BORDER_PX` inside the image. A detector of verticals begins there: the foot of a shelf below
+    the horizon leans as any furrow of the floor may.
     """
 
     edge_id: int
@@ -69,12 +73,14 @@ class SeenEdge:
     contrast: float
     rows: int
     peak_px: float
+    crosses: bool
 
     @property
     def listed(self) -> bool:
-        """Whether it is long and clear enough for a row of its own."""
+        """Whether it crosses the horizon, long and clear enough for a row of its own."""
         return (
-            self.rows >= _EDGE_CONTRAST_ROWS
+            self.crosses
+            and self.rows >= _EDGE_CONTRAST_ROWS
             and abs(self.contrast) >= _EDGE_CONTRAST_GREY
             and self.peak_px <= _EDGE_PEAK_PX
         )
@@ -226,11 +232,16 @@ def see_edges(
         contrast, rows, peak_px = _appearance(grey, uv[k, first : last + 1])
         ends = uv[k, [first, last]]
         top = level[k, first] - true.centre
+        far = true.centre + _FAR_M * np.array([top[0], top[1], 0.0]) / np.hypot(top[0], top[1])
+        u, v = true.project_robot(far)
         seen.append(
             SeenEdge(
                 edge_id=int(near[k]), ends=ends, normalised=true.undistort(ends),
                 bearing_rad=float(np.arctan2(top[0], -top[1])), contrast=contrast, rows=rows,
                 peak_px=peak_px,
+                crosses=bool(
+                    ends[0, 1] <= v <= ends[1, 1] and BORDER_PX <= u < true.width - BORDER_PX
+                ),
             )
         )  # fmt: skip
     return seen

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,14 +55,22 @@ covariance. Quality is always 1: there are no images. ID -1: unknown."""
 
 _LINE_FORMAT = """\
 LANDMARK_L <xtop> <ytop> <xbottom> <ybottom> <alpha> <beta> <quality> <sigma> <ID>
-A vertical edge that is truly in view: its ends in undistorted normalised image coordinates, its
-true bearing, its inclination as the (level) calibration measures it, one pixel as standard
-deviation."""
+A vertical edge that is truly in view where it crosses the horizon, and clear: its ends in
+undistorted normalised image coordinates, its true bearing, its inclination as the (level)
+calibration measures it, one pixel as standard deviation."""
 
 
 _UNLISTED_FORMAT = """\
 LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <ID>
 A disc that is at least partly in view but not listed in map.circles: nearly hidden, cut, or far."""
+
+_UNLISTED_LINES_FORMAT = """\
+LANDMARK_L <xtop> <ytop> <xbottom> <ybottom> <alpha> <beta> <quality> <sigma> <ID>
+A vertical edge that shows in the image but is not listed in map.lines: it does not cross the
+horizon, is short, faint or beside another one. Columns as there."""
+
+#: Least step across such an edge (grey values) and rows that show it: what a detector may find.
+_LEAST_STEP, _LEAST_ROWS = 4.0, 12
 
 _LOOKALIKE_FORMAT = """\
 LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <number>
@@ -207,7 +215,7 @@ def write_run(
 
 
 def write_beside(
-    plan: RunPlan, folder: Path, what: str, truths: Iterable[FrameTruth], *, overwrite: bool
+    plan: RunPlan, folder: Path, what: str, truths: Sequence[FrameTruth], *, overwrite: bool
 ) -> None:
     """Write what is in view besides the listed discs, as `detect compare` reads it."""
     unlisted, lookalikes = [], []
@@ -219,6 +227,19 @@ def write_beside(
         ("lookalikes.circles", _LOOKALIKE_FORMAT, lookalikes),
     ):
         _write_landmarks(plan, folder / name, what, text, rows, overwrite)
+    edges = [
+        tuple(line_row(edge, plan.camera) for edge in truth.edges if _shows(edge))
+        for truth in truths
+    ]
+    if any(truth.edges for truth in truths):
+        place = folder / "unlisted.lines"
+        _write_landmarks(plan, place, what, _UNLISTED_LINES_FORMAT, edges, overwrite)
+
+
+def _shows(edge: SeenEdge) -> bool:
+    """Whether an edge that is not listed shows in the image."""
+    shows = abs(edge.contrast) >= _LEAST_STEP and edge.rows >= _LEAST_ROWS
+    return shows and not edge.listed
 
 
 def _nominal_row(disc: SeenDisc) -> CircleLandmark:
@@ -353,8 +374,9 @@ def _truth_json(plan: RunPlan, truths: list[FrameTruth], what: str) -> str:
             "share: of its area in the image and not hidden; listed: has a row in map.circles",
             "edge": "alpha: true bearing (rad); ends: pixels u, v of top and bottom of the "
             "longest visible stretch; contrast: grey values right minus left; rows: how many "
-            "image rows show it; listed: has a row in map.lines (20 rows, a step of 12 grey "
-            "values, a peak of the gradient within 1 px)",
+            "image rows show it; listed: has a row in map.lines (it crosses the horizon, 12 px "
+            "inside the image; 20 rows, a step of 12 grey values, a peak of the gradient within "
+            "1 px)",
             "picture": "x0, y0, x1, y1, z0, z1 of posters: edges inside them are not listed",
         },
         "settings": {k: v for k, v in asdict(plan.settings).items() if k != "camera_text"},

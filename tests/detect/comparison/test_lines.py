@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from detect.cli import main
 from detect.comparison.compare import compare_line_frames
 from detect.comparison.report import format_json
 from detect.comparison.result import LineComparison, unmet_demands
@@ -393,3 +394,19 @@ def test_rows_are_accounted_for_whatever_they_are(
     ]
     largest = compare_rows(turned[0], turned[1], options).frames[0].largest_error
     assert largest is None or largest <= 1.2 + 1e-9
+
+
+def test_rows_on_unlisted_lines_are_neither_right_nor_wrong(tmp_path: Path) -> None:
+    reference, unlisted = [frame("a", line(0.0))], [frame("a", line(5.0), line(20.0))]
+    detected = [frame("a", line(0.1), line(5.1), line(-30.0))]
+
+    result = compare_line_frames(reference, detected, unlisted=unlisted)
+
+    assert (result.found, result.extra, result.set_aside) == (1, 1, 1)
+    assert result.precision == 0.5
+    assert "on lines in view that are not listed" in format_text(result)
+    # So does the file beside the reference.
+    for name, frames in (("map", reference), ("unlisted", unlisted), ("detected", detected)):
+        write_frames(tmp_path / f"{name}.lines", frames)
+    assert main(["compare", str(tmp_path), "--lines", "--json", str(tmp_path / "c.json")]) == 0
+    assert json.loads((tmp_path / "c.json").read_text())["set_aside"] == 1
