@@ -247,8 +247,8 @@ def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path
 def test_what_is_beside_discs_is_nothing_to_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["compare", str(tmp_path), "--lines", "--unlisted", "unlisted.circles"]
+    arguments = ["compare", str(tmp_path), "--lines", "--lookalikes", "unlisted.circles"]
     assert main(arguments) == 1
     assert capsys.readouterr().err == (
-        "error: --unlisted and --lookalikes are of discs: expected neither with --lines\n"
+        "error: --lookalikes are of discs: expected none with --lines\n"
     )
