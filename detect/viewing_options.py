@@ -94,7 +94,7 @@ class Compare:
     min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
     json: MaybePath = None  #: Write the result as JSON.
     force: bool = False  #: Replace an existing JSON file.
-    options: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
+    matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from importlib import import_module
+from itertools import pairwise
 
 import pytest
 
@@ -79,3 +80,16 @@ def test_every_program_says_its_version(program: str, capsys: pytest.CaptureFixt
         import_module(PROGRAMS[program]).main(["--version"])
     assert end.value.code == 0
     assert re.fullmatch(rf"{program} \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("program", sorted(PROGRAMS))
+def test_every_flag_has_help(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in commands_of(program, capsys):
+        text = help_of(program, [command], capsys)
+        assert "options options" not in text, command
+        lines = [line.strip("│╭╰ \n") for line in text.split("\n")]
+        for line, following in pairwise(lines):
+            flag = re.match(r"(?:-\w, )?(--[a-z][\w.-]+)", line)
+            words = re.split(r"\s{2,}", line, maxsplit=1)[1:] or [following]
+            if flag and len(line) < 100:
+                assert not re.match(r"\((default|required)", words[0]), f"{command} {flag[1]}"

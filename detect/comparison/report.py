@@ -59,7 +59,7 @@ def perform(command: Compare) -> int:
         result = compare_line_frames(
             read_frames(reference),
             read_frames(detected),
-            command.options,
+            command.matching,
             unlisted=unlisted_lines(reference, command.unlisted),
             names=(str(reference), str(detected)),
         )
@@ -68,7 +68,7 @@ def perform(command: Compare) -> int:
             command.run,
             reference=reference,
             detected=detected,
-            options=command.options,
+            options=command.matching,
             sight=_sight(command, reference, detected),
             beside=beside_reference(reference, command.unlisted, command.lookalikes),
         )
@@ -89,7 +89,7 @@ def _sight(command: Compare, reference: Path, detected: Path) -> Sight | None:
     if camera is not None:
         radius_m = read_head(detected).circle_settings.radius_m
         return Sight(camera, radius_m, read_head(reference).level)
-    if not command.options.on_floor:
+    if not command.matching.on_floor:
         print("no calibration: positions are compared on the floor; --camera names one")
     return None
 

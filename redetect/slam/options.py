@@ -341,8 +341,10 @@ class Import:
         UTIAS data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     axes : str
         The axes that the graph or trajectory is in; see `slam export`.
-    range_sigma, bearing_sigma : float
-        Standard deviations of a data set's ranges (m) and bearings (rad).
+    range_sigma : float
+        Standard deviation of a data set's ranges (m).
+    bearing_sigma : float
+        Standard deviation of a data set's bearings (rad).
     output : Path
         Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates;
         of a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of

@@ -21,6 +21,8 @@ from detect.settings import CircleSettings
 from redetect.landmarks import FrameTilt
 from redetect.storage import write_whole
 from redetect.storage.command_line import exit_code_of
+from tools.evaluation.first_number import first_numbers, put_into
+from tools.evaluation.first_number import table_of as first_numbers_table
 from tools.evaluation.markers_command import Markers, MarkersCommand
 from tools.evaluation.markers_command import perform as evaluate_markers
 from tools.evaluation.published_lines import print_printed_lines
@@ -161,6 +163,25 @@ class RealRun:
 
 
 @dataclass(frozen=True)
+class FirstNumbers:
+    """What a stranger sees first: no flags, on the demo, a drive of one's own, a bag, photographs.
+
+    Parameters
+    ----------
+    demo : Path
+        The demo run.
+    data : Path
+        Evaluation data.
+    document : Path
+        Document whose table is written anew.
+    """
+
+    demo: Path = Path("images/e")
+    data: Path = Path("../shared/data")
+    document: Path | None = None
+
+
+@dataclass(frozen=True)
 class TrainRimNetwork:
     """Train the network of the second look at discs, and print what it finds in unseen buildings.
 
@@ -258,6 +279,7 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Buildings, subcommand("buildings")]
         | Annotated[PublishedLines, subcommand("published-lines")]
         | Annotated[RealRun, subcommand("real-run")]
+        | Annotated[FirstNumbers, subcommand("first-numbers")]
         | Annotated[TrainRimNetwork, subcommand("train-rim-network")]
         | Annotated[TiltOfDiscs, subcommand("tilt-of-discs")]
         | Annotated[RenderedLines, subcommand("rendered-lines")]
@@ -278,6 +300,7 @@ def _carry_out(
     | Buildings
     | PublishedLines
     | RealRun
+    | FirstNumbers
     | TrainRimNetwork
     | TiltOfDiscs
     | RenderedLines
@@ -303,6 +326,13 @@ def _carry_out(
     if isinstance(command, RealRun):
         with tempfile.TemporaryDirectory() as folder:
             print(table_of(measure_run(command.run, Path(folder))))
+        return 0
+    if isinstance(command, FirstNumbers):
+        with tempfile.TemporaryDirectory() as folder:
+            numbers = list(first_numbers(command.demo, command.data, Path(folder)))
+        print(first_numbers_table(numbers))
+        if command.document is not None:
+            put_into(command.document, first_numbers_table(numbers))
         return 0
     if isinstance(command, TrainRimNetwork):
         return _train_rim_network(command)

@@ -199,6 +199,13 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+def _is_outside(figures: dict[str, Any]) -> bool:
+    """Whether the normalised error is outside its band."""
+    values = [figures.get(name) for name in ("nees_low", "nees", "nees_high")]
+    numbers = [float(value) for value in values if isinstance(value, int | float)]
+    return len(numbers) == 3 and not numbers[0] <= numbers[1] <= numbers[2]
+
+
 def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
@@ -227,7 +234,8 @@ def _validation(inputs: Inputs) -> list[Part]:
             f"{_number(figures.get('poses'), 1.0, 0)} reference poses. NEES / 3 with both "
             f"covariances: {_number(figures.get('nees'), 1.0, 3)}; 95 % of right ones lie between "
             f"{_number(figures.get('nees_low'), 1.0, 3)} and "
-            f"{_number(figures.get('nees_high'), 1.0, 3)}."
+            f"{_number(figures.get('nees_high'), 1.0, 3)}.",
+            kind="problem" if _is_outside(figures) else "paragraph",
         )
     )
     if inputs.picture is not None:

@@ -68,8 +68,8 @@ def draw_errors(
     sigma = np.degrees([error.sigma_angular_rad for error in errors])
     angular.axhline(0.0, color=_GREY, lw=0.8)
     angular.errorbar(
-        at, turns, yerr=np.where(np.isfinite(sigma), 2.0 * sigma, 0.0), fmt="o", color=_BLUE,
-        ecolor=_ORANGE, ms=4.5, capsize=2.5, label="error, 2 sigma expected",
+        at, turns, yerr=np.where(np.isfinite(sigma), sigma, 0.0), fmt="o", color=_BLUE,
+        ecolor=_ORANGE, ms=4.5, capsize=2.5, label="error, one sigma expected",
     )  # fmt: skip
     angular.set_ylabel("angular error / deg")
     angular.set_xlabel("reference pose")

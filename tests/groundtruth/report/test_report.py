@@ -340,3 +340,16 @@ def test_the_worst_of_each_stretch_is_drawn() -> None:
     assert sum(height < 20.0 for height in heights) == 1
     empty = draw_series("s", "mm", [], [(0.0, 1.0)])
     assert "nothing to show" in "".join(empty.itertext())
+
+
+@pytest.mark.parametrize(("nees", "marked"), [(1.05, False), (2.5, True)])
+def test_a_normalised_error_outside_its_band_is_marked(
+    session: Path, nees: float, marked: bool
+) -> None:
+    figures = {"nees": nees, "nees_low": 0.8, "nees_high": 1.2, "poses": 23}
+    (session / "validation").mkdir()
+    (session / "validation" / "validation.json").write_text(json.dumps({"figures": figures}))
+
+    text = report_page(gather(session), "1").decode()
+
+    assert ('class="problem">23 reference poses' in text) == marked

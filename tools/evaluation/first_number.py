@@ -1,0 +1,220 @@
+"""The first number that a stranger sees: detection without a flag, held against the truth.
+
+Everything goes through the command line, as a user would do it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from redetect.landmarks import read_frames
+from redetect.storage import write_whole
+
+#: The table's place in a document, by comments.
+BEGIN, END = "<!-- first numbers -->", "<!-- end of first numbers -->"
+_FRAMES_PER_SECOND = 2.0
+_BOARD = ("--columns", "9", "--rows", "6")
+
+
+@dataclass(frozen=True)
+class FirstNumber:
+    """A line of the table: errors of the rows that were matched to true discs."""
+
+    what: str
+    commands: str
+    found: int
+    reference: int
+    median_m: float
+    normalised: float
+
+
+def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]:
+    """Detect the demo, a drive with a calibration of one's own, a bag, renders and photographs.
+
+    Parameters
+    ----------
+    demo : Path
+        The demo run.
+    data : Path
+        Evaluation data; what of it is absent is left out.
+    folder : Path
+        For files in between.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        If a command fails.
+    """
+    reference = demo / "map.circles"
+    for command in ("circles", "all"):
+        rows = _detected(command, folder / f"demo-{command}", demo)
+        yield _compared("demo", f"`detect {command}`", demo, rows, reference)
+
+    mine = folder / "mine"
+    _run("tools.documentation.photographs", mine)
+    _run(
+        "camera",
+        "calibrate",
+        mine / "boards",
+        "--half",
+        *_BOARD,
+        "--square-m",
+        "0.04",
+        "-o",
+        mine / "lens.cam",
+    )
+    _run(
+        "camera",
+        "floor",
+        mine / "lens.cam",
+        mine / "floor.png",
+        *_BOARD,
+        "--square-m",
+        "0.12",
+        "--floor-origin",
+        "0",
+        "-1.3",
+        "--floor-yaw",
+        "180",
+        "-o",
+        mine / "my.cam",
+    )
+    drive = mine / "drive"
+    shutil.copytree(demo / "images", drive)
+    shutil.copy(mine / "my.cam", drive)
+    rows = _detected("all", folder / "mine-all", drive, "--odometry", next(demo.glob("*.txt")))
+    yield _compared(
+        "own drive, own calibration",
+        "`camera calibrate`, `floor`, `detect all`",
+        drive,
+        rows,
+        reference,
+    )
+
+    bag = folder / "bag"
+    bag.mkdir()
+    shutil.copy(next(demo.glob("*.cam")), bag)
+    recorded = write_bag(demo / "images", bag / "drive")
+    rows = _detected("all", folder / "bag-all", recorded)
+    yield _compared("bag (MCAP)", "`detect all`", demo, rows, reference)
+
+    for name in ("r1", "r2"):
+        run = data / "rendered" / name
+        if run.is_dir():
+            rows = _detected("all", folder / name, run)
+            yield _compared(
+                f"rendered building {name}", "`detect all`", run, rows, run / "truth.circles"
+            )
+    photographs = sorted(path.parent for path in data.glob("discs/dev/*/truth.json"))
+    if photographs:
+        yield _photographs(photographs, folder)
+
+
+def write_bag(images: Path, place: Path) -> Path:
+    """An MCAP file of the images of a folder, as ROS 2 writes them."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    image, header, time = (
+        store.types[name]
+        for name in (
+            "sensor_msgs/msg/CompressedImage",
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+        )
+    )
+    with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/image", image.__msgtype__, typestore=store)
+        for number, path in enumerate(sorted(images.iterdir())):
+            nanoseconds = round(1e9 * (1.0 + number / _FRAMES_PER_SECOND))
+            stamp = time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+            message = image(
+                header=header(stamp=stamp, frame_id="camera"),
+                format="jpeg",
+                data=np.frombuffer(path.read_bytes(), np.uint8),
+            )
+            content = store.serialize_cdr(message, image.__msgtype__)
+            bag.write(topic, nanoseconds, content)
+    return (place / f"{place.name}.mcap").rename(place.with_suffix(".mcap"))
+
+
+def _photographs(runs: list[Path], folder: Path) -> FirstNumber:
+    """Discs that were measured in photographs; truth is known to a fraction of a millimetre."""
+    errors, squared, reference = [], [], 0
+    for run in runs:
+        rows = _detected("circles", folder / f"photograph-{run.name}", run)
+        truth = json.loads((run / "truth.json").read_text())["discs"]
+        places = np.array([(disc["px"], disc["py"]) for disc in truth if disc["visible"]])
+        reference += len(places)
+        found = [row for frame in read_frames(rows) for row in frame.circles]
+        if not found or not len(places):
+            continue
+        distance, nearest = KDTree(places).query([(row.px, row.py) for row in found])
+        for row, apart, place in zip(found, distance, places[nearest]):
+            if apart < 0.05:
+                covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
+                error = np.array([row.px, row.py]) - place
+                errors.append(apart)
+                squared.append(float(error @ np.linalg.solve(covariance, error)) / 2.0)
+    return FirstNumber(
+        f"{len(runs)} photographs of disc boards", "`detect circles`", len(errors), reference,
+        float(np.median(errors)), float(np.mean(squared)),
+    )  # fmt: skip
+
+
+def _detected(command: str, output: Path, *arguments: object) -> Path:
+    """The file of discs of a command."""
+    output.mkdir()
+    rows = output / "detected.circles"
+    _run("detect", command, *arguments, "--output", rows if command == "circles" else output)
+    return rows
+
+
+def _compared(what: str, commands: str, run: Path, rows: Path, reference: Path) -> FirstNumber:
+    compared = rows.with_suffix(".json")
+    _run("detect", "compare", run, "--detected", rows, "--reference", reference, "--json", compared)
+    result: dict[str, Any] = json.loads(compared.read_text())
+    return FirstNumber(
+        what, commands, result["matched"], result["reference"], result["error_median_m"],
+        result["normalised_error"]["per_dof"],
+    )  # fmt: skip
+
+
+def table_of(numbers: list[FirstNumber]) -> str:
+    """The table as Markdown."""
+    lines = [
+        "| | commands | found | median error / mm | normalised error² |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {n.what} | {n.commands} | {n.found} of {n.reference} | {1e3 * n.median_m:.1f} "
+        f"| {n.normalised:.2f} |"
+        for n in numbers
+    ]
+    return "\n".join(lines)
+
+
+def put_into(document: Path, table: str) -> None:
+    """Replace what is between `BEGIN` and `END` in a document."""
+    before, _, rest = document.read_text().partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise ValueError(f"{document}: lacks {BEGIN} and {END}")
+    with write_whole(document, overwrite=True) as stream:
+        stream.write(f"{before}{BEGIN}\n\n{table}\n\n{END}{after}".encode())
+
+
+def _run(program: str, *arguments: object) -> None:
+    words = [str(argument) for argument in arguments]
+    subprocess.run([sys.executable, "-m", program, *words], check=True, stdout=subprocess.DEVNULL)
