@@ -128,7 +128,7 @@ def test_tables(tmp_path: Path, solution: Path, capsys: Capture) -> None:
     arguments = ["export", str(DEMO), "--to", "csv", "-o", str(out), "--solution", str(solution)]
     assert main([*arguments, "--circles", "--lines"]) == 0
     assert capsys.readouterr().out == (
-        f"{out}: 80 steps, 304 measurements of discs (10 without ID left out), 1497 bearings\n"
+        f"{out}: 80 steps, 304 measurements of discs (10 without ID left out), 976 bearings\n"
     )
     names = ["bearings.csv", "discs.csv", "map.csv", "odometry.csv", "path.csv"]
     assert sorted(path.name for path in out.iterdir()) == names

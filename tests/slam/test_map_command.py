@@ -38,7 +38,7 @@ def test_landmarks_stand_where_they_truly_are(demo_run: Path, both_kinds: Path) 
     truth = json.loads((demo_run / "truth.json").read_text(encoding="utf-8"))
     start = np.array(truth["start"])
     found = read_map(both_kinds / "map.csv")
-    for kind, landmarks, fewest in (("discs", found.discs, 31), ("edges", found.lines, 80)):
+    for kind, landmarks, fewest in (("discs", found.discs, 31), ("edges", found.lines, 55)):
         true = {d["id"]: disc_in_robot(start, d["xy"]) for d in truth[kind]}
         off = landmarks.xy - np.array([true[int(i)] for i in landmarks.ids])
         squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(landmarks.covariance), off)
