@@ -106,6 +106,7 @@ def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]
     shutil.copy(next(demo.glob("*.cam")), bag)
     recorded = write_bag(demo / "images", bag / "drive")
     rows = _detected("all", folder / "bag-all", recorded)
+    _name_frames(rows, demo / "images")
     yield _compared("bag (MCAP)", "`detect all`", demo, rows, reference)
 
     for name in ("r1", "r2"):
@@ -147,6 +148,18 @@ def write_bag(images: Path, place: Path) -> Path:
             content = store.serialize_cdr(message, image.__msgtype__)
             bag.write(topic, nanoseconds, content)
     return (place / f"{place.name}.mcap").rename(place.with_suffix(".mcap"))
+
+
+def _name_frames(rows: Path, images: Path) -> None:
+    """Call the frames of a bag, which are named by their times, as the images are."""
+    frames = list(read_frames(rows))
+    names = {frame.step.prefix: p.stem for frame, p in zip(frames, sorted(images.iterdir()))}
+    words = (line.split(" ") for line in rows.read_text().splitlines())
+    named = [
+        " ".join([line[0], names[line[1]], *line[2:]] if line[0] == "STEP" else line)
+        for line in words
+    ]
+    rows.write_text("\n".join([*named, ""]))
 
 
 def _photographs(runs: list[Path], folder: Path) -> FirstNumber:
