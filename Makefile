@@ -1,4 +1,4 @@
-# make demo: set everything up and detect the discs of the demo run.
+# make demo: set everything up, detect what is in the demo run, compare it with the truth, make a page.
 # make test: set everything up and pass the tests.
 # make docs: the documentation as a site, build/docs/index.html; what leads nowhere is an error.
 # make package: build wheel and source distribution, install and use each in an empty environment.
@@ -18,8 +18,7 @@ setup:
 	@$(PYTHON) tools/make_environment.py $(VENV)
 
 demo: setup
-	$(BIN)/detect circles images/e --force
-	$(BIN)/detect compare images/e
+	$(BIN)/redetect demo --run images/e -o build/demo --force
 
 # Kernels are compiled beforehand, those of discs and of lines at the same time: processes of tests that need the same
 # one at once would each compile it.

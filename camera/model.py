@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -129,6 +130,15 @@ class Camera:
             object.__setattr__(self, "covariance", covariance)
         check_numbers(self)
         check_one_to_one(self)
+
+    # -- files ------------------------------------------------------------------------------
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Camera:
+        """The camera of a `.cam` file (`camera.camfile.read_camera`)."""
+        from camera.camfile import read_camera
+
+        return read_camera(path)
 
     # -- the camera as arrays ---------------------------------------------------------------
 

@@ -26,10 +26,10 @@ from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
-from detect.discs.quality import Limits, centres_of, least_part_quality
+from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
-from detect.discs.search import DiscSearch, Scene, search_discs
+from detect.discs.search import DiscSearch, FoundDiscs, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
 from detect.margins import blank_margins
@@ -142,19 +142,10 @@ def _with_fit(
     image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The default detector: discs that are fitted from the best centres."""
-    noise = estimate_noise(image, _NOISE_ROWS)
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    least, sign = settings.threshold, _SIGNS[settings.polarity]
-    centres = centres_of(image, table, Limits(least, _PART_QUALITY * least, sign=sign))
-    kernel = _kernel_camera(camera)
-    scene = Scene(
-        image, table.floor_xy, _first_search(settings), fit_settings(noise, kernel.blur_ratio),
-        kernel.numbers,
-    )  # fmt: skip
-    found = search_discs(scene, centres, weakest)
+    noise, _, centres, found = first_look(image, camera, table, settings)
     pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
     floor_xy, fitted, evidence = found.floor_xy, found.covariance, found.evidence
-    if _looks_twice(settings):
+    if looks_twice(settings):
         more = second_looks_at(image, camera, table, settings, floor_xy, noise)
         is_disc = more.log_odds >= 0.0
         if is_disc.any():
@@ -180,7 +171,32 @@ def _with_fit(
     )
 
 
-def _looks_twice(settings: CircleSettings) -> bool:
+class FirstLook(NamedTuple):
+    """What the fits from the best centres find, and on what terms."""
+
+    noise: float
+    weakest: float  # least contrast, grey levels
+    centres: Centres
+    found: FoundDiscs
+
+
+def first_look(
+    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+) -> FirstLook:
+    """Discs that are fitted from the best centres; parameters as of `detect_circles`."""
+    noise = estimate_noise(image, _NOISE_ROWS)
+    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
+    least, sign = settings.threshold, _SIGNS[settings.polarity]
+    centres = centres_of(image, table, Limits(least, _PART_QUALITY * least, sign=sign))
+    kernel = _kernel_camera(camera)
+    scene = Scene(
+        image, table.floor_xy, first_search(settings), fit_settings(noise, kernel.blur_ratio),
+        kernel.numbers,
+    )  # fmt: skip
+    return FirstLook(noise, weakest, centres, search_discs(scene, centres, weakest))
+
+
+def looks_twice(settings: CircleSettings) -> bool:
     """Whether there is a second look: of two signs, chance would speak for either."""
     return settings.polarity != "any" and settings.verify and settings.refine
 
@@ -267,10 +283,10 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
     )
 
 
-def _first_search(settings: CircleSettings) -> DiscSearch:
+def first_search(settings: CircleSettings) -> DiscSearch:
     """What the first look goes by: a second one behind it decides about doubtful discs."""
     search = _disc_search(settings)
-    if not _looks_twice(settings):
+    if not looks_twice(settings):
         return search
     return search._replace(least_evidence=search.least_evidence + _DOUBTFUL)
 

@@ -21,14 +21,45 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.markers.settings import PRESETS as MARKER_PRESETS
 from detect.markers.settings import MarkerSettings
-from detect.options import All, Circles, Lines, Markers
+from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings
 from detect.terminal import show_announcements
-from detect.viewing_options import Compare, Draw, Export, Report, Tune, View
-from redetect.storage.command_line import EXIT_INTERRUPTED, Program, exit_code_of
+from detect.viewing_options import (
+    Compare,
+    CompareOptions,
+    Demo,
+    Draw,
+    Explain,
+    Export,
+    Gates,
+    Grid,
+    Report,
+    RowFiles,
+    Tune,
+    View,
+)
+from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
+from redetect.storage.messages import is_quiet
 
-Command = Circles | Lines | Markers | All | Compare | Export | Draw | View | Report | Tune
+#: What `--help` leaves to `--help-all`.
+EXPERT: dict[type, frozenset[str]] = {
+    DetectorFlags: frozenset({"line_ends", "cluster", "strict"}),
+    SourceOptions: all_but(SourceOptions, "odometry", "times", "frames"),
+    DiscIdOptions: all_but(DiscIdOptions, "ids_from"),
+    CircleSettings: all_but(
+        CircleSettings, "radius_m", "polarity", "threshold", "evidence", "blur_px",
+        "systematic_px", "tilt_sigma_deg",
+    ),
+    LineSettings: all_but(LineSettings, "threshold", "join_px"),
+    MarkerSettings: all_but(MarkerSettings, "dictionary"),
+    RowFiles: all_but(RowFiles, "rows", "reference"),
+    Gates: all_but(CompareOptions, "only_identified"),
+    Grid: all_but(Grid, "threshold", "evidence", "noise_floor", "blur_px", "radius_m"),
+}  # fmt: skip
+
+Detectors = Circles | Lines | Markers | All
+Command = Detectors | Compare | Export | Draw | View | Report | Tune | Explain | Demo
 
 PROGRAM = Program(
     "detect",
@@ -41,7 +72,10 @@ PROGRAM = Program(
         View: "detect.view_command",
         Report: "detect.report.page",
         Tune: "detect.tune",
+        Explain: "detect.explain_command",
+        Demo: "detect.demo_command",
     },
+    EXPERT,
 )
 
 
@@ -50,7 +84,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     def work() -> int:
         with interrupts_noted():
-            return carry_out(parsed(sys.argv[1:] if arguments is None else arguments))
+            given = sys.argv[1:] if arguments is None else arguments
+            return PROGRAM.run(given, parsed, carry_out)
 
     code = exit_code_of(work)
     if code == EXIT_INTERRUPTED and arguments is None:
@@ -63,7 +98,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def carry_out(command: Command) -> int:
     """Carry out a command; returns the exit code."""
-    show_announcements()
+    if not is_quiet():
+        show_announcements()
     return PROGRAM.carry_out(command)
 
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import cache
 
 from detect.interrupts import raise_if_interrupted
+from redetect.storage.messages import is_quiet
 
 _log = logging.getLogger("redetect")
 
@@ -52,7 +53,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     Calling it raises an interrupt that was lost (see `detect.interrupts`). The bar appears with the
     first frame: until then, workers may have something to say.
     """
-    if not sys.stderr.isatty():
+    if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted
         return
     from rich.console import Console

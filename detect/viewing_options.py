@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -97,6 +97,10 @@ class Compare:
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
+# As in `detect.flags`.
+MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
+
+
 @dataclass(frozen=True)
 class RowFiles:
     """Selects the files of rows."""
@@ -181,6 +185,61 @@ class Report(RowsFlags):
     time_frames: int = 0
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Why discs of an image are found, or not: each candidate, and the number that dropped it.
+
+    Example: detect explain images/e/images/e.0000.jpg --at 377 85 -o /tmp/why.png
+
+    Parameters
+    ----------
+    image : Path
+        The image.
+    at : two floats
+        Pixel (u, v) of something that should have been found: only what is near it is explained.
+    camera : Path
+        Calibration; by default the one in the image's folder, or in the folder of that.
+    output : Path
+        PNG file for a picture of the candidates, numbered as in the table.
+    json : Path
+        Write the candidates as JSON.
+    force : bool
+        Replace existing files.
+    """
+
+    image: Positional[Path]
+    at: MaybePixel = None
+    camera: MaybePath = None
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    json: MaybePath = None
+    force: bool = False
+    settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Detect discs, verticals and tilt of a small run, compare them with the truth, make a page.
+
+    Example: detect demo -o /tmp/demo
+
+    The run is rendered: a robot's camera drives along a corridor, and where everything is is known.
+
+    Parameters
+    ----------
+    run : Path
+        Another run to use, with map.circles as the truth; by default images that come with the
+        program.
+    output : Path
+        Folder for the rows and the page; by default redetect-demo in the working folder.
+    force : bool
+        Replace existing files.
+    """
+
+    run: MaybePath = None
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("redetect-demo")
+    force: bool = False
 
 
 if TYPE_CHECKING:

@@ -22,7 +22,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: What is tried, in a folder with copies of `images/e` and `images/m`.
 COMMANDS = (
+    "redetect --help",
+    "redetect demo -o demo",
     "detect --help",
+    "detect explain e/images/e.0000.jpg --at 258 111",
     "detect circles e",
     "detect lines e",
     "detect compare e",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict, astuple, fields
-from pathlib import Path
 from typing import NamedTuple
 
 from rich import box
@@ -13,7 +12,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from camera import read_camera
+from camera import Camera, read_camera
 from detect.comparison.compare import (
     beside_reference,
     compare_line_frames,
@@ -43,35 +42,9 @@ from redetect.storage.command_line import EXIT_ERROR
 
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
-    if command.lines and command.lookalikes:
-        raise DetectError("--lookalikes are of discs: expected none with --lines")
-    kind = "lines" if command.lines else "circles"
-    reference = command.reference or command.run / f"map.{kind}"
-    detected = command.detected or command.run / f"detected.{kind}"
-    for path, advice in (
-        (reference, "give the reference rows with --reference"),
-        (detected, f"`detect {kind}` writes it, --detected names another"),
-    ):
-        if not path.exists():
-            raise DetectError(f"{path}: no such landmark file: {advice}")
-    result: Comparison
-    if command.lines:
-        result = compare_line_frames(
-            read_frames(reference),
-            read_frames(detected),
-            command.matching,
-            unlisted=unlisted_lines(reference, command.unlisted),
-            names=(str(reference), str(detected)),
-        )
-    else:
-        result = compare_runs(
-            command.run,
-            reference=reference,
-            detected=detected,
-            options=command.matching,
-            sight=_sight(command, reference, detected),
-            beside=beside_reference(reference, command.unlisted, command.lookalikes),
-        )
+    result = comparison_of(command)
+    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.on_floor):
+        print("no calibration: positions are compared on the floor; --camera names one")
     Console().print(comparison_tables(result))
     if command.json is not None:
         with write_whole(command.json, overwrite=command.force) as stream:
@@ -84,14 +57,41 @@ def perform(command: Compare) -> int:
     return EXIT_ERROR if unmet else 0
 
 
-def _sight(command: Compare, reference: Path, detected: Path) -> Sight | None:
-    camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
+def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
+    """The comparison that a command asks for; with a camera, if it isn't named by its file."""
+    if command.lines and command.lookalikes:
+        raise DetectError("--lookalikes are of discs: expected none with --lines")
+    kind = "lines" if command.lines else "circles"
+    reference = command.reference or command.run / f"map.{kind}"
+    detected = command.detected or command.run / f"detected.{kind}"
+    for path, advice in (
+        (reference, "give the reference rows with --reference"),
+        (detected, f"`detect {kind}` writes it, --detected names another"),
+    ):
+        if not path.exists():
+            raise DetectError(f"{path}: no such landmark file: {advice}")
+    if command.lines:
+        return compare_line_frames(
+            read_frames(reference),
+            read_frames(detected),
+            command.matching,
+            unlisted=unlisted_lines(reference, command.unlisted),
+            names=(str(reference), str(detected)),
+        )
+    if camera is None:
+        camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
+    sight = None
     if camera is not None:
         radius_m = read_head(detected).circle_settings.radius_m
-        return Sight(camera, radius_m, read_head(reference).level)
-    if not command.matching.on_floor:
-        print("no calibration: positions are compared on the floor; --camera names one")
-    return None
+        sight = Sight(camera, radius_m, read_head(reference).level)
+    return compare_runs(
+        command.run,
+        reference=reference,
+        detected=detected,
+        options=command.matching,
+        sight=sight,
+        beside=beside_reference(reference, command.unlisted, command.lookalikes),
+    )
 
 
 _WORST_FRAMES = 10
@@ -146,6 +146,52 @@ def format_json(comparison: Comparison) -> str:
         ],
     }
     return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
+
+
+def sentences(c: Comparison) -> tuple[str, ...]:
+    """A comparison in four sentences: found and missed, what else is there, errors, covariances."""
+    what = "discs" if isinstance(c, DiscComparison) else "verticals"
+    found = (
+        f"{c.found} of {c.reference} {what} of the reference are found, {c.missed} missed, in "
+        f"{len(c.frames)} frames."
+    )
+    on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
+    extra = f"{c.matched} of {c.detected} detected rows are {what} of the reference; "
+    if on_lookalikes is None:
+        extra += f"{c.extra} are on nothing that it has (look-alikes are not known)."
+    else:
+        extra += (
+            f"{on_lookalikes} are on things known to look like a disc, and "
+            f"{c.extra - on_lookalikes or 'none'} on nothing known."
+        )
+    if isinstance(c, DiscComparison):
+        error = (
+            f"Positions on the floor err by {number(_thousand(c.error_median_m), 1)} mm (median), "
+            f"95 % of them by less than {number(_thousand(c.error_95_m), 1)} mm."
+        )
+    else:
+        assert isinstance(c, LineComparison)
+        error = (
+            f"Bearings err by {number(c.bearing_median_deg, 3)} degrees (median), 95 % of them by "
+            f"less than {number(c.bearing_95_deg, 3)}."
+        )
+    return found, extra, error, _agreement(c.normalised_error)
+
+
+def _thousand(value: float | None) -> float | None:
+    return None if value is None else 1000.0 * value
+
+
+def _agreement(error: NormalisedError) -> str:
+    """Whether errors are as large as covariances say."""
+    if error.per_dof is None or error.band is None:
+        return "There are no errors to hold against the stated covariances."
+    figure = f"the squared error is {error.per_dof:.2f} of what they state"
+    if error.per_dof > 1.5:
+        return f"The stated covariances are too small: {figure}."
+    if error.per_dof < 0.67:
+        return f"The stated covariances are too large: {figure}."
+    return f"The errors agree with the stated covariances: {figure}."
 
 
 def _unit(c: Comparison) -> str:

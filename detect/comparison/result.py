@@ -175,6 +175,23 @@ class Comparison:
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
+    def sentences(self) -> tuple[str, ...]:
+        """What came out, in words: see `detect.comparison.report.sentences`."""
+        from detect.comparison.report import sentences
+
+        return sentences(self)
+
+    def to_json(self) -> str:
+        """All figures: see `detect.comparison.report.format_json`."""
+        from detect.comparison.report import format_json
+
+        return format_json(self)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
+
     def worst_frames(self, count: int) -> list[FrameMatch]:
         """The frames with most missed and extra rows; of equals, with the largest error first."""
 

@@ -65,7 +65,7 @@ _WELL_EXPLAINED, _HALF_RIM = 0.97, 0.5
 #: Candidates of a lower quality than this are kept only if the grey value steps in this share
 #: of the directions, by this share of the contrast.
 CLEAR_QUALITY = 0.55
-_LEAST_STEPS = 0.9
+LEAST_STEPS = 0.9
 _LEAST_STEP = 0.25
 _DIRECTIONS = np.array([[math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)] for k in range(16)])
 
@@ -97,6 +97,44 @@ class Scene(NamedTuple):
     camera_numbers: NDArray[np.float64]
 
 
+#: What became of a candidate, in the order of the stages.
+FATES = (
+    "disc",
+    "in a clear disc",
+    "few steps",
+    "first look",
+    "same disc",
+    "evidence",
+    "elsewhere",
+    "beside a better disc",
+    "of the rarer sign",
+)
+_DISC, _IN_CLEAR, _FEW_STEPS, _LOOK, _SAME, _EVIDENCE, _ELSEWHERE, _BESIDE, _RARE = range(
+    len(FATES)
+)
+
+
+class Looks(NamedTuple):
+    """All candidates that were looked at, and what became of them.
+
+    Attributes
+    ----------
+    pixels : (K, 2) int64
+        Where they started.
+    fate : (K,) int8
+        Indices of `FATES`.
+    log_odds : (K,) float64
+        By the last fit that was made; minus infinity where there is none, or it is impossible.
+    results : (K,) RESULT
+        That fit.
+    """
+
+    pixels: NDArray[np.int64]
+    fate: NDArray[np.int8]
+    log_odds: NDArray[np.float64]
+    results: NDArray[Any]
+
+
 class FoundDiscs(NamedTuple):
     """Discs that were found.
 
@@ -107,12 +145,14 @@ class FoundDiscs(NamedTuple):
     floor_xy, covariance : (M, 2), (M, 2, 2) float64
         Fitted places and their covariances by the fits alone, metres, square metres.
     evidence : (M,) float64
+    looks : Looks
     """
 
     centre: NDArray[np.int64]
     floor_xy: NDArray[np.float64]
     covariance: NDArray[np.float64]
     evidence: NDArray[np.float64]
+    looks: Looks
 
 
 def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
@@ -125,7 +165,8 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     weakest : float
         Least contrast, grey levels.
     """
-    return FoundDiscs(*_search(scene, centres, weakest, working_space()))
+    centre, xy, covariance, evidence, looks = _search(scene, centres, weakest, working_space())
+    return FoundDiscs(centre, xy, covariance, evidence, Looks(*looks))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -141,13 +182,16 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
     results: Any = np.zeros(count, RESULT)
     place = np.zeros((count, 2))
     evidence, score = np.full(count, -np.inf), np.full(count, -np.inf)
+    fate, log_odds_of_looks = np.full(count, _LOOK, np.int8), np.full(count, -np.inf)
     first_blur = max(settings.blur_px, 0.6 * search.optics_px)
     for k in range(count):
         result, u, v = results[k], starts[k, 0], starts[k, 1]
         quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
-        if _at_clear_disc(search, place[:k], evidence, floor_xy[v, u]) or (
-            search.verify and not worth_a_look(scene, u, v, quality, contrast)
-        ):
+        if _at_clear_disc(search, place[:k], evidence, floor_xy[v, u]):
+            fate[k] = _IN_CLEAR
+            continue
+        if search.verify and not worth_a_look(scene, u, v, quality, contrast):
+            fate[k] = _FEW_STEPS
             continue
         candidate = Candidate(u, v, search.radius, first_blur)
         start = Disc(0.0, 0.0, 1.0, math.log(first_blur))
@@ -155,10 +199,13 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         if fit_disc(image, floor_xy, candidate, settings, start, LOOK, hope, work, result):
             place[k, 0], place[k, 1] = result.x, result.y
             promise = _evidence(result, search)
+            log_odds_of_looks[k] = promise
             if not search.verify:
                 evidence[k] = max(promise, _NO_EVIDENCE)
             elif promise >= hope.least_evidence:
                 evidence[k] = promise
+            if evidence[k] > -np.inf:
+                fate[k] = _SAME
     for k in best_apart(place, evidence, _SAME_DISC * search.separation):
         result, u, v = results[k], starts[k, 0], starts[k, 1]
         quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
@@ -189,12 +236,18 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             blur = result.blur_bound
         # A fit that wandered off, or turned the disc's contrast round, is about something else.
         off = math.hypot(result.x - x, result.y - y)
+        fate[k], log_odds_of_looks[k] = _EVIDENCE, evidence[k]
         if is_disc and off < search.radius and result.contrast * contrast > 0.0:
             score[k] = max(evidence[k], _NO_EVIDENCE + quality)
+            fate[k] = _BESIDE
+        elif is_disc:
+            fate[k] = _ELSEWHERE
         place[k, 0], place[k, 1] = (result.x, result.y) if search.refine else (x, y)
     best = best_apart(place, score, search.separation)
+    fate[best] = _RARE
     if search.verify:
         best = of_likely_sign(best, results.contrast, evidence, search.least_evidence)
+    fate[best] = _DISC
     # In scan order, as the centres are: by insertion, for these are few.
     for i in range(1, len(best)):
         k, j = best[i], i
@@ -210,7 +263,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         found_xy[i, 0], found_xy[i, 1] = result.x, result.y
         covariance[i, 0, 0], covariance[i, 1, 1] = result.cov_xx, result.cov_yy
         covariance[i, 0, 1] = covariance[i, 1, 0] = result.cov_xy
-    return found, found_xy, covariance, log_odds
+    return found, found_xy, covariance, log_odds, (starts, fate, log_odds_of_looks, results)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -441,4 +494,4 @@ def worth_a_look(scene: Scene, u: int, v: int, quality: float, contrast: float) 
     steps = share_of_steps(
         scene.image, scene.floor_xy, u, v, scene.search.inner, scene.search.outer, contrast
     )
-    return bool(steps >= _LEAST_STEPS)
+    return bool(steps >= LEAST_STEPS)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
 from detect.comparison.result import FrameMatch
+from detect.discs.unfound import Candidate
 from detect.drawing.inputs import SeenRows
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
@@ -303,6 +304,21 @@ _FATE_COLOURS: dict[str, Colour] = {
 }
 
 
+_STAGE_COLOURS: dict[str, Colour] = {
+    "disc": LINE_COLOUR,
+    "quality": (150, 150, 150),
+    "polarity": (255, 120, 60),
+    "contrast": (200, 200, 0),
+    "few steps": (200, 0, 120),
+    "first look": (0, 140, 255),
+    "evidence": (0, 0, 255),
+    "elsewhere": (200, 0, 200),
+    "beside a better disc": (60, 120, 60),
+    "of the rarer sign": (160, 80, 200),
+    "second look": (0, 200, 255),
+}
+
+
 def draw_tracks(
     image: NDArray[np.uint8], table: VerticalTable, found: LineDetections
 ) -> NDArray[np.uint8]:
@@ -324,6 +340,29 @@ def draw_candidates(picture: NDArray[np.uint8], found: MarkerDetections) -> NDAr
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
     return with_legend(picture, words, 210, 0.36)
+
+
+def draw_disc_candidates(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    radius_m: float,
+    candidates: Sequence[Candidate],
+    at: tuple[float, float] | None = None,
+) -> NDArray[np.uint8]:
+    """Draw candidates for discs by what became of them, numbered as they come, with a legend."""
+    canvas = canvas_of(image, camera)
+    for number, candidate in enumerate(candidates, start=1):
+        colour = _STAGE_COLOURS[candidate.stage]
+        rim = camera.project_floor(circle_on_floor((candidate.x_m, candidate.y_m), radius_m))
+        draw_curve(canvas, rim, colour, closed=True)
+        beside = (float(rim[:, 0].max()), candidate.v)
+        draw_text(canvas, f"{number}", beside, colour, shift=(2, 4))
+    if at is not None:
+        for shift in ((6.0, 0.0), (0.0, 6.0)):
+            draw_curve(canvas, np.array([np.subtract(at, shift), np.add(at, shift)]), LINE_COLOUR)
+    counts = Counter(candidate.stage for candidate in candidates)
+    words = [(f"{stage}: {count}", _STAGE_COLOURS[stage]) for stage, count in counts.items()]
+    return with_legend(canvas, words, 190, 0.38)
 
 
 def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:

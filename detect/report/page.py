@@ -41,6 +41,7 @@ from detect.report.figures import (
     whitened,
     whitened_figure,
 )
+from detect.report.floor_map import floor_map
 from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
@@ -126,7 +127,10 @@ def _summary(inputs: ReportInputs) -> list[Part]:
         Part("figures", rows=tuple(figures)),
         Part("table", "Files of rows", head, tuple(rows), left=(0, 1)),
     ]
-    return parts if len(inputs.rows) < 2 else [*parts, counts_figure(inputs.rows)]
+    if len(inputs.rows) < 2:
+        return parts
+    plan = floor_map(inputs.rows)
+    return [*parts, counts_figure(inputs.rows), *([] if plan is None else [plan])]
 
 
 # -- against the reference --------------------------------------------------------------------

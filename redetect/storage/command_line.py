@@ -6,26 +6,36 @@ command ends with its exit code, and one line on the terminal where something wa
 
 from __future__ import annotations
 
+import difflib
+import io
 import os
 import select
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_type_hints
 
-from redetect.storage.messages import OneLineError, one_line
+from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
 from redetect.storage.version import __version__
 
 #: The command could not be carried out.
 EXIT_ERROR = 1
+#: The command line was wrong.
+EXIT_WRONG_COMMAND_LINE = 2
 #: It was interrupted from the keyboard.
 EXIT_INTERRUPTED = 130
 #: The reader of its output has gone (``| head``); the code that system tools exit with then.
 EXIT_UNREAD = 141
 
+#: Flags of every command, which this module takes care of.
+_QUIET = ("-q", "--quiet")
+_HELP_ALL = "--help-all"
+#: What the help of every program says.
+FOR_ALL = "Every command takes -q (only warnings and errors), --help, and --help-all (all flags)."
 _NUMBAS_CACHING = os.path.join("numba", "core", "caching.py")  # noqa: PTH118 - part of a path
 _ADVICE = (
     "free some disk space, delete those of another version of this program (*.nbi in __pycache__), "
@@ -110,13 +120,33 @@ class Program:
     #: Dataclasses of flags, one for each command, which has the class's name in small letters; and
     #: the module whose `perform` carries it out.
     performed_by: Mapping[type, str]
+    expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
+
+    @property
+    def commands(self) -> dict[str, type]:
+        """The dataclasses of the commands, by their names."""
+        return {kind.__name__.lower(): kind for kind in self.performed_by}
 
     def main(self, arguments: list[str] | None = None) -> int:
         """Run the command line; returns the exit code."""
+        given = sys.argv[1:] if arguments is None else arguments
+        return exit_code_of(lambda: self.run(given, self.parsed, self.carry_out))
+
+    def run(
+        self,
+        arguments: Sequence[str],
+        parse: Callable[[Sequence[str]], Any],
+        carry_out: Callable[[Any], int],
+    ) -> int:
+        """Parse a command line and carry it out, quietly if it says so; returns the exit code."""
         # Matrices are small or sparse here: threads of BLAS would cost more than they save.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        given = sys.argv[1:] if arguments is None else arguments
-        return exit_code_of(lambda: self.carry_out(self.parsed(given)))
+        words = [word for word in arguments if word not in _QUIET]
+        command = parse(words)
+        if len(words) == len(arguments):
+            return carry_out(command)
+        with _quietly():
+            return carry_out(command)
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help`, `--version` and on errors.
@@ -126,23 +156,152 @@ class Program:
         import tyro
         from tyro.conf import arg, subcommand
 
-        if list(arguments) == ["--version"]:
+        words = list(arguments)
+        if words == ["--version"]:
             print(f"{self.name} {__version__}")
             raise SystemExit(0)
+        if words and not words[0].startswith("-") and words[0] not in self.commands:
+            end_with(no_such(f"{self.name}: no command", words[0], self.commands))
         known: dict[type, Any] = {type(c): {"default": c} for c in defaults}
+        brief = self.expert and _HELP_ALL not in words and {"-h", "--help"} & set(words)
+        if brief:
+            known = {}
         commands: Any = tuple(
-            Annotated[kind, subcommand(kind.__name__.lower(), **known.get(kind, {}))]
-            for kind in self.performed_by
+            Annotated[self._brief(kind) if brief else kind, subcommand(name, **known.get(kind, {}))]
+            for name, kind in self.commands.items()
         )
         choice: Any = Union.__getitem__(commands)
-        return tyro.cli(
-            Annotated[choice, arg(name="")],
-            prog=self.name,
-            description=self.description,
-            args=arguments,
-        )
+        said = io.StringIO()
+        try:
+            with redirect_stderr(said):
+                return tyro.cli(
+                    Annotated[choice, arg(name="")],
+                    prog=self.name,
+                    description=f"{self.description}\n\n{FOR_ALL}",
+                    args=["--help" if word == _HELP_ALL else word for word in words],
+                )
+        except SystemExit as end:
+            if end.code == EXIT_WRONG_COMMAND_LINE:
+                self._demand_flags(words)
+            print(said.getvalue(), end="", file=sys.stderr)
+            raise
 
     def carry_out(self, command: Any) -> int:
         """Carry out a command; returns the exit code."""
         code: int = import_module(self.performed_by[type(command)]).perform(command)
         return code
+
+    def _demand_flags(self, words: Sequence[str]) -> None:
+        """End with one line if a command line has a flag that its command doesn't."""
+        if not words or words[0] not in self.commands:
+            return
+        known = {*flags_of(self.commands[words[0]]), "--help", _HELP_ALL, "--quiet"}
+        for word in words[1:]:
+            flag = word.partition("=")[0].replace("_", "-")
+            if flag.startswith("--") and flag not in known and not flag.startswith("--tyro-"):
+                end_with(no_such(f"{self.name} {words[0]}: no flag", flag, known))
+
+    def _brief(self, kind: type) -> type:
+        """The dataclass of a command without the flags for experts, for its help."""
+        short, hidden = _without(kind, self.expert)
+        if hidden:
+            text, section, parameters = (kind.__doc__ or "").partition("\n\n    Parameters\n")
+            short.__doc__ = f"{text}\n\n    {hidden} more flags are shown by {_HELP_ALL}."
+            short.__doc__ += section + parameters
+        return short
+
+
+def all_but(kind: type, *names: str) -> frozenset[str]:
+    """The names of a dataclass's fields but these."""
+    return frozenset(each.name for each in fields(kind)) - {*names}
+
+
+def no_such(what: str, word: str, known: Iterable[str]) -> str:
+    """What to answer to a word that is none of the known ones: the nearest of them."""
+    near = difflib.get_close_matches(word, sorted(known), 1, 0.5)
+    names = ", ".join(sorted(known))
+    return f"{what} {excerpt(word)}: " + (f"did you mean {near[0]}?" if near else f"one of {names}")
+
+
+def end_with(words: str) -> None:
+    """End for a wrong command line, saying why."""
+    print(f"error: {words}", file=sys.stderr)
+    raise SystemExit(EXIT_WRONG_COMMAND_LINE)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Nothing goes to standard output, and neither progress nor announcements anywhere."""
+    before = os.environ.get(QUIET)
+    os.environ[QUIET] = "1"  # workers inherit it
+    try:
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):  # noqa: PTH123
+            yield
+    finally:
+        os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
+
+
+def flags_of(kind: type, prefix: str = "") -> Iterator[str]:
+    """The flags of a dataclass as tyro names them."""
+    from tyro.conf import OmitArgPrefixes
+
+    (omitted,) = OmitArgPrefixes[int].__metadata__  # type: ignore[attr-defined]
+    hints = get_type_hints(kind, include_extras=True)
+    for each in fields(kind):
+        inner, marks = _parted(hints[each.name])
+        if _is_nested(inner):
+            inside = prefix if omitted in marks else f"{prefix}{each.name}."
+            yield from flags_of(inner, inside)
+        else:
+            name = f"{prefix}{each.name}".replace("_", "-")
+            yield f"--{name}"
+            if inner is bool:
+                head, dot, last = name.rpartition(".")
+                yield f"--{head}{dot}no-{last}"
+
+
+def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> tuple[type, int]:
+    """A dataclass whose fields for experts are no flags, and how many these are."""
+    from tyro.conf import Suppress
+
+    hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
+    hints = get_type_hints(kind, include_extras=True)
+    changed: list[tuple[str, Any, Any]] = []
+    count = 0
+    for each in fields(kind):
+        inner, marks = _parted(hints[each.name])
+        default: Any = each.default_factory
+        if each.name in hidden:
+            hint: Any = Annotated[hints[each.name], Suppress]
+            count += len(list(flags_of(inner))) if _is_nested(inner) else 1
+        elif _is_nested(inner):
+            hint, inside = _without(inner, expert)
+            count += inside
+            default = hint
+            for mark in marks:
+                hint = Annotated[hint, mark]
+        else:
+            continue
+        changed.append((each.name, hint, _with_default(each, default)))
+    if not count:
+        return kind, 0
+    names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
+    return make_dataclass(
+        kind.__name__, changed, bases=(kind,), frozen=True, namespace=names
+    ), count
+
+
+def _is_nested(kind: Any) -> bool:
+    return is_dataclass(kind)
+
+
+def _with_default(old: Field[Any], factory: Any) -> Any:
+    if old.default is not MISSING:
+        return field(default=old.default, kw_only=old.kw_only)
+    return field(default_factory=factory, kw_only=old.kw_only)
+
+
+def _parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type without what it is annotated by, and that."""
+    marks: tuple[Any, ...] = getattr(hint, "__metadata__", ())
+    return (hint.__origin__ if marks else hint), marks

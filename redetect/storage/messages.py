@@ -6,8 +6,11 @@ a word of a gigabyte. Every typed error of the project passes its message throug
 
 from __future__ import annotations
 
+import os
 import reprlib
 
+#: Environment variable that is set where only warnings and errors are to be shown.
+QUIET = "REDETECT_QUIET"
 #: Characters of a message at most; a path may be the most of it.
 LONGEST_MESSAGE = 1000
 _LONGEST_EXCERPT = 60
@@ -16,6 +19,11 @@ _ELLIPSIS = " ... "
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 3
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
+
+
+def is_quiet() -> bool:
+    """Whether only warnings and errors are to be shown."""
+    return bool(os.environ.get(QUIET))
 
 
 def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:

@@ -35,7 +35,10 @@ class Block:
 
 def documents(root: Path) -> list[Path]:
     """Every document of the project that people read."""
-    single = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "images/README.md")
+    single = (
+        "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "examples/README.md",
+        "images/README.md",
+    )  # fmt: skip
     pages = sorted((root / "docs").rglob("*.md"))
     return [*(root / name for name in single), root / "requirements" / "README.md", *pages]
 
@@ -100,7 +103,7 @@ def commands_in(block: Block) -> Iterator[tuple[int, list[str]]]:
                 continue
             if words[:2] == ["python", "-m"] and len(words) > 2 and words[2].startswith("tools."):
                 words = words[2:]
-            elif not words or words[0] not in PROGRAMS:
+            elif not words or words[0] not in (*PROGRAMS, "redetect"):
                 continue
             if len(words) > 1 and not any(_OPEN.search(word) for word in words):
                 yield number, words

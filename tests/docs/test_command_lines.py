@@ -61,7 +61,7 @@ def start(words: list[str]) -> None:
             warnings.simplefilter("ignore", RuntimeWarning)
             run_module(words[0], run_name="__main__", alter_sys=True)
     else:
-        import_module(PROGRAMS[words[0]]).main(words[1:])
+        import_module({**PROGRAMS, "redetect": "redetect.cli"}[words[0]]).main(words[1:])
 
 
 def test_every_command_line_is_accepted(

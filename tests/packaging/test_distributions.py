@@ -13,8 +13,11 @@ import pytest
 
 ROOMS = ("camera", "detect", "lut", "redetect")
 #: What the project has beside its rooms.
-BESIDE = ("docs", "images", "requirements", "tests", "tools")
-SINGLE = ("CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "Makefile", "README.md", "SECURITY.md")
+BESIDE = ("conda", "docs", "examples", "images", "requirements", "tests", "tools")
+SINGLE = (
+    "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "Dockerfile", "LICENSE", "MANIFEST.in",
+    "Makefile", "README.md", "SECURITY.md",
+)  # fmt: skip
 _MADE = shutil.ignore_patterns("__pycache__", "*.pyc", ".*.part", "*.part", "detected.*", "api")
 
 
@@ -54,11 +57,12 @@ def test_the_wheel_has_the_rooms_and_nothing_else(source: Path, distributions: P
         f"{room}/{name}"
         for room in ROOMS
         for name in files_below(source / room)
-        if name.endswith((".py", ".npz", ".html")) or name == "py.typed"
+        if name.endswith((".py", ".npz", ".html")) or name == "py.typed" or name.startswith("demo/")
     }
     assert found == expected
     assert {name.partition("/")[0] for name in found if name.endswith("/py.typed")} == set(ROOMS)
     assert "camera = camera.cli:main" in commands
+    assert "redetect = redetect.__main__:main" in commands
     for command in ("groundtruth", "slam"):
         assert f"{command} = redetect.{command}.cli:main" in commands
     assert "detect = detect.__main__:main" in commands  # workers import no command line

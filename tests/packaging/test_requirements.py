@@ -11,6 +11,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+from redetect.storage.version import __version__
+
 
 def declared(root: Path, extras: tuple[str, ...]) -> dict[str, Requirement]:
     """What the project needs, by itself and with extras."""
@@ -77,3 +79,31 @@ def test_every_locked_package_has_hashes(project_root: Path, name: str) -> None:
 def test_ci_tries_both_ends(project_root: Path) -> None:
     commands = (project_root / ".ci" / "run").read_text().splitlines()
     assert commands.index("make test") < commands.index("make lowest")
+
+
+#: Packages that conda-forge calls otherwise.
+_IN_CONDA = {"matplotlib": "matplotlib-base", "opencv-python-headless": "opencv"}
+
+
+def test_the_recipe_for_conda_needs_what_the_project_needs(project_root: Path) -> None:
+    recipe = (project_root / "conda" / "meta.yaml").read_text()
+    for name, requirement in declared(project_root, ()).items():
+        low, high = sorted((str(s) for s in requirement.specifier), key=lambda s: s[:2] != ">=")
+        assert f"- {_IN_CONDA.get(name, name)} {low},{high}\n" in recipe
+    project = tomllib.loads((project_root / "pyproject.toml").read_text())["project"]
+    for name, place in project["scripts"].items():
+        assert f"- {name} = {place}\n" in recipe
+
+
+def test_the_version_is_the_same_everywhere(project_root: Path) -> None:
+    assert (
+        f'{{% set version = "{__version__}" %}}'
+        in (project_root / "conda" / "meta.yaml").read_text()
+    )
+    assert f"\nversion: {__version__}\n" in (project_root / "CITATION.cff").read_text()
+
+
+def test_the_readme_is_short_and_says_how_to_install(project_root: Path) -> None:
+    lines = (project_root / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert any("pip install redetect" in line for line in lines)

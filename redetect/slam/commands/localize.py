@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from redetect import slam
-from redetect.landmarks.map_file import read_map, write_path
-from redetect.slam.commands.filter_input import default_output, read_reference, read_run_of
+from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
+from redetect.slam.commands.filter_input import (
+    camera_xy_of,
+    default_output,
+    read_reference,
+    read_run_of,
+)
 from redetect.slam.commands.filter_output import (
     ERROR_PICTURE,
     MAP_PICTURE,
@@ -18,11 +24,15 @@ from redetect.slam.commands.filter_output import (
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.association import Associator
+from redetect.slam.filters.frames import FilterRun
 from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
 from redetect.slam.filters.report import path_distance, summary, table
 from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from redetect.slam.options import Localize
+from redetect.slam.recording import Recording
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
+
+FloatArray = NDArray[np.float64]
 
 JSON_NAME = "localize.json"
 
@@ -31,28 +41,13 @@ def perform(command: Localize) -> int:
     """Localise in a run; returns the exit code."""
     output = command.output or default_output(command.run, "localize")
     names = (PATH_NAME, JSON_NAME, MAP_PICTURE, *([ERROR_PICTURE] if command.reference else []))
-    associator = Associator(command.association, command.gate_probability)
-    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
     landmark_map = read_map(command.map)
     map_errors = _map_errors(command)
     considered = map_errors == "considered"
     joint = read_joint_covariance(command.map, landmark_map) if considered else None
-    recording, camera_xy = read_run_of(command)
+    recording, _ = read_run_of(command)
     demand_free(output, names, overwrite=command.force)
-    localizer = Localizer(
-        landmark_map,
-        command.start,
-        np.diag(np.square(command.start_sigma)),
-        camera_xy,
-        map_errors=map_errors,
-        joint_covariance=joint,
-    )
-    run, time_line = timed(lambda: run_localizer(recording, localizer, associator))
-    if not run.count.discs and not run.count.lines:
-        raise SlamError(
-            f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
-            "same run, or --association joint"
-        )
+    run, time_line = timed(lambda: localized_run_of(command, recording, landmark_map, joint))
     reference = read_reference(command.reference, run.path) if command.reference else None
     distance = path_distance(run.path, reference.poses) if reference else None
     write_path(
@@ -72,6 +67,35 @@ def perform(command: Localize) -> int:
         output, landmark_map, run.path, reference, f"{command.run.name}: localised", command
     )
     return 0
+
+
+def localized_run_of(
+    command: Localize, recording: Recording, landmark_map: LandmarkMap, joint: FloatArray | None
+) -> FilterRun:
+    """What a command asks for: a run's rows localised in a map, whose joint covariance is `joint`.
+
+    Raises
+    ------
+    SlamError
+        If no row shows a landmark of the map, or a flag is out of its range.
+    """
+    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
+    localizer = Localizer(
+        landmark_map,
+        command.start,
+        np.diag(np.square(command.start_sigma)),
+        camera_xy_of(recording, command.run, command.camera),
+        map_errors=_map_errors(command),
+        joint_covariance=joint,
+    )
+    associator = Associator(command.association, command.gate_probability)
+    run = run_localizer(recording, localizer, associator)
+    if not run.count.discs and not run.count.lines:
+        raise SlamError(
+            f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
+            "same run, or --association joint"
+        )
+    return run
 
 
 def _map_errors(command: Localize) -> MapErrors:

@@ -46,7 +46,6 @@ MOST_LANDMARKS_TOGETHER = 5000
 
 def perform(command: Map) -> int:
     """Carry the command out; 0 if all went well."""
-    _check(command)
     output = (
         command.output or (command.run if command.run.is_dir() else command.run.parent) / "slam"
     )
@@ -55,25 +54,8 @@ def perform(command: Map) -> int:
         if (output / name).exists() and not command.force:
             raise OutputExistsError(output / name)
     recording = recording_of(command)
-    weighting = Weighting(
-        loss=command.loss,
-        loss_scale=command.loss_scale,
-        calibrate=command.calibrate,
-        row_errors=command.row_errors,
-        tilt_sigma_rad=math.radians(command.tilt_deg),
-    )
-    camera = None
-    if command.calibrate or command.tilt_deg or len(recording.lines):
-        camera = camera_of_run(command.run, command.camera)
     begin = time.perf_counter()
-    mapped = map_run(
-        recording,
-        camera,
-        weighting,
-        start=command.start,
-        solver=command.solver,
-        name=str(command.run),
-    )
+    mapped = mapped_run_of(command, recording)
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)
@@ -83,7 +65,7 @@ def perform(command: Map) -> int:
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
     few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
     if few:
-        joint = joint_covariance(mapped.graph, mapped.estimate, weighting)
+        joint = joint_covariance(mapped.graph, mapped.estimate, weighting_of(command))
         write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
     else:
         # One of another map must not stay beside this one.
@@ -101,6 +83,33 @@ def perform(command: Map) -> int:
     _draw(mapped, final, path, recording, output, command)
     print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
     return 0
+
+
+def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
+    """The map of a run's rows that a command asks for."""
+    _check(command)
+    camera = None
+    if command.calibrate or command.tilt_deg or len(recording.lines):
+        camera = camera_of_run(command.run, command.camera)
+    return map_run(
+        recording,
+        camera,
+        weighting_of(command),
+        start=command.start,
+        solver=command.solver,
+        name=str(command.run),
+    )
+
+
+def weighting_of(command: Map) -> Weighting:
+    """The terms of the sum of squares that a command asks for."""
+    return Weighting(
+        loss=command.loss,
+        loss_scale=command.loss_scale,
+        calibrate=command.calibrate,
+        row_errors=command.row_errors,
+        tilt_sigma_rad=math.radians(command.tilt_deg),
+    )
 
 
 def _check(command: Map) -> None:

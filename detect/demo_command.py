@@ -1,0 +1,34 @@
+"""The command ``detect demo``: a small run, its comparison with the truth, and a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from detect.comparison.report import comparison_of
+from detect.options import All
+from detect.report.page import perform as write_report
+from detect.runs.command import perform as detect_run
+from detect.viewing_options import Compare, Demo, Report, RowFiles
+from redetect.storage import OutputExistsError
+
+#: Images that come with the program: the first of the demo run (`images/README.md`).
+DEMO_RUN = Path(__file__).resolve().parent.parent / "redetect" / "demo"
+
+
+def perform(command: Demo) -> int:
+    """Carry the command out; returns the exit code."""
+    run = command.run or DEMO_RUN
+    page = command.output / "demo.html"
+    if page.exists() and not command.force:
+        raise OutputExistsError(page)
+    print(f"{run}: rendered images of a robot's drive")
+    code = detect_run(All(run=run, output=command.output, force=command.force))
+    if code != 0:
+        return code
+    detected = command.output / "detected.circles"
+    result = comparison_of(Compare(run=run, detected=detected))
+    write_report(
+        Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force)
+    )
+    print("", *result.sentences(), sep="\n")
+    return 0

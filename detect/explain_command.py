@@ -1,0 +1,72 @@
+"""The command ``detect explain``: an image in; a table, a picture and suggestions out."""
+
+from __future__ import annotations
+
+import cv2
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from camera import Camera, read_camera
+from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.drawing.frame import draw_disc_candidates
+from detect.errors import DetectError
+from detect.run import camera_in, read_image
+from detect.sources.interface import RunFrame
+from detect.viewing_options import Explain
+from redetect.landmarks import Step
+from redetect.storage import OutputExistsError, write_whole
+
+
+def perform(command: Explain) -> int:
+    """Carry the command out; returns the exit code."""
+    for path in (command.output, command.json):
+        if path is not None and path.exists() and not command.force:
+            raise OutputExistsError(path)
+    if not command.image.is_file():
+        raise DetectError(f"{command.image}: no such image: expected one image of a run")
+    camera = _camera(command)
+    image = read_image(RunFrame(Step("image", *[0.0] * 9), command.image), camera)
+    found = explain_discs(image, camera, command.settings, command.at)
+    _print(found)
+    if command.output is not None:
+        picture = draw_disc_candidates(
+            image, camera, command.settings.radius_m, found.candidates, command.at
+        )
+        with write_whole(command.output, overwrite=command.force) as stream:
+            stream.write(cv2.imencode(".png", picture)[1].tobytes())
+        print(f"{command.output}: {len(found.candidates)} candidates")
+    if command.json is not None:
+        with write_whole(command.json, overwrite=command.force) as stream:
+            stream.write(f"{found.to_json()}\n".encode())
+    return 0
+
+
+def _camera(command: Explain) -> Camera:
+    if command.camera is not None:
+        return read_camera(command.camera)
+    folders = [command.image.absolute().parent, command.image.absolute().parent.parent]
+    for folder in folders:
+        camera = camera_in(folder)
+        if camera is not None:
+            return camera
+    raise DetectError(
+        f"{command.image}: no calibration: expected a .cam file in its folder or the one above, or "
+        "one named by --camera"
+    )
+
+
+def _print(found: DiscExplanation) -> None:
+    console = Console()
+    if found.place:
+        console.print(found.place, highlight=False, markup=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=0)
+    for heading in ("", "u", "v", "ahead m", "left m", "quality", "contrast", "what became of it"):
+        table.add_column(heading, justify="left" if heading.startswith("what") else "right")
+    for number, row in enumerate(found.candidates, start=1):
+        figures = f"{row.u:.0f} {row.v:.0f} {-row.y_m:.2f} {row.x_m:.2f} {row.quality:.2f}"
+        contrast = f"{row.contrast:+.0f}" if row.contrast == row.contrast else "-"
+        table.add_row(str(number), *figures.split(), contrast, row.reason())
+    console.print(table if found.candidates else "No candidate for a disc.")
+    for words in found.suggestions:
+        console.print(f"Try: {words}", highlight=False, markup=False)

@@ -1,0 +1,22 @@
+"""The program ``redetect``, also as ``python -m redetect``.
+
+Worker processes import this module, too, so what only the command line needs is imported where it
+is used.
+"""
+
+import sys
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    try:
+        from redetect.cli import main as command_line
+    except KeyboardInterrupt:
+        from redetect.storage.command_line import say_interrupted
+
+        return say_interrupted()
+    return command_line()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

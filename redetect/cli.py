@@ -1,0 +1,94 @@
+"""The command ``redetect``: all programs of the project behind one name.
+
+Exit codes are those of the program that is run; 2 if there is no such command.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import make_dataclass
+from importlib import import_module
+from typing import Annotated, Any, Union
+
+from redetect.programs import DIRECT, PROGRAMS
+from redetect.storage.command_line import FOR_ALL, end_with, no_such
+from redetect.storage.version import __version__
+
+_QUIET = ("-q", "--quiet")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    # Wherever it stands, it is a flag of the command.
+    leading = [word for word in given[:1] if word in _QUIET]
+    words = [*given[len(leading) :], *leading]
+    if words[:1] == ["--version"]:
+        print(f"redetect {__version__}")
+        return 0
+    if not words or words[0] in ("-h", "--help", "--help-all"):
+        print(_help(), end="", file=sys.stdout if words else sys.stderr)
+        return 0 if words else 2
+    if words[0].startswith("--tyro-"):
+        _write_completion(words)
+    name, rest = words[0], words[1:]
+    if name in DIRECT:
+        name, rest = "detect", words
+    if name not in PROGRAMS:
+        end_with(_unknown(name))
+    program = import_module(PROGRAMS[name])
+    if arguments is not None:
+        return int(program.main(rest))
+    # As if it had been called by its short name: it ends the process as it does then.
+    sys.argv = [name, *rest]
+    return int(program.main())
+
+
+def _help() -> str:
+    lines = ["usage: redetect COMMAND ...", "", _HEAD, ""]
+    direct = import_module(PROGRAMS["detect"]).PROGRAM.commands
+    for name, module in sorted(PROGRAMS.items()):
+        program = import_module(module).PROGRAM
+        lines.append(f"  {name:12} {program.description.splitlines()[0]}")
+        lines.append(f"  {'':12} {name} {{{','.join(program.commands)}}}")
+    lines.append("")
+    for name in DIRECT:
+        lines.append(f"  {name:12} {(direct[name].__doc__ or '').splitlines()[0]}")
+    return "\n".join([*lines, "", FOR_ALL, ""])
+
+
+_HEAD = (
+    "Landmarks with covariances from a calibrated camera's images, and what is done with them.\n\n"
+    "Example: redetect detect all images/e"
+)
+
+
+def _write_completion(words: list[str]) -> None:
+    """Have tyro write the completion of all programs' commands; ends the process."""
+    import tyro
+    from tyro.conf import arg, subcommand
+
+    def choice(commands: Mapping[str, type]) -> Any:
+        kinds = tuple(Annotated[kind, subcommand(name)] for name, kind in commands.items())
+        return Annotated[Union.__getitem__(kinds), arg(name="")]
+
+    programs = {name: import_module(module).PROGRAM for name, module in PROGRAMS.items()}
+    below = {
+        name: make_dataclass(name, [("command", choice(program.commands))])
+        for name, program in programs.items()
+    }
+    direct = {name: programs["detect"].commands[name] for name in DIRECT}
+    tyro.cli(choice({**below, **direct}), prog="redetect", args=words)
+
+
+def _unknown(name: str) -> str:
+    """What to answer to a command that there isn't."""
+    for program, module in PROGRAMS.items():
+        if name in import_module(module).PROGRAM.commands:
+            return f"redetect: no command {name!r}: did you mean redetect {program} {name}?"
+    return no_such("redetect: no command", name, (*PROGRAMS, *DIRECT))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What `import redetect` offers: typed results round the functions of the other packages."""

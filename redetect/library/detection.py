@@ -1,0 +1,405 @@
+"""Discs, verticals and tilt in one image."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from detect.errors import FrameError
+from detect.line_settings import LineSettings
+from detect.runs.frame import FrameDetections, detect_batch
+from detect.runs.plan import FramePlan, FrameTask
+from detect.seen import Sight, image_positions
+from detect.settings import CircleSettings, Polarity
+from detect.sources.interface import RunFrame
+from redetect.landmarks import CircleLandmark, Frame, FrameTilt, Step
+from redetect.library.tables import Table, covariance_columns, html_table, plain
+from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
+
+FloatArray = NDArray[np.float64]
+ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
+CameraLike = Camera | str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Discs(Table):
+    """Discs on the floor, N of them, in scan order.
+
+    Attributes
+    ----------
+    u, v : (N,) float64
+        Where the image shows the fitted centre, pixels; (0, 0) is the centre of the top left one.
+    xy : (N, 2) float64
+        Position on the floor, metres, levelled if the tilt is known.
+    covariance : (N, 2, 2) float64
+        Of `xy`, square metres.
+    quality : (N,) float64
+        Otsu's quality of the grey values inside and outside the edge, 0 to 1.
+    evidence : (N,) float64
+        Log-odds that it is a disc; NaN where nothing was fitted.
+    """
+
+    u: FloatArray
+    v: FloatArray
+    xy: FloatArray
+    covariance: FloatArray
+    quality: FloatArray
+    evidence: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def columns(self) -> dict[str, Any]:
+        """One row per disc."""
+        return {
+            "u_px": self.u,
+            "v_px": self.v,
+            "x_m": self.xy[:, 0],
+            "y_m": self.xy[:, 1],
+            **covariance_columns(self.covariance),
+            "quality": self.quality,
+            "evidence": self.evidence,
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Verticals(Table):
+    """Vertical lines of the building, N of them, the leftmost first.
+
+    Attributes
+    ----------
+    bearing_rad : (N,) float64
+        0 forward, positive to the left, in either axes.
+    sigma_rad : (N,) float64
+        Standard deviations of the bearings.
+    inclination_rad : (N,) float64
+        Inclination of the plane through the camera and the line (beta of `.lines` files).
+    top, bottom : (N, 2) float64
+        Ends in the image, pixels u, v.
+    """
+
+    bearing_rad: FloatArray
+    sigma_rad: FloatArray
+    inclination_rad: FloatArray
+    top: FloatArray
+    bottom: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.bearing_rad)
+
+    def columns(self) -> dict[str, Any]:
+        """One row per vertical."""
+        return {
+            "bearing_rad": self.bearing_rad,
+            "sigma_rad": self.sigma_rad,
+            "inclination_rad": self.inclination_rad,
+            "u_top_px": self.top[:, 0],
+            "v_top_px": self.top[:, 1],
+            "u_bottom_px": self.bottom[:, 0],
+            "v_bottom_px": self.bottom[:, 1],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """How the robot tilts, by the verticals.
+
+    Attributes
+    ----------
+    pitch_rad, roll_rad : float
+        Rotation that turns measured directions level: about the robot's axis to the left (pitch)
+        and about the other one (roll): X and Y of the data set's axes, Y and X of REP 103's.
+    covariance : (2, 2) float64
+        Of (pitch, roll), square radians.
+    lines : int
+        Verticals that agree with it.
+    """
+
+    pitch_rad: float
+    roll_rad: float
+    covariance: FloatArray
+    lines: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Detection(Table):
+    """What was found in one image.
+
+    Attributes
+    ----------
+    discs : Discs
+    verticals : Verticals
+    tilt : Tilt or None
+        None where too few verticals determine it: then the discs' covariances contain that of an
+        unknown tilt (`CircleSettings.tilt_sigma_deg`).
+    axes : {"dataset", "robotics"}
+        Of floor positions and tilt: X left and Y backward, or REP 103's X forward and Y left.
+    name : str
+        The image's name.
+    image : (H, W) uint8
+    camera : Camera
+    settings : CircleSettings
+    frame : redetect.landmarks.Frame
+        The same as rows of files, in the data set's axes: for `redetect.landmarks.write_frames`.
+    """
+
+    discs: Discs
+    verticals: Verticals
+    tilt: Tilt | None
+    axes: Axes
+    name: str
+    image: NDArray[np.uint8]
+    camera: Camera
+    settings: CircleSettings
+    frame: Frame
+
+    def columns(self) -> dict[str, Any]:
+        """Discs, then verticals, one row each; what a kind does not have is NaN."""
+        parts: dict[str, Discs | Verticals] = {"disc": self.discs, "vertical": self.verticals}
+        columns: dict[str, Any] = {
+            "kind": [kind for kind, part in parts.items() for _ in range(len(part))]
+        }
+        for name in (*self.discs.columns(), *self.verticals.columns()):
+            columns[name] = np.concatenate(
+                [p.columns().get(name, np.full(len(p), np.nan)) for p in parts.values()]
+            )
+        return columns
+
+    def to_json(self) -> str:
+        """An object with `discs`, `verticals` (lists of records) and `tilt`."""
+        tilt = None if self.tilt is None else plain(vars(self.tilt))
+        content = {
+            "image": self.name,
+            "axes": self.axes,
+            "tilt": tilt,
+            "discs": _records(self.discs),
+            "verticals": _records(self.verticals),
+        }
+        return json.dumps(content, indent=1, allow_nan=False)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
+        from detect.drawing.frame import draw_rows
+        from detect.drawing.inputs import SeenRows
+        from detect.viewing_options import CompareOptions
+
+        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
+        sight = Sight(self.camera, self.settings.radius_m)
+        return draw_rows(self.image, sight, rows, self.settings, CompareOptions(), self.name)
+
+    def __str__(self) -> str:
+        words = f"{self.name}: {len(self.discs)} discs, {len(self.verticals)} verticals, "
+        if self.tilt is None:
+            return words + "no tilt"
+        pitch, roll = np.degrees([self.tilt.pitch_rad, self.tilt.roll_rad])
+        return f"{words}pitch {pitch:.2f}, roll {roll:.2f} degrees ({MEANING[self.axes]})"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+    def _repr_png_(self) -> bytes:
+        return png_of(self.picture())
+
+    def _repr_html_(self) -> str:
+        picture = base64.b64encode(self._repr_png_()).decode()
+        return (
+            f"<p>{html.escape(str(self))}</p>"
+            f'<img alt="{html.escape(self.name)}" src="data:image/png;base64,{picture}"/>'
+            + html_table(self.discs.columns())
+        )
+
+
+def detect(
+    image: ImageLike,
+    camera: CameraLike,
+    radius_m: float | None = None,
+    polarity: Polarity | None = None,
+    *,
+    level: bool = True,
+    axes: Axes = "dataset",
+    settings: CircleSettings | None = None,
+    line_settings: LineSettings | None = None,
+) -> Detection:
+    """Find discs, verticals and tilt in one image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, or path
+        Grey values of the camera's size, or an image file.
+    camera : Camera, or path
+        The calibrated camera, or its `.cam` file.
+    radius_m : float, optional
+        Radius of the discs, metres; by default that of the settings.
+    polarity : {"any", "light", "dark"}, optional
+        Which discs to find; by default as the settings say.
+    level : bool
+        Correct the discs' positions by the tilt that the verticals show.
+    axes : {"dataset", "robotics"}
+        Of the result: X left and Y backward, or REP 103's X forward and Y left.
+    settings : CircleSettings, optional
+        Of the detector of discs.
+    line_settings : LineSettings, optional
+        Of the detector of verticals.
+
+    Returns
+    -------
+    Detection
+
+    Raises
+    ------
+    detect.errors.FrameError
+        If the image cannot be read, is no grey image of 8 bits, or not of the camera's size.
+    detect.errors.DetectError
+        If a setting is out of its range.
+    camera.CameraError
+        If the calibration cannot be read.
+    """
+    frame = frame_of_image(image)
+    return detect_frame(
+        frame, camera_of(camera), settings_of(settings, radius_m, polarity), line_settings,
+        level=level, axes=axes,
+    )  # fmt: skip
+
+
+def detect_frame(
+    frame: RunFrame,
+    camera: Camera,
+    settings: CircleSettings,
+    line_settings: LineSettings | None,
+    *,
+    level: bool,
+    axes: Axes,
+) -> Detection:
+    """As `detect`, of a frame of a run."""
+    plan = FramePlan(
+        camera,
+        lines=line_settings or LineSettings(),
+        circles=settings,
+        levelling="frame" if level else "none",
+    )
+    (found,) = detect_batch([FrameTask(frame)], plan)
+    if found.error is not None:
+        raise FrameError(found.error)
+    return _detection(found, frame.step, camera, settings, axes)
+
+
+def settings_of(
+    settings: CircleSettings | None, radius_m: float | None, polarity: Polarity | None
+) -> CircleSettings:
+    """Settings with what was named apart from them."""
+    settings = settings or CircleSettings()
+    return replace(
+        settings,
+        radius_m=settings.radius_m if radius_m is None else radius_m,
+        polarity=polarity or settings.polarity,
+    )
+
+
+def camera_of(camera: CameraLike) -> Camera:
+    """A camera, or that of a file."""
+    return camera if isinstance(camera, Camera) else read_camera(camera)
+
+
+def grey_image(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """An array as an image to be searched.
+
+    Raises
+    ------
+    FrameError
+        If it is no grey image of 8 bits.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise FrameError(
+            f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 of "
+            "shape (H, W); files of colours or 16 bits can be named by their path"
+        )
+    return np.ascontiguousarray(image)
+
+
+def png_of(picture: NDArray[np.uint8]) -> bytes:
+    """A picture as a PNG file."""
+    import cv2
+
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
+def frame_of_image(image: ImageLike) -> RunFrame:
+    """An array or a file as a frame without odometry."""
+    if isinstance(image, np.ndarray):
+        return RunFrame(Step("image", *[0.0] * 9), None, content=grey_image(image))
+    path = Path(image)
+    if not path.is_file():
+        raise FrameError(f"{path}: no such image")
+    # A prefix is one word.
+    return RunFrame(Step("_".join(path.stem.split()) or "image", *[0.0] * 9), path)
+
+
+def _detection(
+    found: FrameDetections, step: Step, camera: Camera, settings: CircleSettings, axes: Axes
+) -> Detection:
+    assert found.image is not None
+    assert found.discs is not None
+    assert found.lines is not None
+    lines, discs = found.lines, found.discs
+    pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
+    rows = [
+        CircleLandmark(x, y, q, cxx, cxy, cyy, (-1,))
+        for (x, y), ((cxx, cxy), (_, cyy)), q in zip(
+            discs.floor_xy.tolist(), discs.covariance.tolist(), discs.quality.tolist()
+        )
+    ]
+    return Detection(
+        discs=Discs(
+            u=pixels[:, 0],
+            v=pixels[:, 1],
+            xy=from_dataset(discs.floor_xy, axes),
+            covariance=covariance_from_dataset(discs.covariance, axes),
+            quality=discs.quality,
+            evidence=discs.evidence,
+        ),
+        verticals=Verticals(
+            bearing_rad=lines.alpha_rad,
+            sigma_rad=lines.sigma_rad,
+            inclination_rad=lines.beta_rad,
+            top=camera.distort(lines.ends[:, :2]),
+            bottom=camera.distort(lines.ends[:, 2:]),
+        ),
+        tilt=_tilt_of(found.tilt, axes),
+        axes=axes,
+        name=step.prefix,
+        image=found.image,
+        camera=camera,
+        settings=settings,
+        frame=Frame(step, (*rows, *lines.landmarks()), discs.levelled_by),
+    )
+
+
+def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
+    if tilt is None:
+        return None
+    # About X forward instead of Y backward, the rotation of the same sense is the negative one.
+    sign = 1.0 if axes == "dataset" else -1.0
+    covariance = np.array([[tilt.cpp, sign * tilt.cpr], [sign * tilt.cpr, tilt.crr]])
+    return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
+
+
+def _as_row(tilt: Tilt | None, axes: Axes) -> FrameTilt | None:
+    if tilt is None:
+        return None
+    sign = 1.0 if axes == "dataset" else -1.0
+    (cpp, cpr), (_, crr) = tilt.covariance.tolist()
+    return FrameTilt("", tilt.pitch_rad, sign * tilt.roll_rad, cpp, sign * cpr, crr, tilt.lines)
+
+
+def _records(table: Table) -> list[dict[str, Any]]:
+    columns = plain(table.columns())
+    return [dict(zip(columns, values)) for values in zip(*columns.values())]

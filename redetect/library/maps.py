@@ -1,0 +1,259 @@
+"""Maps by least squares, and localisation in them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    Landmarks,
+    Path2D,
+    read_map,
+    write_map,
+    write_path,
+)
+from redetect.library.tables import Table, covariance_columns
+from redetect.slam.commands.localize import localized_run_of
+from redetect.slam.commands.map import MAP_NAME, PATH_NAME, mapped_run_of, weighting_of
+from redetect.slam.filters.frames import FilterRun
+from redetect.slam.filters.report import path_distance
+from redetect.slam.mapping.covariance_file import (
+    joint_covariance,
+    read_joint_covariance,
+    write_joint_covariance,
+)
+from redetect.slam.mapping.run_map import MappedRun, landmark_map, path_of
+from redetect.slam.options import Localize, Map
+from redetect.slam.pictures import draw_map
+from redetect.slam.recording import Recording, read_recording
+
+PathLike = str | os.PathLike[str]
+
+
+class Poses(Table):
+    """The poses of a path as a table.
+
+    Attributes
+    ----------
+    path : Path2D
+    """
+
+    def __init__(self, path: Path2D) -> None:
+        self.path = path
+
+    def columns(self) -> dict[str, Any]:
+        """One row per pose; covariances where the path has them."""
+        columns: dict[str, Any] = {
+            "prefix": list(self.path.prefixes),
+            "x_m": self.path.poses[:, 0],
+            "y_m": self.path.poses[:, 1],
+            "theta_rad": self.path.poses[:, 2],
+        }
+        if self.path.covariance is not None:
+            columns |= covariance_columns(self.path.covariance)
+            columns["cthetatheta_rad2"] = self.path.covariance[:, 2, 2]
+        return columns
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RunMap(Table):
+    """A map of a run by least squares; its frame is the robot's at the start, X left, Y backward.
+
+    Attributes
+    ----------
+    discs, lines : redetect.landmarks.map_file.Landmarks
+        Identifiers, places (m) and covariances (m^2).
+    path : redetect.landmarks.map_file.Path2D
+        Poses with covariances: the start, and one after each step.
+    result : redetect.slam.mapping.run_map.MappedRun
+        How it came about: residuals, what was left out, the camera's mounting.
+    """
+
+    discs: Landmarks
+    lines: Landmarks
+    path: Path2D
+    result: MappedRun
+    command: Map
+
+    @property
+    def chi_squared_factor(self) -> float:
+        """Squared residuals per degree of freedom: 1 if all covariances are right."""
+        return self.result.table.factor
+
+    def columns(self) -> dict[str, Any]:
+        """Discs, then verticals, one row each."""
+        both = {"disc": self.discs, "vertical": self.lines}
+        xy = np.concatenate([some.xy for some in both.values()])
+        covariance = np.concatenate([some.covariance for some in both.values()])
+        return {
+            "kind": [kind for kind, some in both.items() for _ in range(len(some))],
+            "id": np.concatenate([some.ids for some in both.values()]),
+            "x_m": xy[:, 0],
+            "y_m": xy[:, 1],
+            **covariance_columns(covariance),
+            "rows": np.concatenate([some.rows for some in both.values()]),
+        }
+
+    def poses(self) -> Poses:
+        """The path as a table."""
+        return Poses(self.path)
+
+    def write(self, folder: PathLike, *, overwrite: bool = False) -> None:
+        """Write map.csv with its joint covariance, and path.csv, as `slam map` does.
+
+        Parameters
+        ----------
+        folder : path
+            Made if need be.
+        overwrite : bool
+            Whether existing files may be replaced; else `redetect.storage.OutputExistsError`.
+        """
+        place = Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        write_map(place / MAP_NAME, self._landmarks(), overwrite=overwrite)
+        write_joint_covariance(place / MAP_NAME, self.joint_covariance(), overwrite=overwrite)
+        write_path(place / PATH_NAME, self.path, overwrite=overwrite)
+
+    def joint_covariance(self) -> Any:
+        """(2 M, 2 M) covariance of all places, discs first (m^2)."""
+        return joint_covariance(self.result.graph, self.result.estimate, weighting_of(self.command))
+
+    def _landmarks(self) -> LandmarkMap:
+        return LandmarkMap(self.discs, self.lines)
+
+    def _repr_png_(self) -> bytes:
+        return _picture(self._landmarks(), self.path)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Localization(Poses):
+    """A run localised in a map.
+
+    Attributes
+    ----------
+    path : redetect.landmarks.map_file.Path2D
+        Poses with covariances: the start, and one after each step.
+    result : redetect.slam.filters.frames.FilterRun
+        What became of the rows.
+    landmarks : redetect.landmarks.map_file.LandmarkMap
+        The map.
+    """
+
+    path: Path2D
+    result: FilterRun
+    landmarks: LandmarkMap
+
+    def distance(self, reference: Path2D) -> Mapping[str, float]:
+        """How far the path is from another one of the same run in the same map, m and rad."""
+        return path_distance(self.path, reference.poses)
+
+    def _repr_png_(self) -> bytes:
+        return _picture(self.landmarks, self.path)
+
+
+def map_landmarks(
+    run: PathLike, *, circles: bool = True, lines: bool = False, **options: Any
+) -> RunMap:
+    """Map the landmarks of a run by least squares, as `slam map` does.
+
+    Parameters
+    ----------
+    run : path
+        Run folder, or a `.circles` or `.lines` file, with identifiers.
+    circles, lines : bool
+        Which landmarks to use.
+    **options
+        Further flags of `slam map` (`redetect.slam.options.Map`), such as `stem`, `calibrate`,
+        `loss` or `start`.
+
+    Returns
+    -------
+    RunMap
+
+    Raises
+    ------
+    redetect.slam.errors.SlamError
+        If no row has an identifier, the run is disconnected, or a calibration is missing.
+    redetect.landmarks.LandmarkFileError
+        If a file is malformed.
+    """
+    command = Map(run=Path(run), circles=circles, lines=lines, **_as_paths(options))
+    recording = _recording_of(command)
+    mapped = mapped_run_of(command, recording)
+    final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
+    path = path_of(recording, mapped.estimate, mapped.covariance)
+    return RunMap(final.discs, final.lines, path, mapped, command)
+
+
+def localize(
+    run: PathLike, landmarks: RunMap | PathLike, *, circles: bool = True, lines: bool = False,
+    **options: Any,
+) -> Localization:  # fmt: skip
+    """Localise a run in a map, as `slam localize` does.
+
+    Parameters
+    ----------
+    run : path
+        Run folder, or a `.circles` or `.lines` file.
+    landmarks : RunMap, or path
+        The map, or its `map.csv`.
+    circles, lines : bool
+        Which landmarks to use.
+    **options
+        Further flags of `slam localize` (`redetect.slam.options.Localize`), such as `association`,
+        `start` or `map_errors`.
+
+    Returns
+    -------
+    Localization
+
+    Raises
+    ------
+    redetect.slam.errors.SlamError
+        If no row shows a landmark of the map.
+    redetect.landmarks.LandmarkFileError
+        If a file is malformed.
+    """
+    in_file = Path("the map") if isinstance(landmarks, RunMap) else Path(landmarks)
+    command = Localize(
+        run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options)
+    )
+    if isinstance(landmarks, RunMap):
+        places = LandmarkMap(landmarks.discs, landmarks.lines)
+        joint = landmarks.joint_covariance()
+    else:
+        places = read_map(in_file)
+        joint = read_joint_covariance(in_file, places)
+    result = localized_run_of(command, _recording_of(command), places, joint)
+    return Localization(result.path, result, places)
+
+
+def _recording_of(command: Map | Localize) -> Recording:
+    return read_recording(
+        command.run,
+        circles=command.circles,
+        lines=command.lines,
+        stem=command.stem,
+        noise=command.odometry_noise,
+    )
+
+
+def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: Path(value) if name == "camera" and value is not None else value
+        for name, value in options.items()
+    }
+
+
+def _picture(landmarks: LandmarkMap, path: Path2D) -> bytes:
+    with TemporaryDirectory() as folder:
+        place = Path(folder) / "map.png"
+        draw_map(place, landmarks, path, overwrite=False)
+        return place.read_bytes()

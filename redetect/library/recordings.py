@@ -1,0 +1,205 @@
+"""Runs: the frames of a recording, and how detected rows compare with reference rows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.comparison.compare import beside_reference, compare_frames, compare_line_frames
+from detect.comparison.report import comparison_of
+from detect.comparison.result import Comparison
+from detect.drawing.inputs import read_head
+from detect.errors import DetectError
+from detect.line_settings import LineSettings
+from detect.options import SourceOptions
+from detect.run import Run, read_image
+from detect.seen import Sight
+from detect.settings import CircleSettings, Polarity
+from detect.sources.interface import RunFrame
+from detect.sources.opening import open_calibrated, open_source
+from detect.viewing_options import Compare, CompareOptions
+from redetect.landmarks import Step, read_frames
+from redetect.library.detection import CameraLike, Detection, detect_frame, settings_of
+from redetect.slam.formats.axes import Axes
+
+PathLike = str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One frame of a recording.
+
+    Attributes
+    ----------
+    frame : detect.run.RunFrame
+        Its odometry step, and where its image comes from.
+    camera : Camera
+    """
+
+    frame: RunFrame
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """The image's name."""
+        return self.frame.step.prefix
+
+    @property
+    def time_s(self) -> float | None:
+        """When it was taken, if that is known."""
+        return self.frame.time_s
+
+    @property
+    def step(self) -> Step:
+        """The robot's movement since the frame before."""
+        return self.frame.step
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
+        return read_image(self.frame, self.camera)
+
+    def detect(
+        self,
+        radius_m: float | None = None,
+        polarity: Polarity | None = None,
+        *,
+        level: bool = True,
+        axes: Axes = "dataset",
+        settings: CircleSettings | None = None,
+        line_settings: LineSettings | None = None,
+    ) -> Detection:
+        """Find discs, verticals and tilt: see `redetect.library.detection.detect`."""
+        settings = settings_of(settings, radius_m, polarity)
+        return detect_frame(
+            self.frame, self.camera, settings, line_settings, level=level, axes=axes
+        )
+
+
+class Recording:
+    """The frames of a run, in their order; iterating again starts over.
+
+    Attributes
+    ----------
+    name : str
+    camera : Camera
+    folder : path
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.name, self.camera, self.folder = run.name, run.camera, run.folder
+
+    def __iter__(self) -> Iterator[RecordedFrame]:
+        for frame in self._run.frames:
+            yield RecordedFrame(frame, self.camera)
+
+    @property
+    def expected(self) -> int | None:
+        """Approximate number of frames, if it is known."""
+        return self._run.frames.expected
+
+    def __repr__(self) -> str:
+        return f"<recording {self.name}: {self.expected or 'unknown number of'} frames>"
+
+
+def open_recording(name: PathLike, camera: CameraLike | None = None, **source: Any) -> Recording:
+    """Open a run folder, a folder or pattern of images, a video, a bag, or `camera:0`.
+
+    Parameters
+    ----------
+    name : path
+    camera : Camera, or path, optional
+        The calibration; by default the `.cam` file beside the images, or that in the bag.
+    **source
+        Fields of `detect.options.SourceOptions`, such as `odometry`, `times` or `frames`.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    detect.errors.DetectError
+        If there is no such thing, it cannot be read, or there is no calibration.
+    camera.CameraError, redetect.landmarks.LandmarkFileError
+        If the calibration or the odometry cannot be read.
+    """
+    options = SourceOptions(**source)
+    if isinstance(camera, Camera):
+        return Recording(open_source(Path(name), None, options).calibrated(camera))
+    path = None if camera is None else Path(camera)
+    return Recording(open_calibrated(Path(name), path, options))
+
+
+def compare(
+    run: PathLike,
+    detected: PathLike | Iterable[Detection] | None = None,
+    reference: PathLike | None = None,
+    *,
+    lines: bool = False,
+    camera: CameraLike | None = None,
+    options: CompareOptions | None = None,
+) -> Comparison:
+    """Compare detected discs, or verticals, with reference rows, as `detect compare` does.
+
+    Parameters
+    ----------
+    run : path
+        Run folder.
+    detected : path, or iterable of Detection, optional
+        Detected rows; by default `detected.circles` (`detected.lines`) in the run folder.
+    reference : path, optional
+        Reference rows; by default `map.circles` (`map.lines`) in the run folder.
+    lines : bool
+        Compare verticals instead of discs.
+    camera : Camera, or path, optional
+        Calibration; by default the one in the run folder.
+    options : CompareOptions, optional
+        Which rows are the same landmark, and which count.
+
+    Returns
+    -------
+    DiscComparison or LineComparison
+        Its `sentences()` say in words what came out.
+
+    Raises
+    ------
+    detect.errors.DetectError
+        If there are no such rows.
+    redetect.landmarks.LandmarkFileError
+        If a file is malformed.
+    detect.comparison.result.CompareError
+        If an image has two frames, or a covariance that is needed is not positive definite.
+    """
+    options = options or CompareOptions()
+    in_file = None if reference is None else Path(reference)
+    if detected is None or isinstance(detected, str | os.PathLike):
+        path = None if detected is None else Path(detected)
+        command = Compare(
+            Path(run), lines=lines, reference=in_file, detected=path, matching=options,
+            camera=None if camera is None or isinstance(camera, Camera) else Path(camera),
+        )  # fmt: skip
+        return comparison_of(command, camera if isinstance(camera, Camera) else None)
+    found = list(detected)
+    in_file = in_file or Path(run) / ("map.lines" if lines else "map.circles")
+    if not found or not in_file.is_file():
+        raise DetectError(
+            f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
+        )
+    frames, names = [one.frame for one in found], (str(in_file), "detections")
+    if lines:
+        return compare_line_frames(read_frames(in_file), frames, options, names=names)
+    sight = Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level)
+    return compare_frames(
+        read_frames(in_file), frames, options, sight=sight,
+        beside=beside_reference(in_file), names=names,
+    )  # fmt: skip

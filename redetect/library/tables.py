@@ -1,0 +1,104 @@
+"""Results as tables: data frames, JSON, HTML."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib import import_module
+from typing import Any, Literal
+
+import numpy as np
+
+from redetect.storage.messages import OneLineError
+
+FrameLibrary = Literal["pandas", "polars"]
+
+#: Rows of a table that a notebook shows.
+_MOST_SHOWN = 20
+
+
+class ResultError(OneLineError, ValueError):
+    """A result that cannot be given in the form that was asked for."""
+
+
+class Table:
+    """Something with columns; every result of the library is one."""
+
+    def columns(self) -> dict[str, Sequence[Any]]:
+        """Columns of equal length by their names, which end with their units."""
+        raise NotImplementedError
+
+    def to_dataframe(self, library: FrameLibrary | None = None) -> Any:
+        """The columns as a data frame.
+
+        Parameters
+        ----------
+        library : "pandas" or "polars", optional
+            By default the first of them that is installed.
+
+        Raises
+        ------
+        redetect.library.tables.ResultError
+            If it is not installed.
+        """
+        wanted = ("pandas", "polars") if library is None else (library,)
+        for name in wanted:
+            with suppress(ModuleNotFoundError):
+                return import_module(name).DataFrame(self.columns())
+        raise ResultError(
+            f"{' or '.join(wanted)} is not installed: pip install {wanted[0]}, or use columns() "
+            "or to_json()"
+        )
+
+    def to_json(self) -> str:
+        """The columns as a JSON object of lists; what is not finite is null."""
+        return json.dumps(plain(self.columns()), indent=1, allow_nan=False)
+
+    def __repr__(self) -> str:
+        columns = self.columns()
+        rows = len(next(iter(columns.values())))
+        return f"<{type(self).__name__}: {rows} rows of {', '.join(columns)}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(self.columns())
+
+
+def plain(value: Any) -> Any:
+    """Arrays, tuples and mappings as lists and dicts of numbers that JSON has."""
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def covariance_columns(covariance: Any) -> dict[str, Sequence[Any]]:
+    """Columns of (N, 2, 2) covariances of positions, square metres."""
+    return {
+        "cxx_m2": covariance[:, 0, 0],
+        "cxy_m2": covariance[:, 0, 1],
+        "cyy_m2": covariance[:, 1, 1],
+    }
+
+
+def html_table(columns: Mapping[str, Sequence[Any]]) -> str:
+    """The first rows of a table as HTML."""
+    count = len(next(iter(columns.values()), ()))
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{_word(column[k])}</td>" for column in columns.values()) + "</tr>"
+        for k in range(min(count, _MOST_SHOWN))
+    )
+    more = f"<p>and {count - _MOST_SHOWN} more rows</p>" if count > _MOST_SHOWN else ""
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{more}"
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, float | np.floating):
+        return f"{value:.4g}" if math.isfinite(value) else ""
+    return html.escape(str(value))

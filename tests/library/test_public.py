@@ -1,0 +1,278 @@
+"""`import redetect as rd`: names, cost, and what each gives."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import redetect as rd
+from detect.errors import DetectError, FrameError
+from redetect.landmarks import read_frames, write_frames
+from redetect.library.tables import FrameLibrary, ResultError
+from redetect.storage import OutputExistsError
+
+
+def test_importing_costs_nothing(project_root: Path) -> None:
+    program = (
+        "import sys, redetect\n"
+        "print({'numpy', 'numba', 'cv2', 'scipy', 'tyro', 'detect', 'camera'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=project_root, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert done.stdout == "set()\n"
+
+
+def test_every_public_name_is_there() -> None:
+    assert dir(rd) == sorted(rd.__all__)
+    for name in rd.__all__:
+        assert getattr(rd, name).__doc__
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = rd.no_such_name
+
+
+# -- one image ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def found(demo_image: Path, demo_camera: rd.Camera) -> rd.Detection:
+    return rd.detect(demo_image, demo_camera, polarity="light")
+
+
+def test_it_is_what_the_command_line_finds(
+    found: rd.Detection, demo: Path, demo_image: Path, tmp_path: Path
+) -> None:
+    """Of one image: verticals, the tilt by them, discs that are levelled by that."""
+    from detect.cli import main
+
+    flags = ["--camera", str(demo / "e.cam"), "--circles.polarity", "light", "--tilt", "frame"]
+    assert main(["all", str(demo_image), *flags, "-o", str(tmp_path)]) == 0
+    (frame,) = read_frames(tmp_path / "detected.circles")
+    write_frames(tmp_path / "own.circles", [found.frame])
+    (own,) = read_frames(tmp_path / "own.circles")
+    assert [(r.px, r.py, r.quality, r.cxx, r.cxy, r.cyy) for r in own.circles] == [
+        (r.px, r.py, r.quality, r.cxx, r.cxy, r.cyy) for r in frame.circles
+    ]
+    (frame,) = read_frames(tmp_path / "detected.lines")
+    assert [line.alpha for line in frame.lines] == pytest.approx(
+        found.verticals.bearing_rad, rel=1e-5
+    )
+
+
+def test_positions_in_the_image_and_on_the_floor_are_the_same_places(
+    demo_image: Path, demo_camera: rd.Camera
+) -> None:
+    found = rd.detect(demo_image, demo_camera, level=False)
+    assert len(found.discs) > 10
+    seen = demo_camera.project_floor(found.discs.xy)
+    np.testing.assert_allclose(np.stack([found.discs.u, found.discs.v], axis=1), seen, atol=1e-9)
+    assert np.any(np.abs(found.discs.u - np.rint(found.discs.u)) > 0.1)
+
+
+def test_rep_103_axes(found: rd.Detection, demo_image: Path, demo_camera: rd.Camera) -> None:
+    """X forward and Y left: the same vectors and covariances, turned by a quarter."""
+    other = rd.detect(demo_image, demo_camera, polarity="light", axes="robotics")
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    np.testing.assert_array_equal(other.discs.xy, found.discs.xy @ turn.T)
+    np.testing.assert_allclose(
+        other.discs.covariance, turn @ found.discs.covariance @ turn.T, rtol=1e-12
+    )
+    assert np.all(other.discs.xy[:, 0] > 0.0)  # in front
+    np.testing.assert_array_equal(other.verticals.bearing_rad, found.verticals.bearing_rad)
+    assert found.tilt is not None
+    assert other.tilt is not None
+    # The rotation about X and Y is a vector, too.
+    vector = turn @ [found.tilt.pitch_rad, found.tilt.roll_rad]
+    np.testing.assert_allclose([other.tilt.roll_rad, other.tilt.pitch_rad], vector)
+    assert other.frame == found.frame
+    np.testing.assert_array_equal(other.picture(), found.picture())
+
+
+def test_radius_and_settings(demo_image: Path, demo_camera: rd.Camera) -> None:
+    settings = rd.CircleSettings(polarity="dark", threshold=0.9)
+    found = rd.detect(demo_image, demo_camera, radius_m=0.06, settings=settings)
+    assert found.settings == rd.CircleSettings(polarity="dark", threshold=0.9, radius_m=0.06)
+    with pytest.raises(rd.Error, match="radius_m is -1"):
+        rd.detect(demo_image, demo_camera, radius_m=-1.0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((288, 768, 3), np.uint8),
+        np.zeros((288, 768), np.uint16),
+        np.zeros((10, 10), np.uint8),
+        "no/such/image.png",
+    ],
+)
+def test_images_that_are_refused(image: Any, demo_camera: rd.Camera) -> None:
+    for search in (rd.detect, rd.explain):
+        with pytest.raises(FrameError) as error:
+            search(image, demo_camera)
+        assert "\n" not in str(error.value)
+
+
+def test_files_of_colours_can_be_named(
+    found: rd.Detection, demo_image: Path, demo: Path, tmp_path: Path
+) -> None:
+    grey = cv2.imread(str(demo_image), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    cv2.imwrite(str(tmp_path / "in colour.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    other = rd.detect(tmp_path / "in colour.png", demo / "e.cam", polarity="light")
+    np.testing.assert_array_equal(other.discs.xy, found.discs.xy)
+    assert other.name == "in_colour"
+
+
+def test_json(found: rd.Detection) -> None:
+    content = json.loads(found.to_json())
+    assert [disc["u_px"] for disc in content["discs"]] == found.discs.u.tolist()
+    assert [line["bearing_rad"] for line in content["verticals"]] == (
+        found.verticals.bearing_rad.tolist()
+    )
+    assert content["axes"] == "dataset"
+    assert content["tilt"]["lines"] > 5
+
+
+def test_notebooks_show_pictures_and_tables(found: rd.Detection) -> None:
+    picture = cv2.imdecode(np.frombuffer(found._repr_png_(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape[0] > found.image.shape[0]
+    page = found._repr_html_()
+    assert page.count("<tr>") == 1 + len(found.discs)
+    assert "data:image/png;base64," in page
+    assert len(repr(found)) < 200
+    assert len(repr(found.discs)) < 200
+
+
+@pytest.mark.parametrize("name", ["pandas", "polars"])
+def test_data_frames(
+    found: rd.Detection, name: FrameLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a stand-in of the library that keeps the columns, where it isn't installed."""
+    for other in {"pandas", "polars"} - {name}:
+        monkeypatch.setitem(sys.modules, other, None)
+    monkeypatch.setitem(sys.modules, name, types.SimpleNamespace(DataFrame=dict))
+    columns = found.to_dataframe()
+    count = len(found.discs) + len(found.verticals)
+    assert {len(column) for column in columns.values()} == {count}
+    assert columns["kind"][0] == "disc"
+    assert np.isnan(columns["bearing_rad"][0])
+    assert found.discs.to_dataframe(name).keys() == found.discs.columns().keys()
+
+
+def test_without_a_library_of_data_frames(
+    found: rd.Detection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("pandas", "polars"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ResultError, match="pandas or polars is not installed: pip install pandas"):
+        found.to_dataframe()
+
+
+# -- runs -----------------------------------------------------------------------------------
+
+
+def test_frames_of_a_run_and_their_comparison(demo: Path) -> None:
+    run = rd.open(demo, frames=3)
+    frames = list(run)
+    assert [frame.name for frame in frames] == ["e.0000", "e.0001", "e.0002"]
+    assert frames[0].image.shape == (run.camera.height, run.camera.width)
+    assert frames[1].step.dy != 0.0
+    found = [frame.detect(polarity="light") for frame in frames]
+    discs = rd.compare(demo, found)
+    assert discs.recall == 1.0
+    assert "discs of the reference are found, 0 missed, in 3 frames" in discs.sentences()[0]
+    assert json.loads(discs.to_json())["matched"] == discs.matched
+    verticals = rd.compare(demo, found, lines=True)
+    assert "verticals of the reference are found" in verticals._repr_html_()
+    with pytest.raises(DetectError, match="nothing to compare"):
+        rd.compare(demo, [])
+
+
+def test_a_run_with_another_camera(demo: Path, demo_camera: rd.Camera) -> None:
+    for camera in (demo_camera, demo / "e.cam"):
+        (frame,) = rd.open(demo / "images", camera, frames=1)
+        assert frame.camera == demo_camera
+    with pytest.raises(rd.Error, match="no such folder"):
+        rd.open("no-such-run.mcap")
+
+
+def test_comparison_of_files(demo: Path, tmp_path: Path) -> None:
+    result = rd.compare(demo, demo / "map.circles", demo / "map.circles")
+    assert result.recall == result.precision == 1.0
+    with pytest.raises(rd.Error, match=r"detected\.circles"):
+        rd.compare(tmp_path, reference=demo / "map.circles")
+
+
+def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
+    landmarks = rd.map(demo, lines=True)
+    assert len(landmarks.discs) > 20
+    assert set(landmarks.columns()["kind"]) == {"disc", "vertical"}
+    assert len(landmarks.poses().columns()["prefix"]) == len(landmarks.path.poses)
+    assert landmarks._repr_png_().startswith(b"\x89PNG")
+    landmarks.write(tmp_path)
+    with pytest.raises(OutputExistsError):
+        landmarks.write(tmp_path)
+    in_memory = rd.localize(demo, landmarks, lines=True)
+    from_file = rd.localize(demo, tmp_path / "map.csv", lines=True)
+    np.testing.assert_allclose(in_memory.path.poses, from_file.path.poses, atol=1e-9)
+    assert in_memory.distance(landmarks.path)["position_max_m"] < 0.05
+    assert len(repr(landmarks)) < 200
+    assert len(repr(in_memory)) < 200
+
+
+# -- explanations ---------------------------------------------------------------------------
+
+
+def test_every_disc_that_is_found_is_explained(
+    found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
+) -> None:
+    why = rd.explain(demo_image, demo_camera, polarity="light")
+    assert sum(row.is_disc for row in why.candidates) == len(found.discs)
+    stages = {row.stage for row in why.candidates}
+    assert {"disc", "few steps", "polarity", "quality"} <= stages
+    for row in why.candidates:
+        assert row.is_disc == row.reason().startswith("found")
+    content = json.loads(why.to_json())
+    assert len(content["candidates"]) == len(why.candidates)
+    assert why._repr_png_().startswith(b"\x89PNG")
+    assert "data:image/png" in why._repr_html_()
+
+
+def test_the_wrong_polarity_is_named(demo_image: Path, demo_camera: rd.Camera) -> None:
+    why = rd.explain(demo_image, demo_camera, polarity="dark")
+    assert any("--polarity any finds" in words for words in why.suggestions)
+    assert any(row.stage == "polarity" for row in why.candidates)
+
+
+@pytest.mark.long
+def test_the_right_radius_is_found_at_a_place(
+    found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
+) -> None:
+    clearest = int(np.argmax(found.discs.evidence))
+    at = float(found.discs.u[clearest]), float(found.discs.v[clearest])
+    why = rd.explain(demo_image, demo_camera, at, radius_m=0.06)
+    assert not any(row.is_disc for row in why.candidates)
+    assert "best quality" in why.place
+    (words,) = [words for words in why.suggestions if "--radius-m" in words]
+    assert float(words.split()[1]) == pytest.approx(0.10, rel=0.1)
+
+
+def test_places_where_nothing_can_be_found(demo_image: Path, demo_camera: rd.Camera) -> None:
+    for at, words in (
+        ((300.0, 10.0), "does not see the floor"),
+        ((900.0, 100.0), "outside the image"),
+        ((377.0, 70.0), "too far"),
+        ((3.0, 285.0), "too near to the border"),
+    ):
+        why = rd.explain(demo_image, demo_camera, at)
+        assert words in why.place, at
