@@ -177,7 +177,7 @@ def compare(
         If there are no such rows.
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
-    detect.comparison.result.CompareError
+    detect.errors.CompareError
         If an image has two frames, or a covariance that is needed is not positive definite.
     """
     options = options or CompareOptions()
