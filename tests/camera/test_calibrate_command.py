@@ -20,8 +20,8 @@ from camera.calibration.model import rotation_of
 from camera.calibration.projection import projection_difference
 from camera.cli import main
 from camera.errors import CalibrationError
-from tools.camera_evaluation.rendered import BOARDS, calibrate_rendered
-from tools.camera_evaluation.rendering import Rays, board_poses, rays_of, render_board
+from tools.evaluation.boards import Rays, board_poses, rays_of, render_board
+from tools.evaluation.calibration import BOARDS, calibrate_rendered
 
 BOARD = Board("checkerboard", 9, 6, 0.04)
 FLAGS = ["--columns", "9", "--rows", "6", "--square-m", "0.04"]

@@ -16,7 +16,7 @@ from camera.calibration.calibrate import BoardView, Calibration, aspect_of, cali
 from camera.calibration.settings import CalibrationSettings
 from camera.cli import main
 from camera.uncertainty import covariance_of
-from tools.camera_evaluation.rendering import Rays, board_poses, rays_of, render_board
+from tools.evaluation.boards import Rays, board_poses, rays_of, render_board
 
 BOARD = Board("checkerboard", 9, 6, 0.04)
 CAMERA = Camera(

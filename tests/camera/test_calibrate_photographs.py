@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.camera_evaluation.photographs import compare
+from tools.evaluation.calibration import compare
 
 
 @pytest.mark.long

@@ -33,8 +33,8 @@ from camera.calibration.projection import (
 )
 from camera.calibration.settings import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
-from tools.camera_evaluation.covariance import monte_carlo
-from tools.camera_evaluation.rendering import board_poses
+from tools.evaluation.boards import board_poses
+from tools.evaluation.calibration import monte_carlo
 
 FloatArray = NDArray[np.float64]
 

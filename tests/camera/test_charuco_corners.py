@@ -11,7 +11,7 @@ from camera.boards.board import Board
 from camera.boards.charuco import find_charuco
 from camera.calibration.model import rotation_of
 from camera.errors import CalibrationError
-from tools.camera_evaluation.rendering import rays_of, render_board
+from tools.evaluation.boards import rays_of, render_board
 
 FloatArray = NDArray[np.float64]
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

@@ -165,7 +165,7 @@ def test_simulated_rays_are_the_cameras(
     decentred: Camera, polynomial: tuple[float, float, float]
 ) -> None:
     from camera.kernels import camera_numbers
-    from tools.simulator.frame.kernels import camera_ray
+    from tools.simulator.frame_kernels import camera_ray
 
     if any(polynomial):
         decentred = replace(decentred, coef=(0.0,) * 5, polynomial=polynomial)

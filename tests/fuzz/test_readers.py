@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import random
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from tools.fuzz.damage import damaged
 from tools.fuzz.reader import Reader, attempt
 from tools.fuzz.readers import READERS
 
@@ -38,6 +38,30 @@ def test_what_fuzzing_begins_with_is_accepted(reader: Reader, folder: Path) -> N
         path = folder / reader.file
         path.write_bytes(reader.content_of(content))
         assert attempt(reader, path) is None
+
+
+def damaged(content: bytes, words: Sequence[bytes], chance: random.Random) -> bytes:
+    """Change a file in one to four places: bits, pieces left out, doubled or moved, words."""
+    for _ in range(chance.randint(1, 4)):
+        at = chance.randint(0, len(content))
+        end = min(len(content), at + chance.choice((1, 1, 2, 8, 40)))
+        kind = chance.randrange(6)
+        if kind == 0:
+            content = content[:at] + content[end:]
+        elif kind == 1:
+            content = content[:end] + content[at:]
+        elif kind == 2:
+            noise = bytes(chance.randrange(256) for _ in range(chance.randint(1, 4)))
+            content = content[:at] + noise + content[at:]
+        elif kind == 3 and words:
+            content = content[:at] + chance.choice(words) + content[end:]
+        elif kind == 4 and at < len(content):
+            flipped = content[at] ^ (1 << chance.randrange(8))
+            content = content[:at] + bytes([flipped]) + content[at + 1 :]
+        else:
+            to = chance.randint(0, len(content))
+            content = content[:to] + content[at:end] + content[to:]
+    return content
 
 
 @each_reader

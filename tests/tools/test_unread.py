@@ -11,7 +11,7 @@ import pytest
 from redetect.storage.command_line import EXIT_UNREAD
 
 
-@pytest.mark.parametrize("command", ["evaluation accuracy", "slam_evaluation map"])
+@pytest.mark.parametrize("command", ["evaluation accuracy", "evaluation fusion-speed --hours 0.01"])
 def test_nobody_reads_on_what_a_tool_prints(command: str) -> None:
     module, *arguments = command.split()
     reading, writing = os.pipe()

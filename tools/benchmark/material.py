@@ -1,19 +1,25 @@
-"""The images that are measured on."""
+"""The images that are measured on: of runs, noise, photographs, and with painted landmarks."""
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from detect.run import Run
 from redetect.landmarks import Frame, write_frames
-from tools.benchmark.errors import BenchmarkError
+from tools.arrays import ByteArray, FloatArray
+from tools.simulator.single_disc import render_disc
+
+
+class BenchmarkError(ValueError):
+    """A benchmark could not be carried out; the message says what was expected."""
+
 
 _JPEG_QUALITY = 90
 
@@ -27,21 +33,13 @@ _SENSOR_NOISE = 2.0
 
 @dataclass(frozen=True)
 class Picture:
-    """An image as a file holds it and as a detector gets it.
+    """An image as a file holds it and as a detector gets it."""
 
-    Attributes
-    ----------
-    encoded : (N,) uint8
-        Content of an image file.
-    grey : (H, W) uint8
-        What it decodes to.
-    """
-
-    encoded: NDArray[np.uint8]
-    grey: NDArray[np.uint8]
+    encoded: ByteArray  # (N,) Content of an image file.
+    grey: ByteArray  # (H, W) What it decodes to.
 
 
-def decode(encoded: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def decode(encoded: ByteArray) -> ByteArray:
     """(H, W) grey values of an image file's content."""
     import cv2
 
@@ -51,7 +49,7 @@ def decode(encoded: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(grey, dtype=np.uint8)
 
 
-def jpeg_picture(grey: NDArray[np.uint8]) -> Picture:
+def jpeg_picture(grey: ByteArray) -> Picture:
     """An image through a JPEG of quality 90."""
     import cv2
 
@@ -60,13 +58,7 @@ def jpeg_picture(grey: NDArray[np.uint8]) -> Picture:
 
 
 def run_pictures(run: Run, count: int) -> list[Picture]:
-    """Some frames of a run, evenly spread over it, as their files are.
-
-    Raises
-    ------
-    BenchmarkError
-        If the run has no images.
-    """
+    """Some frames of a run, evenly spread over it, as their files are."""
     paths = _spread_out([frame.image for frame in run.frames if frame.image is not None], count)
     if not paths:
         raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
@@ -82,21 +74,7 @@ def noise_pictures(camera: Camera, count: int, seed: int) -> list[Picture]:
 
 
 def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Picture]:
-    """Photographs found anywhere below a folder, scaled to the camera's size.
-
-    Parameters
-    ----------
-    folder : path
-    camera : Camera
-        Whose size they get.
-    count : int
-        At most this many, evenly spread over all in the order of their paths.
-
-    Raises
-    ------
-    BenchmarkError
-        If there is no image below the folder, or one cannot be read.
-    """
+    """Photographs found anywhere below a folder, scaled to the camera's size."""
     import cv2
 
     found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTOGRAPHS)
@@ -141,22 +119,7 @@ def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
 
 
 def repeated_run(run: Run, folder: Path, frames: int) -> Path:
-    """A run folder of any number of frames: those of a run over and over.
-
-    Parameters
-    ----------
-    run : Run
-        The run whose image files are copied; beyond some, links to the copies will do.
-    folder : path
-        Where the new run folder is made.
-    frames : int
-        How many frames it has.
-
-    Returns
-    -------
-    path
-        The run folder, with the odometry of those frames.
-    """
+    """A run folder of any number of frames: those of a run over and over."""
     sources = [(frame.image, frame.step) for frame in run.frames if frame.image is not None]
     if not sources:
         raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
@@ -183,3 +146,90 @@ def _spread_out(paths: list[Path], count: int) -> list[Path]:
     if len(paths) <= count:
         return paths
     return [paths[i * len(paths) // count] for i in range(count)]
+
+
+_FLOOR, _DISC = 90.0, 200.0
+_DARK, _LIGHT = 90.0, 160.0
+_BLUR_PX = 0.7
+_NOISE = 1.5
+_RADIUS_M = 0.10
+
+#: Discs lie this far apart at least, this far away at most, and this far inside the image.
+_APART_M = 0.35
+_FARTHEST_M = 4.0
+_MARGIN_PX = 30
+
+#: Attempts to place a disc.
+_ATTEMPTS = 10_000
+
+#: Samples per pixel and axis of a wall, and the wall's stripes' part of the view.
+_FINE = 4
+_WALL_SHARE = 0.8
+
+
+def disc_places(camera: Camera, count: int, seed: int) -> FloatArray:
+    """Floor positions of discs that the camera sees whole, none near another.
+
+    The first of more are the same as fewer.
+
+    Returns (count, 2).
+    """
+    rng = np.random.default_rng(seed)
+    low = np.full(2, float(_MARGIN_PX))
+    high = np.array([camera.width, camera.height]) - 1.0 - _MARGIN_PX
+    places = np.zeros((0, 2))
+    for _ in range(_ATTEMPTS):
+        if len(places) == count:
+            return places
+        place = camera.floor_from_pixel(rng.uniform(low, high))
+        near = float(np.hypot(*place)) <= _FARTHEST_M  # false for NaN, above the horizon
+        if near and np.all(np.hypot(*(places - place).T) >= _APART_M):
+            places = np.vstack([places, place])
+    raise BenchmarkError(f"{count} discs do not find room on the floor: expected fewer")
+
+
+def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray:
+    """A bare floor with light discs, blurred and noisy. `places` (N, 2); returns (H, W)."""
+    grey = np.full((camera.height, camera.width), _FLOOR)
+    for place in places:
+        crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX, rounded=False)
+        height, width = crop.grey.shape
+        grey[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width] += crop.grey - _FLOOR
+    return _taken(grey, seed)
+
+
+def wall_with_edges(camera: Camera, count: int, seed: int) -> ByteArray:
+    """A wall all round, striped so that the camera sees a number of vertical edges.
+    Returns (H, W).
+    """
+    fine = (np.arange(_FINE) + 0.5) / _FINE - 0.5
+    u = (np.arange(camera.width)[:, None] + fine).ravel()
+    v = (np.arange(camera.height)[:, None] + fine).ravel()
+    direction = camera.directions_robot(np.stack(np.meshgrid(u, v), axis=-1))
+    bearing = np.arctan2(direction[..., 0], -direction[..., 1])
+    middle = bearing[len(v) // 2]
+    half = 0.5 * _WALL_SHARE * (float(np.max(middle)) - float(np.min(middle)))
+    centre = 0.5 * (float(np.max(middle)) + float(np.min(middle)))
+    edges = centre + half * (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)
+    light = np.searchsorted(edges, bearing) % 2 == 1
+    share = light.reshape(camera.height, _FINE, camera.width, _FINE).mean(axis=(1, 3))
+    return _taken(_DARK + (_LIGHT - _DARK) * share, seed)
+
+
+def _taken(grey: FloatArray, seed: int) -> ByteArray:
+    """Grey values with the noise of a sensor, rounded."""
+    noisy = grey + np.random.default_rng(seed).normal(0.0, _NOISE, grey.shape)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+
+
+def contents_of(paths: Sequence[Path]) -> list[ByteArray]:
+    """What files hold; files that are one under several names are held once."""
+    held: dict[tuple[int, int], ByteArray] = {}
+    contents = []
+    for path in paths:
+        status = path.stat()
+        key = (status.st_dev, status.st_ino)
+        if key not in held:
+            held[key] = np.fromfile(path, np.uint8)
+        contents.append(held[key])
+    return contents

@@ -1,241 +1,147 @@
-"""The result as tables for a terminal, and as Markdown. Ratios come first: they are what holds."""
+"""The measurements as rows, in JSON, as Markdown tables, and as a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
+from detect import __version__
+from tools.arrays import FloatArray
+from tools.benchmark.timing import Spread, paired_ratios, spread_of
+from tools.evaluation.tables import markdown_table, picture
 
-from tools.benchmark.errors import BenchmarkError
-from tools.benchmark.result import (
-    KindTimes,
-    Result,
-    RunTimes,
-    costs_per_landmark,
-    growth_powers,
-    times_one_job_beyond,
-)
-from tools.benchmark.timing import Spread
-
-_BEGIN, _END = "<!-- benchmark begins -->", "<!-- benchmark ends -->"
+_PACKAGES = ("numpy", "numba", "opencv-python-headless", "scikit-image")
 
 
-def result_tables(result: Result) -> Group:
-    """Everything but the growth curves' single functions, for a terminal."""
-    parts: list[Table | Text] = [Text(line) for line in description_lines(result)]
-    parts += [_kind_table(kind) for kind in result.kinds]
-    parts += [_comparison_table(kind) for kind in result.kinds if kind.comparisons]
-    parts.append(_runs_table("Whole runs, files in, files out", result.runs))
-    for title, points in (
-        ("Growth with the image, Mpixel", result.by_megapixels),
-        ("Growth with the discs", result.by_discs),
-        ("Growth with the verticals", result.by_verticals),
-    ):
-        table = Table(title=title, title_justify="left")
-        names = [function.name for function in points[0].functions] if points else []
-        table.add_column("")
-        for name in names:
-            table.add_column(f"{name} / ms", justify="right")
-        for point in points:
-            table.add_row(f"{point.amount:.3g}", *(number(t.ms.median) for t in point.functions))
-        parts.append(table)
-    parts += [Text(line) for line in growth_lines(result)]
-    parts.append(_runs_table("Growth with the frames", result.by_frames))
-    return Group(*parts)
+@dataclass(frozen=True)
+class Time:
+    """Time of one function on the pictures of one case."""
+
+    part: str  # Part of the benchmark: images, megapixels, discs, verticals.
+    case: str  # What the pictures are, or how much of it there is.
+    function: str
+    ms: Spread  # Milliseconds per image.
+    decodings: Spread  # The same, in decodings of the same image in the same round.
 
 
-def description_lines(result: Result) -> list[str]:
-    """What it was measured on, and what was not measured."""
-    machine = result.machine
-    versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
-    lines = [f"{machine.cpu}, {machine.cores} cores, {machine.system}; {versions}"]
-    measured = ", ".join(
-        f"{key} {' '.join(map(str, value)) if isinstance(value, list | tuple) else value}"
-        for key, value in result.settings.items()
-    )
-    lines.append(f"settings: {measured}")
-    lines += [f"not installed: {name}" for name in result.absent]
-    lines += [f"not measured: {sentence}" for sentence in result.skipped]
-    return lines
+@dataclass(frozen=True)
+class RunTime:
+    """Passes over a whole run, files in and files out."""
+
+    command: str
+    frames: int
+    jobs: int
+    images_per_s: Spread  # By all jobs together.
+    decoding_images_per_s: Spread  # Of one core that decodes the same files from memory.
+    reading_images_per_s: Spread  # Of one core that reads and decodes them.
+    share_of_decoding: Spread  # Images per second and job, over those of decoding.
+    share_of_reading: Spread
+    times_one_job: Spread | None = None  # None where one job was not measured.
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that was measured, where, and with which settings."""
+
+    machine: str
+    settings: dict[str, Any]
+    times: tuple[Time, ...]
+    runs: tuple[RunTime, ...]
+
+
+def times_of(part: str, case: str, seconds: dict[str, FloatArray], reference: str) -> list[Time]:
+    """Sum up functions that were measured in turn with a reference."""
+    return [
+        Time(part, case, name, spread_of(1e3 * taken),
+             spread_of(paired_ratios(taken, seconds[reference])))
+        for name, taken in seconds.items()
+    ]  # fmt: skip
+
+
+def run_time(
+    command: str, frames: int, jobs: int, seconds: FloatArray, alone: Sequence[FloatArray],
+    one_job: FloatArray | None = None,
+) -> RunTime:  # fmt: skip
+    """Sum up passes over a run; `alone` are seconds of decoding, and of reading and decoding."""
+    rates = [spread_of(frames / taken) for taken in (seconds, *alone)]
+    decoding, reading = (spread_of(paired_ratios(taken, seconds) / jobs) for taken in alone)
+    ratio = None if one_job is None else spread_of(paired_ratios(one_job, seconds))
+    return RunTime(command, frames, jobs, rates[0], rates[1], rates[2], decoding, reading, ratio)
+
+
+def this_machine() -> str:
+    """Processor, cores, system and versions, in a line."""
+    file = Path("/proc/cpuinfo")
+    model = cpu_model(file.read_text() if file.is_file() else "") or platform.processor()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    versions = [f"{name} {version(name)}" for name in _PACKAGES]
+    return ", ".join(
+        [f"{model or 'unknown'}, {cores} cores, {platform.system()} {platform.machine()}",
+         f"redetect {__version__}", f"python {platform.python_version()}", *versions]
+    )  # fmt: skip
+
+
+def cpu_model(cpuinfo: str) -> str:
+    """The processor's name in the text of ``/proc/cpuinfo``; empty if it is not there."""
+    rows = (line.partition(":") for line in cpuinfo.splitlines())
+    return next((value.strip() for key, _, value in rows if key.strip() == "model name"), "")
+
+
+def format_json(result: Result) -> str:
+    """The result as JSON, ending with a line end."""
+    return json.dumps(dataclasses.asdict(result), indent=1) + "\n"
+
+
+_PARTS = {
+    "images": "",
+    "megapixels": "Over the size of the image, Mpixel:",
+    "discs": "Over the discs in the image:",
+    "verticals": "Over the vertical edges in the image:",
+}
 
 
 def format_markdown(result: Result) -> str:
-    """The tables that documents show: functions on all kinds of pictures, and whole runs."""
-    kinds = result.kinds
-    lines = [
-        *(f"- {line}" for line in description_lines(result)),
-        *(f"- {kind.kind}: {kind.pictures} images, {kind.description}" for kind in kinds),
-        "",
-        "Median processor time per image, in times that decoding the same image takes (quartiles; "
-        "milliseconds):",
-        "",
-        *_markdown_row(["", *(kind.kind for kind in kinds)], head=True),
-    ]
-    for function in kinds[0].functions:
-        cells = []
-        for kind in kinds:
-            times = next(t for t in kind.functions if t.name == function.name)
-            cells.append(f"{spread(times.decodings)}; {number(times.ms.median)} ms")
-        lines += _markdown_row([function.name, *cells])
-    lines += [
-        "",
-        "How many times as long as the detector of this project a peer takes on the same image "
-        "(quartiles):",
-        "",
-        *_markdown_row(["peer / own", *(kind.kind for kind in kinds)], head=True),
-    ]
-    for compared in kinds[0].comparisons:
-        cells = [
-            spread(next(c.ratio for c in kind.comparisons if c.slower == compared.slower))
-            for kind in kinds
-        ]
-        lines += _markdown_row([f"{compared.slower} / {compared.faster}", *cells])
-    lines += [
-        "",
-        "Whole runs, files in, files out, by the clock on the wall, as a share of what one core "
-        "that does nothing else reaches in the same process (quartiles):",
-        "",
-        *_markdown_row(
-            [
-                "per job",
-                "jobs",
-                "images/s",
-                "of decoding from memory",
-                "of reading and decoding files",
-            ],
-            head=True,
+    """Tables of all measurements: ratios to decoding first, since they hold on any machine."""
+    settings = ", ".join(
+        f"{key} {' '.join(map(str, value)) if isinstance(value, list | tuple) else value}"
+        for key, value in result.settings.items()
+    )
+    lines = [f"- {result.machine}", f"- settings: {settings}", "",
+             "Median processor time per image, in times that decoding the same image takes "
+             "(quartiles; milliseconds):"]  # fmt: skip
+    for part, title in _PARTS.items():
+        times = [time for time in result.times if time.part == part]
+        cases = list(dict.fromkeys(time.case for time in times))
+        cells = {
+            (t.function, t.case): f"{spread(t.decodings)}; {number(t.ms.median)} ms" for t in times
+        }
+        names = dict.fromkeys(time.function for time in times)
+        lines += ["", title, ""] if title else [""]
+        lines += markdown_table(
+            ["", *cases], ([name, *(cells[name, case] for case in cases)] for name in names)
+        )
+    lines += ["", "Whole runs, files in, files out, by the clock on the wall; one core that only "
+              "decodes the same files, or reads and decodes them, for comparison:", ""]  # fmt: skip
+    head = ["command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
+            "times one job", "decoding alone", "with reading"]  # fmt: skip
+    lines += markdown_table(
+        head,
+        (
+            [f"`{t.command}`", f"{t.frames}", f"{t.jobs}", number(t.images_per_s.median),
+             spread(t.share_of_decoding), spread(t.share_of_reading),
+             "" if t.times_one_job is None else number(t.times_one_job.median),
+             number(t.decoding_images_per_s.median), number(t.reading_images_per_s.median)]
+            for t in result.runs
         ),
-    ]
-    for passes in result.runs:
-        lines += _markdown_row(
-            [
-                f"`{passes.command}`, {passes.frames} frames",
-                str(passes.jobs),
-                number(passes.images_per_s.median),
-                spread(passes.share_of_decoding),
-                spread(passes.share_of_reading),
-            ]
-        )
-    for alone in result.runs[:1]:
-        lines += _markdown_row(["*decoding from memory*", "1", _per_s(alone)[0], "1", ""])
-        lines += _markdown_row(["*reading and decoding files*", "1", _per_s(alone)[1], "", "1"])
-    lines += _by_frames(result.by_frames)
-    lines += ["", "Growth, fitted to the medians:", "", *(f"- {t}" for t in growth_lines(result))]
+    )  # fmt: skip
     return "\n".join(lines) + "\n"
-
-
-def _by_frames(runs: Sequence[RunTimes]) -> list[str]:
-    """Runs of growing length by each number of jobs; how many times as many images as by one."""
-    if not runs:
-        return []
-    jobs = sorted({times.jobs for times in runs})
-    lines = [
-        "",
-        f"`{runs[0].command}` on runs of growing length, images/s (times those of one job); "
-        "processes of their own take a second to begin:",
-        "",
-        *_markdown_row(["frames", *(f"jobs: {count}" for count in jobs)], head=True),
-    ]
-    for frames in sorted({times.frames for times in runs}):
-        cells = []
-        for times in sorted((t for t in runs if t.frames == frames), key=lambda t: t.jobs):
-            cell = number(times.images_per_s.median)
-            if times.jobs > 1 and times.times_one_job is not None:
-                cell += f" ({number(times.times_one_job.median)})"
-            cells.append(cell)
-        lines += _markdown_row([str(frames), *cells])
-    for count in jobs:
-        beyond = times_one_job_beyond(runs, count) if count > 1 else None
-        if beyond is not None:
-            lines += [
-                "",
-                f"Beyond the first {beyond[0]} frames {count} jobs do {number(beyond[1])} times as "
-                "many.",
-            ]
-    return lines
-
-
-def format_headline(result: Result) -> str:
-    """The medians alone, as one short Markdown table and a line on whole runs."""
-    kinds = result.kinds
-    lines = _markdown_row(["x decoding (ms)", *(kind.kind for kind in kinds)], head=True)
-    for row in zip(*(kind.functions for kind in kinds)):
-        cells = [f"{number(t.decodings.median)} ({number(t.ms.median)})" for t in row]
-        lines += _markdown_row([row[0].name, *cells])
-    passes = "; ".join(
-        f"`{t.command}` {number(t.images_per_s.median)} images/s, "
-        f"{number(t.share_of_decoding.median)} of decoding from memory, "
-        f"{number(t.share_of_reading.median)} of reading and decoding files"
-        for t in result.runs
-    )
-    for alone in result.runs[:1]:
-        decoding, reading = _per_s(alone)
-        passes += (
-            f" ({alone.frames} frames; decoding alone {decoding} images/s, with reading {reading})"
-        )
-    longest = max((times.frames for times in result.by_frames), default=0)
-    for times in result.by_frames:
-        if times.frames == longest and times.jobs > 1 and times.times_one_job is not None:
-            passes += (
-                f"; `{times.command}` of {times.frames} frames with {times.jobs} jobs "
-                f"{number(times.images_per_s.median)} images/s, "
-                f"{number(times.times_one_job.median)} times one job"
-            )
-            beyond = times_one_job_beyond(result.by_frames, times.jobs)
-            if beyond is not None:
-                passes += f" ({number(beyond[1])} beyond the first {beyond[0]})"
-    pictures, rounds = (result.settings[key] for key in ("pictures", "rounds"))
-    machine = result.machine
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"Whole runs, files in, files out, one job each: {passes}. {machine.cpu}; {pictures} "
-            f"pictures of each kind, {rounds} rounds.",
-            "",
-        ]
-    )
-
-
-def spliced(document: str, part: str) -> str:
-    """A document with another part between its marks.
-
-    Parameters
-    ----------
-    document : str
-        Text that has the two marks on lines of their own.
-    part : str
-        What comes between them.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    BenchmarkError
-        If it has not exactly one of each, in their order.
-    """
-    before, begin, rest = document.partition(_BEGIN)
-    _, end, after = rest.partition(_END)
-    if not begin or not end or _BEGIN in rest or _END in before + after:
-        raise BenchmarkError(f"the document has no place for the table: expected {_BEGIN} {_END}")
-    return f"{before}{_BEGIN}\n{part}{_END}{after}"
-
-
-def growth_lines(result: Result) -> list[str]:
-    """How times grow, in a sentence for each function that has a curve."""
-    lines = []
-    if len(result.by_megapixels) > 1:
-        for name, power in growth_powers(result.by_megapixels).items():
-            lines.append(f"{name}: time grows as the number of pixels to the power {power:.2f}")
-    for points, landmark in ((result.by_discs, "disc"), (result.by_verticals, "vertical")):
-        if len(points) > 1:
-            for name, (bare, each) in costs_per_landmark(points).items():
-                lines.append(f"{name}: {bare:.2f} ms, and {each:.3f} ms for each {landmark}")
-    return lines
 
 
 def number(value: float) -> str:
@@ -248,93 +154,43 @@ def number(value: float) -> str:
 
 def spread(values: Spread) -> str:
     """Median and quartiles."""
-    return f"{number(values.median)} ({_quartiles(values)})"
+    quartiles = f"{number(values.lower_quartile)} - {number(values.upper_quartile)}"
+    return f"{number(values.median)} ({quartiles})"
 
 
-def _per_s(passes: RunTimes) -> tuple[str, str]:
-    """Images per second of decoding from memory, and of reading and decoding."""
-    spreads = passes.decoding_images_per_s, passes.reading_images_per_s
-    from_memory, from_files = (number(values.median) for values in spreads)
-    return from_memory, from_files
+def plot_png(result: Result) -> bytes:
+    """Ratios on the first kind of images, times over growing amounts, and images per second."""
+    return picture((13.0, 8.5), lambda figure: _plot(figure, result), dpi=100)
 
 
-def _kind_table(kind: KindTimes) -> Table:
-    table = Table(
-        title=f"{kind.kind}: {kind.pictures} images, {kind.description}", title_justify="left"
+def _plot(figure: Any, result: Result) -> None:
+    axes = figure.subplot_mosaic(
+        [["ratios", "megapixels", "frames"], ["ratios", "discs", "verticals"]]
     )
-    table.add_column("function", no_wrap=True)
-    for column in ("x decoding", "quartiles", "ms/image", "quartiles", "calls"):
-        table.add_column(column, justify="right")
-    group = kind.functions[0].group
-    for times in kind.functions:
-        if times.group != group:
-            table.add_section()
-            group = times.group
-        table.add_row(
-            times.name,
-            number(times.decodings.median),
-            _quartiles(times.decodings),
-            number(times.ms.median),
-            _quartiles(times.ms),
-            str(times.ms.count),
-        )
-    return table
-
-
-def _comparison_table(kind: KindTimes) -> Table:
-    table = Table(title=f"{kind.kind}: peers", title_justify="left")
-    table.add_column("time of peer / own")
-    table.add_column("ratio", justify="right")
-    table.add_column("quartiles", justify="right")
-    for compared in kind.comparisons:
-        table.add_row(
-            f"{compared.slower} / {compared.faster}",
-            number(compared.ratio.median),
-            _quartiles(compared.ratio),
-        )
-    return table
-
-
-def _runs_table(title: str, runs: Iterable[RunTimes]) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        caption="* images per second and job / those of decoding the same files from memory, or of "
-        "reading and decoding them, and nothing else; in brackets those",
-        caption_justify="left",
+    images = [time for time in result.times if time.part == "images"]
+    first = [time for time in images if time.case == images[0].case]
+    axes["ratios"].barh([t.function for t in first], [t.decodings.median for t in first])
+    axes["ratios"].invert_yaxis()
+    axes["ratios"].set(
+        xscale="log", xlabel="time / time of decoding the same image", title=images[0].case
     )
-    table.add_column("command", no_wrap=True)
-    for column in (
-        "of decoding*",
-        "quartiles",
-        "of reading*",
-        "quartiles",
-        "images/s",
-        "frames",
-        "jobs",
-        "of one job",
-    ):
-        table.add_column(column, justify="right")
-    for times in runs:
-        decoding, reading = _per_s(times)
-        table.add_row(
-            times.command,
-            f"{number(times.share_of_decoding.median)} ({decoding}/s)",
-            _quartiles(times.share_of_decoding),
-            f"{number(times.share_of_reading.median)} ({reading}/s)",
-            _quartiles(times.share_of_reading),
-            number(times.images_per_s.median),
-            str(times.frames),
-            str(times.jobs),
-            "" if times.times_one_job is None else number(times.times_one_job.median),
-        )
-    return table
-
-
-def _quartiles(values: Spread) -> str:
-    return f"{number(values.lower_quartile)} - {number(values.upper_quartile)}"
-
-
-def _markdown_row(cells: list[str], *, head: bool = False) -> list[str]:
-    row = f"| {' | '.join(cells)} |"
-    return [row, f"|{'---|' * len(cells)}"] if head else [row]
+    for part in ("megapixels", "discs", "verticals"):
+        times = [time for time in result.times if time.part == part]
+        for name in dict.fromkeys(time.function for time in times):
+            own = [time for time in times if time.function == name]
+            amounts = [float(time.case) for time in own]
+            axes[part].plot(amounts, [time.ms.median for time in own], "o-", label=name)
+            low, high = ([getattr(t.ms, f"{q}_quartile") for t in own] for q in ("lower", "upper"))
+            axes[part].fill_between(amounts, low, high, alpha=0.2)
+        scale = "log" if part == "megapixels" else "linear"
+        axes[part].set(xscale=scale, yscale=scale, xlabel=part, ylabel="ms per image")
+    for command, jobs in dict.fromkeys((run.command, run.jobs) for run in result.runs):
+        passes = [r for r in result.runs if (r.command, r.jobs) == (command, jobs)]
+        rates = [run.images_per_s.median for run in passes]
+        label = f"{command}, jobs: {jobs}"
+        axes["frames"].plot([run.frames for run in passes], rates, "o-", label=label)
+    axes["frames"].set(xscale="log", xlabel="frames of the run", ylabel="images per second")
+    for one in axes.values():
+        one.grid(alpha=0.3)
+        if one.get_legend_handles_labels()[0]:
+            one.legend(fontsize=8)

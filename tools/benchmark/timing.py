@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from tools.arrays import FloatArray
 
 #: However slow a function is, it is called this often (as far as there are images and rounds).
 LEAST_CALLS = 3
@@ -22,40 +22,17 @@ LEAST_CALLS = 3
 
 @dataclass(frozen=True)
 class Spread:
-    """What sums up repeated measurements.
+    """What sums up repeated measurements."""
 
-    Attributes
-    ----------
-    median, lower_quartile, upper_quartile, least : float
-        In the unit of the values.
-    count : int
-        Number of values.
-    """
-
-    median: float
+    median: float  # In the unit of the values.
     lower_quartile: float
     upper_quartile: float
     least: float
-    count: int
+    count: int  # Number of values.
 
 
 def spread_of(values: ArrayLike) -> Spread:
-    """Median, quartiles, minimum and number of some values; NaN are none.
-
-    Parameters
-    ----------
-    values : array
-        Measurements; NaN where there is none.
-
-    Returns
-    -------
-    Spread
-
-    Raises
-    ------
-    ValueError
-        If there is no value at all.
-    """
+    """Median, quartiles, minimum and number of some values; NaN are none."""
     given = np.asarray(values, dtype=np.float64).ravel()
     given = given[~np.isnan(given)]
     if not given.size:
@@ -78,28 +55,6 @@ def measure_in_turn(
 
     With `warm_up` every function is called once beforehand on the first image, so that compiling
     and first touches are not measured. Which function goes first changes from image to image.
-
-    Parameters
-    ----------
-    functions : mapping
-        Name to a function of the image's number.
-    images, rounds : int
-        Numbers of both.
-    budget_s : float
-        A function that has used up this many seconds, and was called `least_calls` times, is left
-        out of the rest.
-    clock : callable
-        Seconds; by default those of processors at work for this process, whatever its threads:
-        a wait for the processor costs a long call more than a short one, and would not cancel.
-    warm_up : bool
-        See above.
-    least_calls : int
-        See `budget_s`.
-
-    Returns
-    -------
-    dict of (rounds, images) float64
-        Seconds; NaN where a function was left out.
     """
     if warm_up:
         for function in functions.values():
@@ -127,14 +82,6 @@ def measure_in_turn(
 
 def paired_ratios(seconds: FloatArray, reference: FloatArray) -> FloatArray:
     """Ratios between measurements of the same round and image, NaN where one of them is missing.
-
-    Parameters
-    ----------
-    seconds, reference : (rounds, images) float64
-        As from `measure_in_turn`.
-
-    Returns
-    -------
-    (rounds, images) float64
+    `seconds`, `reference` (rounds, images); returns (rounds, images).
     """
     return np.asarray(seconds / reference)

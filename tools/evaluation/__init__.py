@@ -1,3 +1,1 @@
-"""The figures in the README, each printed by a subcommand: ``python -m tools.evaluation
---help``.
-"""
+"""The figures of the documentation, each printed by ``python -m tools.evaluation NAME``."""

@@ -1,8 +1,63 @@
-"""Entry point of ``python -m tools.evaluation``."""
+"""All studies: ``python -m tools.evaluation NAME ...``; each has its own flags (``--help``)."""
+
+from __future__ import annotations
 
 import sys
+from importlib import import_module
 
-from tools.evaluation.cli import main
+import tyro
+
+from redetect.storage.command_line import exit_code_of
+
+#: Module and class of each study: a dataclass of its flags, which carries it out when called.
+STUDIES = {
+    "accuracy": "accuracy.AccuracyStudy",
+    "association": "association.Association",
+    "buildings": "detection.Buildings",
+    "camera-conversions": "calibration.CameraConversions",
+    "camera-covariance": "calibration.CameraCovariance",
+    "camera-photographs": "calibration.CameraPhotographs",
+    "camera-rendered": "calibration.CameraRendered",
+    "consistency": "consistency.ConsistencyStudy",
+    "disturbed": "disturbed.Disturbed",
+    "first-numbers": "first_number.FirstNumbers",
+    "fusion": "fusion.FusionStudy",
+    "fusion-gaps": "fusion.GapStudy",
+    "fusion-speed": "fusion.FusionSpeed",
+    "laser-log": "lasers.LaserLog",
+    "laser-sessions": "lasers.LaserSessions",
+    "map": "maps.MapStudy",
+    "map-calibration": "maps.MapCalibration",
+    "map-modelling": "maps.MapModelling",
+    "map-redetected": "maps.MapRedetected",
+    "map-speed": "maps.MapSpeed",
+    "markers": "markers.Markers",
+    "photographs": "detection.Photographs",
+    "pictures": "pictures.Pictures",
+    "published-lines": "published_lines.PublishedLines",
+    "real-run": "real_run.RealRun",
+    "rendered": "detection.Rendered",
+    "rendered-lines": "detection.RenderedLines",
+    "tilt": "detection.Tilt",
+    "tilt-of-discs": "tilt_of_discs.TiltOfDiscs",
+    "train-rim-network": "rim_network_training.TrainRimNetwork",
+    "tutorial-photographs": "tutorial.TutorialPhotographs",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a study; returns the exit code."""
+    name, *flags = (sys.argv[1:] if arguments is None else arguments) or [""]
+    if name not in STUDIES:
+        asked = name in ("-h", "--help")
+        usage = f"usage: python -m tools.evaluation NAME ...; NAME is one of {', '.join(STUDIES)}"
+        print(usage, file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
+    module, _, study = STUDIES[name].partition(".")
+    options = getattr(import_module(f"tools.evaluation.{module}"), study)
+    command = tyro.cli(options, prog=f"python -m tools.evaluation {name}", args=flags)
+    return exit_code_of(command)
+
 
 if __name__ == "__main__":
     sys.exit(main())

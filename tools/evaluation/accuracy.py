@@ -8,39 +8,33 @@ fit), and fitted. Errors are held against the covariance that the fit predicts.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from camera import Camera
+from camera import Camera, read_camera
 from detect.circles import disc_shape, refined_covariance
 from detect.discs.fit import blur_ratio_of, fit_discs
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
+from tools.arrays import ByteArray, FloatArray
+from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
+
+_BLURS_PX = (0.3, 0.7, 1.2)
+_BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of N fitted discs.
+    """Errors of N fitted discs."""
 
-    Attributes
-    ----------
-    distance_m : (N,) float64
-        Of the discs from the robot.
-    error_px : (N, 2) float64
-        Fitted minus true centre in the image, pixels.
-    normalised_error : (N,) float64
-        Squared error over the predicted covariance, per degree of freedom.
-    failed : int
-        Discs that the fit gave up.
-    """
-
-    distance_m: NDArray[np.float64]
-    error_px: NDArray[np.float64]
-    normalised_error: NDArray[np.float64]
-    failed: int
+    distance_m: FloatArray  # (N,) Of the discs from the robot.
+    error_px: FloatArray  # (N, 2) Fitted minus true centre in the image, pixels.
+    normalised_error: FloatArray
+    """(N,) Squared error over the predicted covariance, per degree of freedom."""
+    failed: int  # Discs that the fit gave up.
 
     @property
     def rms_px(self) -> float:
@@ -59,29 +53,7 @@ def measure_accuracy(
     noise: float,
     seed: int,
 ) -> Accuracy:
-    """Render and fit discs.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    settings : CircleSettings
-        Of the detector whose fit is measured.
-    discs : int
-        How many.
-    light, dark : float
-        Grey values of disc and floor.
-    blur_px : float
-        Standard deviation of the optics' blur along u, pixels; along v it is the same angle.
-    noise : float
-        Standard deviation of the noise, grey levels.
-    seed : int
-        Of places and noise.
-
-    Returns
-    -------
-    Accuracy
-    """
+    """Render and fit discs."""
     table = cached_disc_table(camera, disc_shape(replace(settings, rows_apart=0.0)))
     rng = np.random.default_rng(seed)
     rows, columns = np.nonzero(table.usable)
@@ -114,14 +86,14 @@ def measure_accuracy(
 def _render(
     camera: Camera,
     table: DiscTable,
-    true_xy: NDArray[np.float64],
+    true_xy: FloatArray,
     settings: CircleSettings,
     light: float,
     dark: float,
     blur_px: float,
     noise: float,
     rng: np.random.Generator,
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """An image of the bare floor with one disc on it."""
     height, width = table.usable.shape
     floor = dark + rng.normal(0.0, noise, (height, width))
@@ -135,3 +107,36 @@ def _render(
         top - crop.v0 : bottom - crop.v0, left - crop.u0 : right - crop.u0
     ]
     return image
+
+
+@dataclass(frozen=True)
+class AccuracyStudy:
+    """Refined centres of rendered single discs against the truth, by blur and distance."""
+
+    camera: Path = Path("images/e/e.cam")  # Calibration to render and fit through.
+    discs: int = 400  # Discs per blur.
+    light: float = 220.0  # Grey value of the discs.
+    dark: float = 60.0  # Grey value of the floor.
+    noise: float = 2.0  # Standard deviation of the noise, grey levels.
+    seed: int = 1  # Of places and noise.
+
+    def __call__(self) -> int:
+        camera = read_camera(self.camera)
+        table = Table(
+            {"blur px": ".1f", "distance m": "<10", "discs": "d", "rms u px": "9.4f",
+             "rms v px": "9.4f", "normalised error^2 / dof": ".3f"}
+        )  # fmt: skip
+        for blur_px in _BLURS_PX:
+            result = measure_accuracy(
+                camera, CircleSettings(tilt_sigma_deg=0.0), discs=self.discs, light=self.light,
+                dark=self.dark, blur_px=blur_px, noise=self.noise, seed=self.seed,
+            )  # fmt: skip
+            bins = [(f"{low:.1f}-{high:.1f}", low, high) for low, high in _BINS_M]
+            for label, low, high in [*bins, ("all", 0.0, np.inf)]:
+                chosen = (result.distance_m >= low) & (result.distance_m < high)
+                if chosen.any():
+                    rms = np.sqrt(np.mean(result.error_px[chosen] ** 2, axis=0))
+                    normalised = result.normalised_error[chosen].mean()
+                    table.row(blur_px, label, chosen.sum(), *rms, normalised)
+            print(f"both coordinates {result.rms_px:.4f} px rms, {result.failed} failed")
+        return 0

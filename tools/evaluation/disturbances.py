@@ -13,9 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from tools.arrays import ByteArray, Float32Array, FloatArray
 
 #: Signed distance into a shape of some size, radii, at places (s, t).
 Distance = Callable[[FloatArray, FloatArray, float], FloatArray]
@@ -29,27 +28,14 @@ _RIM = 2.0 * np.pi * np.arange(256) / 256
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Grey values about a light disc.
+    """Grey values about a light disc."""
 
-    Attributes
-    ----------
-    grey : (H, W) float64
-    offset : (H, W, 2) float64
-        Floor position less the disc's centre, radii.
-    away : float
-        Direction from the camera to the disc on the floor, radians.
-    disc, floor : float
-        Grey values of the two.
-    pixel : float
-        Size of a pixel, radii: nothing is sharper.
-    """
-
-    grey: FloatArray
-    offset: FloatArray
-    away: float
-    disc: float
+    grey: FloatArray  # (H, W)
+    offset: FloatArray  # (H, W, 2) Floor position less the disc's centre, radii.
+    away: float  # Direction from the camera to the disc on the floor, radians.
+    disc: float  # Grey values of the two.
     floor: float
-    pixel: float
+    pixel: float  # Size of a pixel, radii: nothing is sharper.
 
     @classmethod
     def of(cls, grey: FloatArray, offset: FloatArray, away: float) -> Surroundings:
@@ -166,13 +152,7 @@ class Disturbance:
     upright: bool = False
 
     def __call__(self, about: Surroundings, hidden: float, rng: np.random.Generator) -> FloatArray:
-        """Grey values with a share of the rim disturbed.
-
-        Raises
-        ------
-        ValueError
-            If this shape cannot have so much of the rim.
-        """
+        """Grey values with a share of the rim disturbed."""
         distance = self.shape(rng)
         size = _size_for(distance, hidden)
         turn = about.away if self.upright else rng.uniform(0.0, 2.0 * np.pi)
@@ -249,27 +229,15 @@ def look_alike(about: Surroundings, kind: str, rng: np.random.Generator) -> Floa
 
 
 def disturbed(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
+    image: ByteArray,
+    floor_xy: Float32Array,
     place: FloatArray,
     radius: float,
     kind: str,
     rng: np.random.Generator,
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """An image with one light disc disturbed, at a random share of its rim.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    place : (2,) float64
-        The disc's, metres.
-    radius : float
-        Metres.
-    kind : str
-        Of `DISTURBANCES`.
-    rng : numpy.random.Generator
+    `image` (H, W); `floor_xy` (H, W, 2); `place` (2,).
     """
     window, about = _surroundings(image, floor_xy, place, radius)
     grey = DISTURBANCES[kind](about, rng.uniform(*_SHARES), rng)
@@ -277,13 +245,13 @@ def disturbed(
 
 
 def replaced(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
+    image: ByteArray,
+    floor_xy: Float32Array,
     place: FloatArray,
     radius: float,
     kind: str,
     rng: np.random.Generator,
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """An image with one of `LOOK_ALIKES` instead of a disc; parameters as of `disturbed`."""
     window, about = _surroundings(image, floor_xy, place, radius)
     return _with(image, window, about.grey, look_alike(about, kind, rng), rng)
@@ -293,7 +261,7 @@ _Window = tuple[slice, slice]
 
 
 def _surroundings(
-    image: NDArray[np.uint8], floor_xy: NDArray[np.float32], place: FloatArray, radius: float
+    image: ByteArray, floor_xy: Float32Array, place: FloatArray, radius: float
 ) -> tuple[_Window, Surroundings]:
     offset = (floor_xy - place.astype(np.float32)) / np.float32(radius)
     rows, columns = np.nonzero(np.hypot(offset[..., 0], offset[..., 1]) < REACH)
@@ -307,12 +275,12 @@ def _surroundings(
 
 
 def _with(
-    image: NDArray[np.uint8],
+    image: ByteArray,
     window: _Window,
     before: FloatArray,
     grey: FloatArray,
     rng: np.random.Generator,
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """An image with other grey values in a window, and noise where they are others."""
     noisy = grey + (np.abs(grey - before) > 1.0) * rng.normal(0.0, 0.8, grey.shape)
     result = image.copy()

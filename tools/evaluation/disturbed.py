@@ -9,25 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
+from camera import Camera, read_camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.settings import CircleSettings
 from lut import cached_disc_table
-from tools.evaluation.disturbances import (
-    DISTURBANCES,
-    LOOK_ALIKES,
-    REACH,
-    Surroundings,
-    look_alike,
-)
-
-FloatArray = NDArray[np.float64]
+from redetect.storage import write_whole
+from tools.arrays import ByteArray, FloatArray
+from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -55,24 +50,14 @@ _SLACK = 0.05
 
 @dataclass
 class Tally:
-    """What became of the discs, or look-alikes, of one kind.
-
-    Attributes
-    ----------
-    shown, found : int
-    error_px : list of (2,) float64
-        Found less true place, in the image.
-    normalised : list of float
-        Squared error on the floor over the stated covariance, per degree of freedom.
-    elsewhere : int
-        Rows at no disc.
-    """
+    """What became of the discs, or look-alikes, of one kind."""
 
     shown: int = 0
     found: int = 0
-    error_px: list[FloatArray] = field(default_factory=list)
+    error_px: list[FloatArray] = field(default_factory=list)  # Found less true place, in the image.
     normalised: list[float] = field(default_factory=list)
-    elsewhere: int = 0
+    """Squared error on the floor over the stated covariance, per degree of freedom."""
+    elsewhere: int = 0  # Rows at no disc.
 
     @property
     def recall(self) -> float:
@@ -124,7 +109,7 @@ class Stage:
 
     def exposed(
         self, grey: FloatArray, blur: tuple[float, float], rng: np.random.Generator
-    ) -> NDArray[np.uint8]:
+    ) -> ByteArray:
         """An image of a fine scene, with motion and optics that blur by so many pixels."""
         across, down = _FINE
         motion, optics = blur
@@ -190,23 +175,9 @@ def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[Floa
 
 def render_scene(
     stage: Stage, kind: str, share: float, rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], list[FloatArray]]:
+) -> tuple[ByteArray, list[FloatArray]]:
     """An image of a floor with discs of one family of disturbances, or look-alikes.
-
-    Parameters
-    ----------
-    stage : Stage
-    kind : str
-        Of `DISTURBANCES`, `BLURRED`, `LOOK_ALIKES`, or `BORDER`.
-    share : float
-        Of the rim that is disturbed, 0 to 1.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    image : (H, W) uint8
-    places : list of (2,) float64
-        Of the discs or look-alikes, metres.
+    Returns `image` (H, W).
     """
     grey = stage.floors[str(rng.choice(FLOORS))].copy()
     places = _places(stage, share if kind == BORDER else 0.0, rng)
@@ -225,31 +196,9 @@ def render_scene(
 
 
 def measure(
-    camera: Camera,
-    settings: CircleSettings,
-    *,
-    discs: int,
-    shares: Sequence[float],
-    seed: int,
+    camera: Camera, settings: CircleSettings, *, discs: int, shares: Sequence[float], seed: int
 ) -> Iterator[tuple[str, float, Tally]]:
-    """Detect the discs of scenes of every family and share, and the look-alikes.
-
-    Parameters
-    ----------
-    camera : Camera
-    settings : CircleSettings
-        Of the detector.
-    discs : int
-        Of each family and share.
-    shares : sequence of float
-        Of the rim that are disturbed.
-    seed : int
-
-    Yields
-    ------
-    kind, share, tally : str, float, Tally
-        The share is 0 where there is none.
-    """
+    """Detect the discs of scenes of every family and share, and the look-alikes."""
     stage = Stage(camera, settings.radius_m, np.random.default_rng(seed))
     table = cached_disc_table(camera, disc_shape(settings))
     cases = [(kind, share) for kind in (*DISTURBANCES, BORDER) for share in shares]
@@ -315,7 +264,7 @@ def _digits(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".removeprefix("0") if value < 1.0 else f"{value:.{digits}f}"
 
 
-def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> NDArray[np.uint8]:
+def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> ByteArray:
     """One disc of every family and one of every look-alike, side by side with their names."""
     stage = Stage(camera, radius_m, np.random.default_rng(seed))
     panels = []
@@ -331,7 +280,7 @@ def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> NDAr
     return np.vstack(rows)
 
 
-def _panel(image: NDArray[np.uint8], outline: FloatArray, name: str) -> NDArray[np.uint8]:
+def _panel(image: ByteArray, outline: FloatArray, name: str) -> ByteArray:
     middle = outline.mean(axis=0)
     half = float(np.ptp(outline[:, 0])) / 2.0
     rows = np.linspace(middle[1] - half / 2.0, middle[1] + half / 2.0, 160)
@@ -342,3 +291,28 @@ def _panel(image: NDArray[np.uint8], outline: FloatArray, name: str) -> NDArray[
     panel[26:186, 4:164] = crop
     cv2.putText(panel, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
     return panel
+
+
+@dataclass(frozen=True)
+class Disturbed:
+    """Discs partly hidden, stained, badly lit or blurred, and look-alikes, rendered."""
+
+    camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
+    discs: int = 100  # Discs of each family and share.
+    shares: tuple[float, ...] = (0.2, 0.3, 0.4)  # Of the rim that are disturbed.
+    polarity: Literal["light", "any"] = "light"  # Stated to the detector; the discs are light.
+    seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
+    picture: Path | None = None  # Draw one disc of every family, and detect nothing.
+
+    def __call__(self) -> int:
+        camera = read_camera(self.camera)
+        settings = CircleSettings(polarity=self.polarity, tilt_sigma_deg=0.0)
+        if self.picture is not None:
+            drawn = picture_of(camera, settings.radius_m, self.shares[-1], self.seed)
+            _, png = cv2.imencode(".png", drawn)
+            with write_whole(self.picture, overwrite=True) as stream:
+                stream.write(png.tobytes())
+            return 0
+        results = measure(camera, settings, discs=self.discs, shares=self.shares, seed=self.seed)
+        print(table_of(list(results)))
+        return 0

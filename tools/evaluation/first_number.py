@@ -9,6 +9,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +20,29 @@ from scipy.spatial import KDTree
 
 from redetect.landmarks import read_frames
 from redetect.storage import write_whole
+from tools.evaluation.tables import markdown_table
 
 #: The table's place in a document, by comments.
 BEGIN, END = "<!-- first numbers -->", "<!-- end of first numbers -->"
 _FRAMES_PER_SECOND = 2.0
 _BOARD = ("--columns", "9", "--rows", "6")
+
+
+@dataclass(frozen=True)
+class FirstNumbers:
+    """No flags, on the demo, a drive of one's own, a bag, renders and photographs."""
+
+    demo: Path = Path("images/e")  # The demo run.
+    data: Path = Path("../shared/data")  # Evaluation data.
+    document: Path | None = None  # Document whose table is written anew.
+
+    def __call__(self) -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            table = table_of(list(first_numbers(self.demo, self.data, Path(folder))))
+        print(table)
+        if self.document is not None:
+            put_into(self.document, table)
+        return 0
 
 
 @dataclass(frozen=True)
@@ -41,19 +60,7 @@ class FirstNumber:
 def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]:
     """Detect the demo, a drive with a calibration of one's own, a bag, renders and photographs.
 
-    Parameters
-    ----------
-    demo : Path
-        The demo run.
-    data : Path
-        Evaluation data; what of it is absent is left out.
-    folder : Path
-        For files in between.
-
-    Raises
-    ------
-    subprocess.CalledProcessError
-        If a command fails.
+    What is absent of `data` is left out; files in between go to `folder`.
     """
     reference = demo / "map.circles"
     for command in ("circles", "all"):
@@ -61,34 +68,11 @@ def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]
         yield _compared("demo", f"`detect {command}`", demo, rows, reference)
 
     mine = folder / "mine"
-    _run("tools.documentation.photographs", mine)
-    _run(
-        "camera",
-        "calibrate",
-        mine / "boards",
-        "--half",
-        *_BOARD,
-        "--square-m",
-        "0.04",
-        "-o",
-        mine / "lens.cam",
-    )
-    _run(
-        "camera",
-        "floor",
-        mine / "lens.cam",
-        mine / "floor.png",
-        *_BOARD,
-        "--square-m",
-        "0.12",
-        "--floor-origin",
-        "0",
-        "-1.3",
-        "--floor-yaw",
-        "180",
-        "-o",
-        mine / "my.cam",
-    )
+    _run("tools.evaluation", "tutorial-photographs", mine)
+    boards = ("--half", *_BOARD, "--square-m", "0.04")
+    _run("camera", "calibrate", mine / "boards", *boards, "-o", mine / "lens.cam")
+    board = (*_BOARD, "--square-m", "0.12", "--floor-origin", "0", "-1.3", "--floor-yaw", "180")
+    _run("camera", "floor", mine / "lens.cam", mine / "floor.png", *board, "-o", mine / "my.cam")
     drive = mine / "drive"
     shutil.copytree(demo / "images", drive)
     shutil.copy(mine / "my.cam", drive)
@@ -206,16 +190,13 @@ def _compared(what: str, commands: str, run: Path, rows: Path, reference: Path) 
 
 def table_of(numbers: list[FirstNumber]) -> str:
     """The table as Markdown."""
-    lines = [
-        "| | commands | found | median error / mm | normalised error² |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {n.what} | {n.commands} | {n.found} of {n.reference} | {1e3 * n.median_m:.1f} "
-        f"| {n.normalised:.2f} |"
+    rows = [
+        (n.what, n.commands, f"{n.found} of {n.reference}", f"{1e3 * n.median_m:.1f}",
+         f"{n.normalised:.2f}")
         for n in numbers
-    ]
-    return "\n".join(lines)
+    ]  # fmt: skip
+    head = ("", "commands", "found", "median error / mm", "normalised error²")
+    return "\n".join(markdown_table(head, rows))
 
 
 def put_into(document: Path, table: str) -> None:

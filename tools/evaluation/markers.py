@@ -1,33 +1,76 @@
-"""Markers: statistics against the truth, and the search for false and misidentified ones."""
+"""Markers in rendered frames: corner errors, detection rate, false ones, time; beside OpenCV's."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tools.evaluation.markers_detectors import Found, detector_of
-from tools.evaluation.markers_scoring import (
+from redetect.storage import write_whole
+from tools.benchmark.material import decode, jpeg_picture
+from tools.benchmark.timing import Spread, measure_in_turn, paired_ratios, spread_of
+from tools.evaluation.markers_statistics import (
+    FOUND,
     MISIDENTIFIED,
+    OURS,
+    PEERS,
     ScoredFrame,
+    binned,
+    bins_json,
+    bins_lines,
+    counts_lines,
+    detector_of,
+    known_to_opencv,
     score_frame,
     scored_frame,
+    statistics_picture,
+    table_of,
 )
-from tools.simulator.markers.backgrounds import photograph_files
-from tools.simulator.markers.sampling import SampleSettings, sample_frame
+from tools.evaluation.tables import progress, write_json
+from tools.simulator.markers.samples import SampleFrame, SampleSettings, sample_frame
+from tools.simulator.markers.things import photograph_files
+from tools.simulator.parallel import in_order
+
+#: Dictionaries of the search for false markers: all kinds, small and large.
+_SEARCHED = (
+    "rawseeds", "artoolkitplus12", "artoolkitplus8", "4x4_50", "5x5_100", "6x6_250", "7x7_1000",
+    "aruco_original", "apriltag_16h5", "apriltag_25h9", "apriltag_36h11",
+)  # fmt: skip
+#: Rays in each quarter of a pixel: many where errors are measured, few where frames are searched.
+_MEASURED_SAMPLES, _SEARCHED_SAMPLES = 32, 8
+_SHOWN = 40
+
+DECODING, SEARCH, GIVEN_WIDTH = "decoding", "redetect", "redetect, width given"
+#: Those of OpenCV's refinements that take different times.
+_TIMED_PEERS = tuple(name for name in PEERS if name.startswith("aruco"))
+#: Radii of closings, pixels.
+_RADII_PX = (4, 32)
+#: Of functions that are slow, seconds.
+_BUDGET_S = 20.0
+#: Width that is given where a frame has no marker, pixels.
+_WIDTH_WITHOUT_MARKER_PX = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Offence:
+    """Something that must not happen, and where it did."""
+
+    detector: str
+    kind: str
+    place: str
 
 
 @dataclass(frozen=True)
-class Work:
-    """A frame to be rendered and searched."""
+class Timed:
+    """Time of a function on many images."""
 
-    settings: SampleSettings
-    detectors: tuple[str, ...]
-    seed: int
-    index: int
+    name: str
+    ratio: Spread  # To decoding the same image in the same round.
+    milliseconds: Spread
 
 
 def score_frames(
@@ -39,52 +82,22 @@ def score_frames(
     jobs: int = 1,
     on_frame: Callable[[], None] | None = None,
 ) -> list[ScoredFrame]:
-    """Render frames and let detectors search them.
-
-    Parameters
-    ----------
-    settings : SampleSettings
-        What the frames are to be like.
-    detectors : tuple of str
-        Names that `markers_detectors.detector_of` knows.
-    frames, seed : int
-        Frames 0 to frames - 1 of that seed.
-    jobs : int
-        Processes.
-    on_frame : callable, optional
-        Called after each frame.
-
-    Returns
-    -------
-    list of ScoredFrame
-    """
-    work = [Work(settings, detectors, seed, index) for index in range(frames)]
+    """Render frames and let detectors search them."""
     scored = []
-    for frame in _mapped(_score, work, jobs):
+    for frame in in_order(_score, (settings, detectors, seed), range(frames), jobs):
         scored.append(frame)
         if on_frame is not None:
             on_frame()
     return scored
 
 
-def _score(work: Work) -> ScoredFrame:
-    frame = sample_frame(work.settings, work.seed, work.index)
-    outcomes = {
-        name: score_frame(
-            frame.markers, detector_of(name)(frame.image, frame.camera, frame.dictionary)
-        )
-        for name in work.detectors
-    }
+def _score(state: tuple[SampleSettings, tuple[str, ...], int], index: int) -> ScoredFrame:
+    settings, detectors, seed = state
+    frame = sample_frame(settings, seed, index)
+    found = {name: detector_of(name)(frame.image, frame.camera, frame.dictionary)
+             for name in detectors}  # fmt: skip
+    outcomes = {name: score_frame(frame.markers, of) for name, of in found.items()}
     return scored_frame(frame, outcomes)
-
-
-@dataclass(frozen=True, eq=False)
-class Offence:
-    """Something that must not happen: where it did, so that it can be looked at."""
-
-    detector: str
-    kind: str
-    place: str
 
 
 def offences(frames: Sequence[ScoredFrame]) -> list[Offence]:
@@ -94,24 +107,13 @@ def offences(frames: Sequence[ScoredFrame]) -> list[Offence]:
         place = f"seed {frame.seed} frame {frame.index} {frame.dictionary}"
         for name, outcome in frame.outcomes.items():
             result += [Offence(name, "false", f"{place} id {i}") for i in outcome.false]
-            wrong = frame.rows[outcome.status == MISIDENTIFIED]
-            result += [
-                Offence(
-                    name,
-                    "misidentified",
-                    f"{place} width {row[0]:.0f} px slant {row[1]:.0f} blur {row[2]:.1f} px "
-                    f"contrast {row[3]:.0f} clear {row[6]:.0f}",
+            for row in frame.rows[outcome.status == MISIDENTIFIED]:
+                about = (
+                    f"width {row[0]:.0f} px slant {row[1]:.0f} blur {row[2]:.1f} px "
+                    f"contrast {row[3]:.0f} clear {row[6]:.0f}"
                 )
-                for row in wrong
-            ]
+                result.append(Offence(name, "misidentified", f"{place} {about}"))
     return result
-
-
-@dataclass(frozen=True)
-class _Photograph:
-    path: Path
-    detectors: tuple[str, ...]
-    dictionaries: tuple[str, ...]
 
 
 def search_photographs(
@@ -122,75 +124,264 @@ def search_photographs(
     jobs: int = 1,
     on_photograph: Callable[[], None] | None = None,
 ) -> tuple[int, list[Offence]]:
-    """Search photographs on which there is no marker.
-
-    Parameters
-    ----------
-    folders : sequence of path
-        All images below them are searched.
-    detectors, dictionaries : tuple of str
-        Every photograph is searched by each detector for each dictionary.
-    jobs : int
-        Processes.
-    on_photograph : callable, optional
-        Called after each photograph.
-
-    Returns
-    -------
-    photographs : int
-        How many there were.
-    offences : list of Offence
-        Markers that were found.
+    """Search photographs without markers: how many there were, and what was found.
 
     Raises
     ------
     ValueError
         If a folder holds no images, or one cannot be read.
     """
-    work = []
+    files: list[Path] = []
     for folder in folders:
-        files = photograph_files(folder)
-        if not files:
+        files += (below := photograph_files(folder))
+        if not below:
             raise ValueError(f"{folder}: holds no photographs (.jpg, .png)")
-        work += [_Photograph(path, detectors, dictionaries) for path in files]
     found: list[Offence] = []
-    for offences_here in _mapped(_search, work, jobs):
-        found += offences_here
+    for of_one in in_order(_search, (detectors, dictionaries), files, jobs):
+        found += of_one
         if on_photograph is not None:
             on_photograph()
-    return len(work), found
+    return len(files), found
 
 
-def _search(work: _Photograph) -> list[Offence]:
-    import cv2
-
-    decoded = cv2.imread(str(work.path), cv2.IMREAD_GRAYSCALE)
-    if decoded is None:
-        raise ValueError(f"{work.path}: cannot be read as an image")
-    image: NDArray[np.uint8] = np.asarray(decoded, dtype=np.uint8)
-    result = []
-    for name in work.detectors:
-        for dictionary in work.dictionaries:
-            found: Found = detector_of(name)(image, None, dictionary)
-            result += [
-                Offence(name, "false", f"{work.path.name} {dictionary} id {i}") for i in found.ids
-            ]
-    return result
+def _search(state: tuple[tuple[str, ...], tuple[str, ...]], path: Path) -> list[Offence]:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ValueError(f"{path}: cannot be read as an image")
+    return [
+        Offence(name, "false", f"{path.name} {dictionary} id {i}")
+        for name in state[0]
+        for dictionary in state[1]
+        for i in detector_of(name)(np.asarray(image, dtype=np.uint8), None, dictionary).ids
+    ]
 
 
-def _mapped(function: Callable, work: Sequence, jobs: int) -> Iterator:  # type: ignore[type-arg]
-    """Results in order."""
-    if jobs <= 1:
-        yield from (function(item) for item in work)
-        return
-    import multiprocessing
+def time_searches(
+    settings: SampleSettings,
+    frames: int,
+    seed: int,
+    *,
+    rounds: int = 5,
+    on_frame: Callable[[], None] | None = None,
+) -> list[Timed]:
+    """Time the search of rendered frames, decoding them, and OpenCV's detectors, in turn.
 
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(jobs, _start_worker) as pool:
-        yield from pool.imap(function, work, chunksize=4)
-
-
-def _start_worker() -> None:
-    import cv2
+    The frames are those of the statistics, stored as JPEG files of quality 90. Our detector is
+    timed twice: with no width given, and with the median width of the frame's markers.
+    """
+    from detect.markers.candidates import closing
+    from detect.markers.detect import detect_markers
+    from detect.markers.settings import MarkerSettings
 
     cv2.setNumThreads(1)
+    (dictionary,) = settings.dictionaries
+    sampled: list[SampleFrame] = []
+    encoded, given = [], []
+    plain = MarkerSettings(dictionary=dictionary)
+    for index in range(frames):
+        frame = sample_frame(settings, seed, index)
+        picture = jpeg_picture(frame.image)
+        sampled.append(replace(frame, image=picture.grey))
+        encoded.append(picture.encoded)
+        widths = [marker.width_px for marker in frame.markers] or [_WIDTH_WITHOUT_MARKER_PX]
+        given.append(replace(plain, width_px=float(np.median(widths))))
+        if on_frame is not None:
+            on_frame()
+
+    def peer(name: str) -> Callable[[int], object]:
+        detect = detector_of(name)
+        return lambda i: detect(sampled[i].image, sampled[i].camera, dictionary)
+
+    def close(radius: int) -> Callable[[int], object]:
+        return lambda i: closing(sampled[i].image, radius)
+
+    functions: dict[str, Callable[[int], object]] = {
+        DECODING: lambda i: decode(encoded[i]),
+        SEARCH: lambda i: detect_markers(sampled[i].image, plain, sampled[i].camera),
+        GIVEN_WIDTH: lambda i: detect_markers(sampled[i].image, given[i], sampled[i].camera),
+        **{f"closing, radius {radius} px": close(radius) for radius in _RADII_PX},
+        **{name: peer(name) for name in (_TIMED_PEERS if known_to_opencv(dictionary) else ())},
+    }
+    seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
+    return [
+        Timed(name, spread_of(paired_ratios(values, seconds[DECODING])), spread_of(1e3 * values))
+        for name, values in seconds.items()
+    ]
+
+
+def timing_lines(times: Sequence[Timed]) -> list[str]:
+    """A table: times in decodings of the same image, with quartiles, and in milliseconds."""
+    width = max(len(timed.name) for timed in times)
+    return [
+        f"{timed.name:>{width}}: {timed.ratio.median:.3g} x decoding "
+        f"({timed.ratio.lower_quartile:.3g} - {timed.ratio.upper_quartile:.3g}), "
+        f"{timed.milliseconds.median:.3g} ms"
+        for timed in times
+    ]
+
+
+@dataclass(frozen=True)
+class Markers:
+    """Markers in rendered frames: corner errors, detection rate, false ones; beside OpenCV's ArUco.
+
+    Four parts: statistics of `--statistics` frames with one dictionary, all detectors; the
+    processor time of searching `--timing` of these frames; a search for false and misidentified
+    markers in `--frames` frames of many dictionaries; photographs below `--photographs`, on which
+    everything found is false. Exit code 1 if anything is.
+    """
+
+    statistics: int = 1000  # Frames for the statistics; 0 leaves them out.
+    dictionary: str = "6x6_250"  # Of the statistics; without OpenCV where it does not know it.
+    spot: bool = True  # Also measure the corners of markers some 60 px wide at noise sigma 3.
+    timing: int = 0  # Frames to time the detectors on, beside decoding; 0 leaves that out.
+    frames: int = 0  # Frames to search for false and misidentified markers.
+    dictionaries: tuple[str, ...] = _SEARCHED  # Of that search, and of the photographs'.
+    backgrounds: Path | None = None  # Photographs behind half the frames of that search.
+    photographs: tuple[Path, ...] = ()  # Folders of photographs without markers to search.
+    peers: bool = False  # Let OpenCV's detector search as well; what it finds wrong is no failure.
+    seed: int = 1  # Of all frames.
+    jobs: int = 1  # Processes.
+    output: Path | None = None  # Folder for markers.json and statistics.png.
+    force: bool = False  # Replace files that exist.
+
+    def __call__(self) -> int:
+        content: dict[str, Any] = {
+            "settings": {
+                "statistics": self.statistics,
+                "dictionary": self.dictionary,
+                "frames": self.frames,
+                "dictionaries": list(self.dictionaries),
+                "photographic_backgrounds": self.backgrounds is not None,
+                "seed": self.seed,
+            }
+        }
+        wrong: list[Offence] = []
+        picture = b""
+        if self.statistics:
+            found, picture = self._statistics(content)
+            wrong += found
+            if self.spot:
+                self._spot(content)
+        if self.timing:
+            self._timing(content)
+        if self.frames:
+            wrong += self._search_frames(content)
+        if self.photographs:
+            wrong += self._search_photographs(content)
+        if self.output is not None:
+            self.output.mkdir(parents=True, exist_ok=True)
+            if picture:
+                place = self.output / "statistics.png"
+                with write_whole(place, overwrite=self.force) as stream:
+                    stream.write(picture)
+            write_json(self.output / "markers.json", content, overwrite=self.force)
+        return 1 if any(offence.detector == OURS for offence in wrong) else 0
+
+    def _scored(
+        self, label: str, settings: SampleSettings, detectors: tuple[str, ...], frames: int
+    ) -> list[ScoredFrame]:
+        with progress(label, frames) as tick:
+            return score_frames(settings, detectors, frames=frames, seed=self.seed, jobs=self.jobs,
+                                on_frame=tick)  # fmt: skip
+
+    @property
+    def _detectors(self) -> tuple[str, ...]:
+        return (OURS, *(PEERS if known_to_opencv(self.dictionary) else ()))
+
+    def _statistics(self, content: dict[str, Any]) -> tuple[list[Offence], bytes]:
+        settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
+        frames = self._scored("statistics", settings, self._detectors, self.statistics)
+        table, found = table_of(frames), offences(frames)
+        bins = binned(table)
+        own = [offence for offence in found if offence.detector == OURS]
+        print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
+        print("\n".join([*counts_lines(table), *bins_lines(bins), *_offence_lines(own)]))
+        content["statistics"] = {
+            "frames": table.frames,
+            "false": {name: len(of.false) for name, of in table.outcomes.items()},
+            "repeated": {name: of.repeated for name, of in table.outcomes.items()},
+            "bins": bins_json(bins), "offences": [asdict(offence) for offence in own],
+        }  # fmt: skip
+        title = (
+            f"{table.frames} rendered frames, {int(table.columns['clear'].sum())} markers of "
+            f"{self.dictionary} clearly in view: widths 12-200 px, slant to 70 deg, blur 0.3-3 px, "
+            "contrast 15-200, noise 1-5"
+        )
+        return found, statistics_picture(bins, title)
+
+    def _spot(self, content: dict[str, Any]) -> None:
+        """Corners at a width of 60 px and a noise of 3: any light and blur, and good light."""
+        common = SampleSettings(
+            dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES, empty=0.0, markers=(2, 4),
+            width_px=(58.0, 62.0), noise_grey=(3.0, 3.0),
+        )  # fmt: skip
+        good = replace(common, contrast_grey=(100.0, 200.0), blur_px=(0.5, 1.3), motion=0.0)
+        cases = {"any light and blur": common, "contrast 100-200, blur 0.5-1.3 px, still": good}
+        content["spot"] = {}
+        for label, settings in cases.items():
+            count = max(20, self.statistics // 5)
+            everything = binned(
+                table_of(self._scored("width 60 px", settings, self._detectors, count))
+            )[:1]
+            print("\n".join([f"Width 58-62 px, noise 3, {label}", *bins_lines(everything)]))
+            content["spot"][label] = bins_json(everything)[0]
+
+    def _timing(self, content: dict[str, Any]) -> None:
+        settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
+        with progress("rendering", self.timing) as tick:
+            times = time_searches(settings, self.timing, self.seed, on_frame=tick)
+        print(f"Processor time, {self.timing} frames of the statistics")
+        print("\n".join(timing_lines(times)))
+        content["timing"] = [asdict(timed) for timed in times]
+
+    def _search_frames(self, content: dict[str, Any]) -> list[Offence]:
+        settings = SampleSettings(
+            dictionaries=self.dictionaries, samples=_SEARCHED_SAMPLES, photographs=self.backgrounds
+        )
+        detectors: tuple[str, ...] = (OURS,)
+        if self.peers and all(map(known_to_opencv, self.dictionaries)):
+            detectors = (OURS, PEERS[0])
+        frames = self._scored("search", settings, detectors, self.frames)
+        table, found = table_of(frames), offences(frames)
+        empty = sum(len(frame.rows) == 0 for frame in frames)
+        print(f"Search of {len(frames)} frames, {empty} of them without any marker")
+        print("\n".join(counts_lines(table)))
+        by_dictionary = {}
+        for name in self.dictionaries:
+            chosen = [frame for frame in frames if frame.dictionary == name]
+            clear = [frame.rows[:, 6] > 0.0 for frame in chosen]
+            status = [frame.outcomes[OURS].status for frame in chosen]
+            by_dictionary[name] = figures = {
+                "frames": len(chosen),
+                "clear": int(sum(c.sum() for c in clear)),
+                "found": int(sum((c & (s == FOUND)).sum() for c, s in zip(clear, status))),
+                "misidentified": int(sum((s == MISIDENTIFIED).sum() for s in status)),
+                "false": sum(len(frame.outcomes[OURS].false) for frame in chosen),
+            }
+            print(f"{name:>16}: " + ", ".join(f"{key} {value}" for key, value in figures.items()))
+        print("\n".join(_offence_lines(found)))
+        content["search"] = {
+            "frames": len(frames), "without_markers": empty,
+            "false": {name: len(of.false) for name, of in table.outcomes.items()},
+            "by_dictionary": by_dictionary, "offences": [asdict(offence) for offence in found],
+        }  # fmt: skip
+        return found
+
+    def _search_photographs(self, content: dict[str, Any]) -> list[Offence]:
+        with progress("photographs", None) as tick:
+            count, found = search_photographs(
+                self.photographs, (OURS,), self.dictionaries, jobs=self.jobs, on_photograph=tick
+            )
+        print(
+            f"{count} photographs, each searched for {len(self.dictionaries)} dictionaries: "
+            f"{len(found)} false markers"
+        )
+        print("\n".join(_offence_lines(found)))
+        offences_json = [asdict(offence) for offence in found]
+        content["photographs"] = {"photographs": count, "offences": offences_json}
+        return found
+
+
+def _offence_lines(found: list[Offence]) -> list[str]:
+    lines = [f"  {one.detector}: {one.kind}: {one.place}" for one in found[:_SHOWN]]
+    return lines + ([f"  ... and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else [])

@@ -1,16 +1,209 @@
-"""Statistics of detected markers by width, slant, blur and contrast, detectors side by side."""
+"""Detected markers against the truth: scores, statistics by bins, tables and a picture."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tools.evaluation.markers_detectors import OURS
-from tools.evaluation.markers_scoring import FOUND, MISIDENTIFIED, Table
+from camera import Camera
+from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from tools.evaluation.tables import picture
+from tools.simulator.markers.samples import SampleFrame
+from tools.simulator.markers.truth import MarkerTruth
+
+OURS = "redetect"
+
+#: OpenCV's refinements of corners, by the names under which they are shown, and what is taken off
+#: their corners: the AprilTag code puts (0, 0) at the upper left pixel's corner, not at its centre.
+_REFINEMENTS = {
+    "aruco": ("CORNER_REFINE_NONE", 0.0),
+    "aruco subpix": ("CORNER_REFINE_SUBPIX", 0.0),
+    "aruco contour": ("CORNER_REFINE_CONTOUR", 0.0),
+    "aruco apriltag": ("CORNER_REFINE_APRILTAG", 0.0),
+    "apriltag - 0.5": ("CORNER_REFINE_APRILTAG", 0.5),
+}
+PEERS = tuple(_REFINEMENTS)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Markers that a detector found in an image."""
+
+    ids: IntArray  # (N,)
+    corners: FloatArray
+    """(N, 4, 2) Top left, top right, bottom right, bottom left as printed; pixels of the image as
+    it is."""
+    covariances: FloatArray | None = None
+    """(N, 4, 2, 2) Of the corners, if the detector says."""
+
+
+Detector = Callable[[ByteArray, Camera | None, str], Found]
+
+
+def detector_of(name: str) -> Detector:
+    """A detector: a function of image, calibration and the dictionary's name."""
+    if name == OURS:
+        return _ours
+    if name in _REFINEMENTS:
+        return lambda image, camera, dictionary: _aruco(name, image, dictionary)
+    raise ValueError(f"{name}: no such detector: expected {OURS} or one of {', '.join(PEERS)}")
+
+
+def known_to_opencv(dictionary: str) -> bool:
+    """Whether OpenCV has a dictionary of that name."""
+    return dictionary in _opencv_dictionaries()
+
+
+def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
+    from detect.markers.detect import detect_markers
+    from detect.markers.settings import MarkerSettings
+
+    found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
+    return Found(found.ids, found.corners, found.covariance)
+
+
+def _aruco(name: str, image: ByteArray, dictionary: str) -> Found:
+    corners, ids, _ = _aruco_detector(name, dictionary).detectMarkers(image)
+    if ids is None:
+        return Found(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2) - _REFINEMENTS[name][1]
+    return Found(np.asarray(ids, dtype=np.int64).ravel(), pixels)
+
+
+@cache
+def _aruco_detector(name: str, dictionary: str):  # type: ignore[no-untyped-def]
+    from cv2 import aruco
+
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = getattr(aruco, _REFINEMENTS[name][0])
+    known = aruco.getPredefinedDictionary(_opencv_dictionaries()[dictionary])
+    return aruco.ArucoDetector(known, parameters)
+
+
+@cache
+def _opencv_dictionaries() -> dict[str, int]:
+    from cv2 import aruco
+
+    names = [name for name in dir(aruco) if name.startswith("DICT_")]
+    return {name.removeprefix("DICT_").lower(): getattr(aruco, name) for name in names}
+
+
+MISSED, FOUND, MISIDENTIFIED = 0, 1, 2
+
+# A detection is of a marker if its corners, in any order, are as near as this in its widths.
+_NEAR_WIDTHS = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a detector made of the markers of one frame."""
+
+    status: IntArray
+    """(M,) `MISSED`, `FOUND` or `MISIDENTIFIED` (wrong number, or turned) for each true marker."""
+    errors_px: FloatArray  # (M, 4, 2) Found minus true corners; NaN unless found.
+    normalised: FloatArray
+    """(M, 4) Squared error over the detector's own covariance, per degree of freedom; NaN if it has
+    none."""
+    false: tuple[int, ...]  # Numbers of the detections where no marker is.
+    repeated: int  # Further detections of markers found already.
+
+
+def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
+    """Hold what was found against the truth."""
+    count = len(markers)
+    status = np.full(count, MISSED, dtype=np.int64)
+    errors, normalised = np.full((count, 4, 2), np.nan), np.full((count, 4), np.nan)
+    false: list[int] = []
+    repeated = 0
+    for k, (number, corners) in enumerate(zip(found.ids, found.corners)):
+        which, turn = _nearest(markers, corners)
+        if which < 0:
+            false.append(int(number))
+        elif status[which] != MISSED:
+            repeated += 1
+        elif number != markers[which].id or turn != 0:
+            status[which] = MISIDENTIFIED
+        else:
+            status[which] = FOUND
+            errors[which] = corners - markers[which].corners
+            if found.covariances is not None:
+                solved = np.linalg.solve(found.covariances[k], errors[which][..., None])
+                normalised[which] = np.sum(errors[which] * solved[..., 0], axis=1) / 2.0
+    return Outcome(status, errors, normalised, tuple(false), repeated)
+
+
+def _nearest(markers: Sequence[MarkerTruth], corners: FloatArray) -> tuple[int, int]:
+    """The true marker that lies where the corners are, and by how many quarters it is turned."""
+    best = (-1, 0)
+    least = _NEAR_WIDTHS
+    for which, marker in enumerate(markers):
+        for turn in range(4):
+            off = np.roll(corners, turn, axis=0) - marker.corners
+            distance = float(np.linalg.norm(off, axis=1).mean()) / marker.width_px
+            if distance < least:
+                best, least = (which, turn), distance
+    return best
+
+
+COLUMNS = (
+    "width_px", "slant_deg", "blur_px", "contrast_grey", "noise_grey", "motion_px", "clear",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredFrame:
+    """A frame's truth, without its image, and what became of it."""
+
+    seed: int
+    index: int
+    dictionary: str
+    rows: FloatArray  # (M, 7) of `COLUMNS`.
+    things: tuple[str, ...]
+    outcomes: dict[str, Outcome]
+
+
+def scored_frame(frame: SampleFrame, outcomes: dict[str, Outcome]) -> ScoredFrame:
+    """What is kept of a frame."""
+    imaging = frame.imaging
+    rows = [
+        (m.width_px, m.slant_deg, imaging.blur_px, m.contrast_grey, imaging.noise_grey,
+         frame.motion_px, float(m.clear))
+        for m in frame.markers
+    ]  # fmt: skip
+    table = np.array(rows).reshape(-1, len(COLUMNS))
+    return ScoredFrame(frame.seed, frame.index, frame.dictionary, table, frame.things, outcomes)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """All markers of many frames, and what each detector made of them."""
+
+    frames: int
+    columns: dict[str, FloatArray]  # (M,) each of `COLUMNS`; clear is 0 or 1.
+    outcomes: dict[str, Outcome]  # By detector, of all frames together.
+
+
+def table_of(frames: Sequence[ScoredFrame]) -> Table:
+    """All frames in one."""
+
+    def joined(outcomes: list[Outcome]) -> Outcome:
+        return Outcome(
+            np.concatenate([o.status for o in outcomes]),
+            np.concatenate([o.errors_px for o in outcomes]),
+            np.concatenate([o.normalised for o in outcomes]),
+            tuple(number for o in outcomes for number in o.false),
+            sum(o.repeated for o in outcomes),
+        )
+
+    rows = np.concatenate([frame.rows for frame in frames])
+    outcomes = {n: joined([frame.outcomes[n] for frame in frames]) for n in frames[0].outcomes}
+    return Table(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
+
 
 #: Limits of the bins of each quantity.
 BINS: dict[str, tuple[float, ...]] = {
@@ -34,8 +227,7 @@ _FEWEST = 5
 class Figures:
     """What a detector did with the clear markers of a bin."""
 
-    markers: int
-    """Clear markers in the bin."""
+    markers: int  # Clear markers in the bin.
     found: int
     misidentified: int
     median_px: float
@@ -53,24 +245,15 @@ class Figures:
 
 @dataclass(frozen=True)
 class Bin:
-    """Figures of all detectors over the markers of one range of a quantity.
+    """Figures of all detectors over the markers of one range of a quantity."""
 
-    Attributes
-    ----------
-    quantity : str
-        What the range is of; empty for all markers together.
-    low, high : float
-    own : dict of detector to Figures
-        Errors over all markers that this detector found.
-    shared : dict of peer to (ours, peer's) Figures
-        Errors over the markers that both found: like with like.
-    """
-
-    quantity: str
+    quantity: str  # What the range is of; empty for all markers together.
     low: float
     high: float
     own: dict[str, Figures]
+    """By detector; errors over all markers that it found."""
     shared: dict[str, tuple[Figures, Figures]]
+    """By peer: ours and the peer's, errors over the markers that both found."""
 
     @property
     def ahead_in_error(self) -> bool | None:
@@ -89,72 +272,43 @@ class Bin:
         return all(f.found <= self.own[OURS].found for f in self.own.values())
 
 
-def binned(table: Table, chosen: NDArray[np.bool_] | None = None) -> list[Bin]:
-    """Figures of all markers that are clearly in view, and by bins of each quantity.
-
-    Parameters
-    ----------
-    table : Table
-        Markers and what became of them.
-    chosen : (M,) bool, optional
-        Which markers to look at.
-
-    Returns
-    -------
-    list of Bin
-        First all together.
-    """
+def binned(table: Table) -> list[Bin]:
+    """Figures of all markers that are clearly in view, and by bins of each quantity."""
     clear = table.columns["clear"] > 0.0
-    if chosen is not None:
-        clear = clear & chosen
     bins = [_bin(table, clear, "", 0.0, float("inf"))]
     for quantity, limits in BINS.items():
         values = table.columns[quantity]
         for low, high in itertools.pairwise(limits):
-            last = high == limits[-1]
-            inside = (values >= low) & ((values <= high) if last else (values < high))
+            inside = (values >= low) & ((values < high) | (values == limits[-1]) & (values == high))
             bins.append(_bin(table, clear & inside, quantity, low, high))
     return bins
 
 
-def _bin(table: Table, inside: NDArray[np.bool_], quantity: str, low: float, high: float) -> Bin:
-    own = {name: _figures(table, name, inside, inside) for name in table.status}
+def _bin(table: Table, inside: BoolArray, quantity: str, low: float, high: float) -> Bin:
+    own = {name: _figures(of, inside, inside) for name, of in table.outcomes.items()}
     shared = {}
-    for name in table.status:
-        if name != OURS and OURS in table.status:
-            both = inside & (table.status[OURS] == FOUND) & (table.status[name] == FOUND)
-            shared[name] = (
-                _figures(table, OURS, inside, both),
-                _figures(table, name, inside, both),
-            )
+    ours = table.outcomes.get(OURS)
+    for name, peer in table.outcomes.items():
+        if name != OURS and ours is not None:
+            both = inside & (ours.status == FOUND) & (peer.status == FOUND)
+            shared[name] = _figures(ours, inside, both), _figures(peer, inside, both)
     return Bin(quantity, low, high, own, shared)
 
 
-def _figures(
-    table: Table, name: str, inside: NDArray[np.bool_], judged: NDArray[np.bool_]
-) -> Figures:
+def _figures(outcome: Outcome, inside: BoolArray, judged: BoolArray) -> Figures:
     """Counts over the markers inside, errors over those of them that are judged and were found."""
-    status = table.status[name]
-    found = judged & (status == FOUND)
-    distances = np.linalg.norm(table.errors_px[name][found], axis=-1).ravel()
-    normalised = table.normalised[name][found].ravel()
+    found = judged & (outcome.status == FOUND)
+    distances = np.linalg.norm(outcome.errors_px[found], axis=-1).ravel()
+    normalised = outcome.normalised[found].ravel()
     normalised = normalised[np.isfinite(normalised)]
-    nothing = float("nan")
+    errors = (float("nan"),) * 3
     enough = np.count_nonzero(found) >= _FEWEST
-    return Figures(
-        markers=int(np.count_nonzero(inside)),
-        found=int(np.count_nonzero(found)),
-        misidentified=int(np.count_nonzero(inside & (status == MISIDENTIFIED))),
-        median_px=float(np.median(distances)) if enough else nothing,
-        rms_px=float(np.sqrt(np.mean(distances**2))) if enough else nothing,
-        q95_px=float(np.quantile(distances, 0.95)) if enough else nothing,
-        normalised=float(np.mean(normalised)) if enough and len(normalised) else nothing,
-    )
-
-
-def misidentified(table: Table, name: str) -> int:
-    """Markers given a wrong number or turn, those partly hidden included."""
-    return int(np.count_nonzero(table.status[name] == MISIDENTIFIED))
+    if enough:
+        rms, q95 = np.sqrt(np.mean(distances**2)), np.quantile(distances, 0.95)
+        errors = float(np.median(distances)), float(rms), float(q95)
+    wrong = inside & (outcome.status == MISIDENTIFIED)
+    known = float(np.mean(normalised)) if enough and len(normalised) else float("nan")
+    return Figures(int(inside.sum()), int(found.sum()), int(wrong.sum()), *errors, known)
 
 
 def bins_json(bins: list[Bin]) -> list[dict[str, Any]]:
@@ -180,3 +334,101 @@ def _figures_json(figures: Figures) -> dict[str, float | int | None]:
         key: (None if isinstance(value, float) and not np.isfinite(value) else value)
         for key, value in numbers.items()
     }
+
+
+# Of the colour-blind-safe set of Okabe and Ito.
+_COLOURS = ("#000000", "#999999", "#56B4E9", "#009E73", "#E69F00", "#D55E00")
+_LEAST_PX, _LARGEST_PX = 0.005, 3.0
+
+
+def counts_lines(table: Table) -> list[str]:
+    """What each detector found, took for another and saw where there is nothing."""
+    markers = len(table.columns["clear"])
+    clear = int(table.columns["clear"].sum())
+    lines = [f"{table.frames} frames, {markers} markers, {clear} of them clearly in view"]
+    lines += [
+        f"{name:>15}: misidentified {np.count_nonzero(of.status == MISIDENTIFIED)}, "
+        f"where there is no marker {len(of.false)}, twice {of.repeated}"
+        for name, of in table.outcomes.items()
+    ]
+    return lines
+
+
+def bins_lines(bins: list[Bin]) -> list[str]:
+    """Detection rate and corner errors by bins, and whether this project's detector is ahead.
+
+    Errors over the markers that each detector found itself; then our median and the peer's over
+    those that both found.
+    """
+    names = list(bins[0].own)
+    lines = [
+        "".join(
+            [
+                f"{'':32}{'markers':>8}",
+                *(f"  {name:>29}" for name in names),
+                "   error^2/dof  shared: ours peer ...",
+            ]
+        ),
+        "".join([" " * 40, *(f"  {'found  median    rms    95 %':>29}" for _ in names)]),
+    ]
+    for b in bins:
+        if not b.own[names[0]].markers:
+            continue
+        label = "all"
+        if b.quantity:
+            label = f"{TITLES[b.quantity]} {b.low:g}-{b.high:g}"
+        cells = [f"{label:32.32}{b.own[names[0]].markers:8d}"]
+        cells += [
+            f"  {b.own[n].rate:8.3f} {b.own[n].median_px:6.3f} {b.own[n].rms_px:6.3f} "
+            f"{b.own[n].q95_px:6.3f}"
+            for n in names
+        ]
+        cells.append(f"  {b.own[names[0]].normalised:10.2f}  ")
+        cells += [f" {ours.median_px:.3f}<{peer.median_px:.3f}" for ours, peer in b.shared.values()]
+        if b.shared:
+            error = {True: "ahead", False: "BEHIND", None: "-"}[b.ahead_in_error]
+            cells.append(f"  error {error}, rate {'ahead' if b.ahead_in_rate else 'BEHIND'}")
+        lines.append("".join(cells))
+    return lines
+
+
+def statistics_picture(bins: list[Bin], title: str) -> bytes:
+    """A PNG: corner error above, detection rate below, over each quantity."""
+    return picture((15.0, 6.5), lambda figure: _draw(figure, bins, title), dpi=80)
+
+
+def _draw(figure: Any, bins: list[Bin], title: str) -> None:
+    names = list(bins[0].own)
+    axes = figure.subplots(2, len(BINS), sharey="row", squeeze=False)
+    for column, quantity in enumerate(BINS):
+        chosen = [b for b in bins if b.quantity == quantity]
+        middle = [
+            np.sqrt(b.low * b.high) if b.low > 0.0 else 0.5 * (b.low + b.high) for b in chosen
+        ]
+        if quantity == "slant_deg":
+            middle = [0.5 * (b.low + b.high) for b in chosen]
+        for name, colour in zip(names, _COLOURS):
+            own = [b.own[name] for b in chosen]
+            width = 2.2 if name == OURS else 1.2
+            axes[0, column].plot(
+                middle, [f.median_px for f in own], "o-", color=colour, lw=width, ms=3, label=name
+            )
+            axes[0, column].plot(middle, [f.q95_px for f in own], ":", color=colour, lw=width)
+            axes[1, column].plot(
+                middle, [f.rate for f in own], "o-", color=colour, lw=width, ms=3, label=name
+            )
+        for row in axes[:, column]:
+            row.grid(alpha=0.3)
+            if quantity != "slant_deg":
+                row.set_xscale("log")
+                ticks = BINS[quantity]
+                row.set_xticks(ticks, [f"{t:g}" for t in ticks])
+                row.minorticks_off()
+        axes[0, column].set_yscale("log")
+        axes[0, column].set_ylim(_LEAST_PX, _LARGEST_PX)
+        axes[1, column].set_ylim(0.0, 1.02)
+        axes[1, column].set_xlabel(TITLES[quantity])
+    axes[0, 0].set_ylabel("corner error / px\nmedian, dotted 95 %")
+    axes[1, 0].set_ylabel("share of clear markers found")
+    axes[1, 0].legend(fontsize=8, loc="lower right")
+    figure.suptitle(title, fontsize=10)

@@ -5,39 +5,30 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from detect.line_settings import PUBLISHED, LineSettings
+from detect.line_settings import PRESETS, PUBLISHED, LineSettings
 from detect.lines import LineDetections, detect_lines
 from detect.sources.gray import decode_gray
 from lut.verticals import build_vertical_table
 from redetect.landmarks import LineLandmark, parse_record
+from tools.evaluation.tables import Table
 
 
 @dataclass(frozen=True)
 class PrintedLine:
-    """A printed row and the detected one whose bearing is nearest.
+    """A printed row and the detected one whose bearing is nearest."""
 
-    Attributes
-    ----------
-    step : str
-        Image, such as `e.0000`.
-    printed, detected : LineLandmark
-        The two rows.
-    printed_rows, detected_rows : tuple of float
-        Image rows of their ends, top and bottom.
-    members : int
-        Tracks that the detected row joins.
-    """
-
-    step: str
-    printed: LineLandmark
+    step: str  # Image, such as `e.0000`.
+    printed: LineLandmark  # The two rows.
     detected: LineLandmark
-    printed_rows: tuple[float, float]
+    printed_rows: tuple[float, float]  # Image rows of their ends, top and bottom.
     detected_rows: tuple[float, float]
-    members: int
+    members: int  # Tracks that the detected row joins.
 
     @property
     def ends_off_rows(self) -> float:
@@ -78,24 +69,7 @@ class PrintedLine:
 def compare_printed_lines(
     published: Path, run: Path, settings: LineSettings = PUBLISHED
 ) -> tuple[list[PrintedLine], dict[str, int]]:
-    """Detect the lines of the images whose rows are printed, and put them side by side.
-
-    Parameters
-    ----------
-    published : Path
-        `published.json`: the printed rows.
-    run : Path
-        Folder of run e with its images.
-    settings : LineSettings
-        Parameters of the detector.
-
-    Returns
-    -------
-    lines : list of PrintedLine
-        In the order of the report.
-    detected : dict of str to int
-        Rows detected in each image.
-    """
+    """Detect the lines of the images whose rows are printed, and put them side by side."""
     camera = read_camera(run / "e.cam")
     table = build_vertical_table(camera)
     found: dict[str, LineDetections] = {}
@@ -125,25 +99,34 @@ def _rows_of(line: LineLandmark, camera: Camera) -> tuple[float, float]:
     return top, bottom
 
 
-def print_printed_lines(published: Path, run: Path, settings: LineSettings) -> None:
-    """Print the table of `compare_printed_lines`."""
-    lines, detected = compare_printed_lines(published, run, settings)
-    print(
-        "image   IDs       rows printed      rows here      ends off   alpha printed      here"
-        "   off sigma   sigma printed     here  tracks"
-    )
-    for line in lines:
-        ids = ",".join(map(str, line.printed.ids))
-        print(
-            f"{line.step}  {ids:9} {line.printed_rows[0]:6.2f} {line.printed_rows[1]:7.2f}"
-            f"  {line.detected_rows[0]:6.2f} {line.detected_rows[1]:7.2f}"
-            f"  {line.ends_off_rows:4.1f} {line.ends_off:.4f}"
-            f"   {line.printed.alpha:+9.6f} {line.detected.alpha:+9.6f}"
-            f"   {line.bearing_off_sigmas:9.2f}"
-            f"   {line.printed.sigma:.5f}      {line.detected.sigma:.5f}  {line.members}"
-            f"{'' if line.found else '  not the same'}"
+@dataclass(frozen=True)
+class PublishedLines:
+    """Compare detected lines with the rows that the data set's report prints."""
+
+    data: Positional[Path] = Path("../shared/data")
+    """Folder with `published.json` and, in `dlr/e`, the first images of run e."""
+    preset: Literal["default", "published", "report"] = "published"  # Of the line detector.
+
+    def __call__(self) -> int:
+        lines, detected = compare_printed_lines(
+            self.data / "published.json", self.data / "dlr/e", PRESETS[self.preset]
         )
-    print(f"{sum(line.found for line in lines)} of {len(lines)} rows")
-    for step, rows in detected.items():
-        printed = sum(line.step == step for line in lines)
-        print(f"{step}: {printed} rows printed, {rows} detected")
+        print("printed and detected rows, bearings alpha and their standard deviations")
+        pairs = {"rows": "7.2f", "to": "7.2f", "rows here": "7.2f", "to here": "7.2f"}
+        table = Table(
+            {"image": "<6", "IDs": "<9", **pairs, "ends off": ".1f", "aside": ".4f",
+             "alpha": "+9.6f", "here": "+9.6f", "off / sigma": ".2f", "sigma": ".5f",
+             "sigma here": ".5f", "tracks": "d", "": "<"}
+        )  # fmt: skip
+        for line in lines:
+            table.row(
+                line.step, ",".join(map(str, line.printed.ids)), *line.printed_rows,
+                *line.detected_rows, line.ends_off_rows, line.ends_off, line.printed.alpha,
+                line.detected.alpha, line.bearing_off_sigmas, line.printed.sigma,
+                line.detected.sigma, line.members, "" if line.found else "not the same",
+            )  # fmt: skip
+        print(f"{sum(line.found for line in lines)} of {len(lines)} rows")
+        for step, rows in detected.items():
+            printed = sum(line.step == step for line in lines)
+            print(f"{step}: {printed} rows printed, {rows} detected")
+        return 0

@@ -8,10 +8,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from tyro.conf import Positional
 
 #: How the rows of each line of the table are made; the camera's true spread of tilt and the lens
 #: are stated for the honest ones (`docs/slam/real-run.md`).
@@ -27,38 +30,22 @@ WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 @dataclass(frozen=True)
 class RunFigures:
-    """One line of the table.
+    """One line of the table."""
 
-    Attributes
-    ----------
-    way : str
-        What made the rows.
-    rows, matched, shipped : int
-        Rows, shipped rows with an identifier found again, and all of those.
-    floor_median_m : float or None
-        Median difference on the floor from the shipped rows, after the common lean.
-    factor, factor_calibrated : float
-        Chi-squared over its expectation of the least-squares map, as calibrated and with the
-        camera's mounting as unknown.
-    """
-
-    way: str
-    rows: int
+    way: str  # What made the rows.
+    rows: int  # Rows, shipped rows with an identifier found again, and all of those.
     matched: int
     shipped: int
     floor_median_m: float | None
+    """Median difference on the floor from the shipped rows, after the common lean."""
     factor: float
+    """Chi-squared over its expectation of the least-squares map, as calibrated and with the
+    camera's mounting as unknown."""
     factor_calibrated: float
 
 
 def measure_run(run: Path, folder: Path) -> list[RunFigures]:
-    """Detect a run in each of the ways, compare and map it; files go into `folder`.
-
-    Raises
-    ------
-    subprocess.CalledProcessError
-        If a command fails.
-    """
+    """Detect a run in each of the ways, compare and map it; files go into `folder`."""
     shipped = run / "map.circles"
     camera = next(run.glob("*.cam"))
     figures = []
@@ -110,3 +97,16 @@ def table_of(figures: Sequence[RunFigures]) -> str:
 def _run(program: str, *arguments: object) -> None:
     words = [str(argument) for argument in arguments]
     subprocess.run([sys.executable, "-m", program, *words], check=True, stdout=subprocess.DEVNULL)
+
+
+@dataclass(frozen=True)
+class RealRun:
+    """Detect a recorded run by several presets, compare with its shipped rows, and map the rows."""
+
+    run: Positional[Path] = Path("../shared/data/dlr/e")
+    """Run folder with images, calibration and `map.circles`."""
+
+    def __call__(self) -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            print(table_of(measure_run(self.run, Path(folder))))
+        return 0

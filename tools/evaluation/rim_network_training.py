@@ -8,13 +8,17 @@ Decay Regularization, ICLR 2019), their length rises and falls once.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
-from tools.evaluation.second_look_data import Looks
+from redetect.storage import write_whole
+from tools.evaluation.second_look_data import Looks, gather
 
 FloatArray = NDArray[np.floating]
 
@@ -42,18 +46,11 @@ SHAPES = {"glance": Shape(12, 8, 1, 40), "look": Shape(12, 16, 4, 60)}
 
 
 class Batch(NamedTuple):
-    """What the network sees of N looks.
+    """What the network sees of N looks."""
 
-    Attributes
-    ----------
-    inputs : (N, K, I) float32
-    scales : (N, SCALES) float32
-    features : (N, F) float32
-    """
-
-    inputs: FloatArray
-    scales: FloatArray
-    features: FloatArray
+    inputs: FloatArray  # (N, K, I)
+    scales: FloatArray  # (N, SCALES)
+    features: FloatArray  # (N, F)
 
 
 def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArray) -> Batch:
@@ -177,21 +174,7 @@ def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int
 
 
 def train(looks: Looks, used: NDArray[np.bool_], shape: Shape, seed: int) -> RimNetwork:
-    """Train networks on some of the looks.
-
-    Parameters
-    ----------
-    looks : Looks
-    used : (N,) bool
-    shape : Shape
-    seed : int
-        Of the first network; each has its own.
-
-    Returns
-    -------
-    RimNetwork
-        Its features are those of the looks as they are.
-    """
+    """Train networks on some of the looks. `used` (N,)."""
     index = np.flatnonzero(used)
     mean, deviation = looks.features[used].mean(axis=0), looks.features[used].std(axis=0) + 1e-6
     alike = looks._replace(features=(looks.features - mean) / deviation)
@@ -263,3 +246,30 @@ def cross_validation(glances: Looks, looks: Looks, seed: int) -> Iterable[str]:
             f"left out {left_out}: glances keep {passed[0]:.3f} of discs, {passed[1]:.3f} else;"
             f" {text}"
         )
+
+
+@dataclass(frozen=True)
+class TrainRimNetwork:
+    """Train the network of the second look at discs, and print its finds in unseen buildings."""
+
+    data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
+    every: int = 8  # Every n-th frame of the recorded run is used.
+    scenes: int = 500  # Rendered floors with disturbed discs.
+    seed: int = 1  # Of the disturbances and the networks.
+    output: Path = Path("build/rim_network.npz")
+    """Where the weights go, which replace `detect/discs/rim_network.npz`."""
+    force: bool = False  # Replace that file.
+
+    def __call__(self) -> int:
+        glances, looks = gather(self.data, self.every, self.scenes, self.seed)
+        for kind, of in (("glances", glances), ("looks", looks)):
+            print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
+        for line in cross_validation(glances, looks, self.seed):
+            print(line)
+        networks = train_all(glances, looks, self.seed)
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        weights: dict[str, Any] = networks.by_name()
+        with write_whole(self.output, overwrite=self.force) as stream:
+            np.savez(stream, **weights)
+        print(f"{self.output}: {sum(array.size for array in weights.values())} weights")
+        return 0

@@ -27,10 +27,9 @@ from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_step
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
+from tools.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
 from tools.evaluation.disturbed import BLURRED, Stage, render_scene
-
-FloatArray = NDArray[np.float64]
 
 _SETTINGS = CircleSettings(polarity="light")
 #: There is no second look with these.
@@ -71,25 +70,14 @@ _NOWHERE, _NO_PLACES = np.zeros((0, 4)), np.zeros((0, 2))
 
 
 class Looks(NamedTuple):
-    """Glances at candidates or second looks, of known truth.
+    """Glances at candidates or second looks, of known truth."""
 
-    Attributes
-    ----------
-    features : (N, F) float64
-    grey : (N, V, K, M) float32
-    pixels_per_radius : (N, V, K) float32
-        What the network sees, from V places nearby.
-    is_disc : (N,) bool
-    weight : (N,) float64
-    source : (N,) str
-    """
-
-    features: FloatArray
-    grey: NDArray[np.float32]
-    pixels_per_radius: NDArray[np.float32]
-    is_disc: NDArray[np.bool_]
-    weight: FloatArray
-    source: NDArray[np.str_]
+    features: FloatArray  # (N, F)
+    grey: Float32Array  # (N, V, K, M)
+    pixels_per_radius: Float32Array  # (N, V, K) What the network sees, from V places nearby.
+    is_disc: BoolArray  # (N,)
+    weight: FloatArray  # (N,)
+    source: NDArray[np.str_]  # (N,)
 
 
 _Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
@@ -103,7 +91,7 @@ class _Gathering:
 
     def add(
         self,
-        image: NDArray[np.uint8],
+        image: ByteArray,
         view: tuple[Camera, DiscTable],
         discs: FloatArray,
         unsure: FloatArray,
@@ -139,7 +127,7 @@ class _Gathering:
                 self.looks.append((features, *self._views(image, camera, place), *judged(place)))
 
     def _views(
-        self, image: NDArray[np.uint8], camera: Camera, place: FloatArray
+        self, image: ByteArray, camera: Camera, place: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS // 2)), np.empty((_VIEWS, DIRECTIONS))
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
@@ -243,7 +231,7 @@ def _add_scenes(
 
 def _add_disturbed(
     gathering: _Gathering,
-    image: NDArray[np.uint8],
+    image: ByteArray,
     view: tuple[Camera, DiscTable],
     rng: np.random.Generator,
     source: str,
@@ -280,5 +268,5 @@ def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:
         yield pose["prefix"], _images(seen, near, 4.0)
 
 
-def _read(path: Path) -> NDArray[np.uint8]:
+def _read(path: Path) -> ByteArray:
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)

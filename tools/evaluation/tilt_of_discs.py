@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from tyro.conf import Positional
 
-from camera import Camera
+from camera import Camera, read_camera
 from detect.seen import image_positions
 from detect.sources.image_files import image_name
 from redetect.landmarks import Frame, read_frames, read_tilts
 from redetect.landmarks.map_file import read_map, read_path
-
-FloatArray = NDArray[np.float64]
+from tools.arrays import FloatArray
 
 #: An error of the image smaller than this is not believed, pixels along u.
 _LEAST_SIGMA_PX = 0.3
@@ -34,27 +33,17 @@ class DiscTilt(NamedTuple):
     discs: int
     pitch_rad: float
     roll_rad: float
-    covariance: FloatArray
-    """(2, 2), square radians."""
+    covariance: FloatArray  # (2, 2), square radians.
 
 
 @dataclass(frozen=True, eq=False)
 class TiltComparison:
-    """The two tilts of the frames that have enough lines and discs.
-
-    Attributes
-    ----------
-    prefixes : list of str
-    by_lines, by_discs : (N, 2) float64
-        Pitch and roll, radians.
-    squared : (N,) float64
-        Squared difference in units of both covariances; 2 is expected.
-    """
+    """The two tilts of the frames that have enough lines and discs."""
 
     prefixes: list[str]
-    by_lines: FloatArray
-    by_discs: FloatArray
-    squared: FloatArray
+    by_lines: FloatArray  # (N, 2) Pitch and roll, radians.
+    by_discs: FloatArray  # (N, 2)
+    squared: FloatArray  # (N,) Squared difference in units of both covariances; 2 is expected.
 
 
 def tilt_of_discs(
@@ -66,21 +55,7 @@ def tilt_of_discs(
     usual: tuple[float, float] | None = None,
 ) -> DiscTilt:
     """Pose, pitch and roll that put discs of a map where the camera saw them, robustly.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera as calibrated.
-    rows_xy : (N, 2) float64
-        Rows that nothing levelled, robot frame, metres; at least 4.
-    map_xy : (N, 2) float64
-        Their discs in the map, metres.
-    pose : (3,) float64
-        About where the robot is: x, y (m), heading (rad).
-    raised_m : float
-        How much higher the camera is than calibrated: it trades with the pitch.
-    usual : (float, float), optional
-        Pitch and roll about which the frame's are known beforehand to `_SPREAD_RAD`.
+    `rows_xy` (N, 2); `map_xy` (N, 2); `pose` (3,).
     """
     seen = image_positions(camera, rows_xy)
     # Errors are about equal in all directions of the lens, whatever the shape of a pixel.
@@ -117,22 +92,7 @@ def compare_tilts(
     raised_m: float = 0.0,
     least: int = 5,
 ) -> TiltComparison:
-    """Hold the tilts of a `.tilt` file against those of the discs of a map.
-
-    Parameters
-    ----------
-    camera : Camera
-    rows : path
-        `.circles` of raw rows with the map's identifiers.
-    tilts : path
-        Single frames' tilts (`.tilt`).
-    map_path, path_path : path
-        As `slam map` writes them.
-    raised_m : float
-        See `tilt_of_discs`.
-    least : int
-        Lines and discs that a frame needs.
-    """
+    """Hold the tilts of a `.tilt` file against those of the discs of a map."""
     discs = read_map(map_path).discs
     place = dict(zip(discs.ids.tolist(), discs.xy, strict=True))
     path = read_path(path_path)
@@ -207,3 +167,24 @@ def _known(
         for row in frame.circles
         if row.ids and row.ids[0] in place
     ]
+
+
+@dataclass(frozen=True)
+class TiltOfDiscs:
+    """Compare the tilt that verticals show with the tilt that the discs of a map show."""
+
+    rows: Positional[Path]
+    """Raw rows of discs with the map's identifiers (`detect circles --ids-from`)."""
+    tilts: Positional[Path]  # Tilts of single frames (`detect lines`).
+    camera: Path  # Calibration.
+    map: Path  # `map.csv` of `slam map`.
+    path: Path  # Its `path.csv`.
+    raised_m: float = 0.0  # How much higher the camera is than calibrated.
+
+    def __call__(self) -> int:
+        camera = read_camera(self.camera)
+        compared = compare_tilts(
+            camera, self.rows, self.tilts, self.map, self.path, raised_m=self.raised_m
+        )
+        print("\n".join(report_of(compared)))
+        return 0

@@ -19,20 +19,7 @@ Cell = tuple[str, int, str]
 
 
 def bag_with_edits(recorded: bytes, recipe: bytes) -> bytes:
-    """A database whose cells were changed.
-
-    Parameters
-    ----------
-    recorded : bytes
-        A SQLite file.
-    recipe : bytes
-        Of each edit its kind, which cell, where in it, how many bytes follow, and these.
-
-    Returns
-    -------
-    bytes
-        A SQLite file.
-    """
+    """A database whose cells were changed."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
         database.deserialize(recorded)
         cells = _cells(recorded)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,6 @@ from detect.sources import bag as ros_bag
 from detect.sources.bag import Bag, pose_in_dataset, static_transforms
 from detect.sources.poses import step_between
 from tools.fuzz.bag_cells import bag_with_edits
-from tools.fuzz.bag_types import known_types, opened_once
 from tools.fuzz.reader import Reader
 
 _Kind = Literal["mcap", "sqlite", "ros1"]
@@ -33,14 +33,8 @@ def _bag(path: Path) -> object:
     """All that `detect` asks of a bag.
 
     The calibration that it begins with is none, so that no camera is fitted to it, which takes
-    seconds; the transforms are read all the same. What the definitions of messages mean is worked
-    out once for each set of them.
+    seconds; the transforms are read all the same.
     """
-    with known_types(), opened_once(path):
-        return _asked_of(path)
-
-
-def _asked_of(path: Path) -> object:
     bag = Bag(path)
     images = list(bag)
     for image in images:
@@ -81,12 +75,7 @@ class _Ros:
         )  # fmt: skip
 
     def info(self) -> Any:
-        numbers = {
-            "d": np.zeros(5),
-            "k": np.zeros(9),
-            "r": np.eye(3).ravel(),
-            "p": np.zeros(12),
-        }
+        numbers = {"d": np.zeros(5), "k": np.zeros(9), "r": np.eye(3).ravel(), "p": np.zeros(12)}
         if self.is_1:
             numbers = {letter.upper(): values for letter, values in numbers.items()}
         region = self.make(
@@ -168,25 +157,17 @@ def _seeds(kind: _Kind) -> tuple[bytes, ...]:
     return (_recorded(kind),)
 
 
-def _bag_of_recipe(recipe: bytes) -> bytes:
-    return bag_with_edits(_recorded("sqlite"), recipe)
+def _reader(name: str, file: str, kind: _Kind) -> Reader:
+    errors = (DetectError, CameraError)
+    return Reader(name, file, _bag, errors, (), _WORDS, made_seeds=partial(_seeds, kind), files=5)
 
-
-_ERRORS = (DetectError, CameraError)
 
 BAG_READERS: tuple[Reader, ...] = (
-    Reader(
-        "mcap", "b.mcap", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "mcap"), files=5
-    ),
-    Reader(
-        "ros1 bag", "b.bag", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "ros1"),
-        files=5,
-    ),
-    Reader(
-        "sqlite bag", "b.db3", _bag, _ERRORS, (), _WORDS, made_seeds=partial(_seeds, "sqlite"),
-        files=5,
-    ),
-    Reader(
-        "sqlite cells", "b.db3", _bag, _ERRORS, (b"",), _WORDS, files=40, content=_bag_of_recipe,
+    _reader("mcap", "b.mcap", "mcap"),
+    _reader("ros1 bag", "b.bag", "ros1"),
+    _reader("sqlite bag", "b.db3", "sqlite"),
+    replace(
+        _reader("sqlite cells", "b.db3", "sqlite"), seeds=(b"",), made_seeds=None, files=12,
+        content=lambda recipe: bag_with_edits(_recorded("sqlite"), recipe),
     ),
 )  # fmt: skip

@@ -14,8 +14,7 @@ from camera.formats.kalibr import format_kalibr, parse_kalibr
 from camera.formats.models import ForeignCamera
 from camera.formats.opencv import format_opencv, parse_opencv
 from camera.formats.ros import format_ros, parse_ros
-from tools.fuzz.reader import Reader
-from tools.fuzz.words import CAMERA_TEXT, NUMBERS
+from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader
 
 
 def _camera(path: Path) -> object:
@@ -43,10 +42,6 @@ def _foreign(
     return camera
 
 
-def _guessed(path: Path) -> object:
-    return format_of_text(path, read_text(path))
-
-
 _DECENTRED_TEXT = CAMERA_TEXT.removesuffix(b"}\n") + b"tangential: { 0.002 -0.003 }\n}\n"
 _POLYNOMIAL_TEXT = _DECENTRED_TEXT.removesuffix(b"}\n") + b"polynomial: { -0.02 0.01 0 }\n}\n"
 _OPENCV = ForeignCamera("radtan", 64, 48, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.01, 0.001, 0.002, 0.0))
@@ -63,85 +58,35 @@ def _texts(*cameras: ForeignCamera, write: Callable[[ForeignCamera], str]) -> tu
     return tuple(write(camera).encode() for camera in cameras)
 
 
-CAMERA_READERS: tuple[Reader, ...] = (
-    Reader(
-        "camera",
-        "e.cam",
-        _camera,
-        (CameraError,),
-        (CAMERA_TEXT, _DECENTRED_TEXT, _POLYNOMIAL_TEXT),
-        (
-            b"sensor2World:",
-            b"coef:",
-            b"tangential: { 1e-3 -2e-3 }",
-            b"polynomial: { -0.01 1e-3 1e-4 }",
-            b"width:",
-            b"{",
-            b"}",
-            b"[",
-            b"]",
-            b"key: value",
-            *NUMBERS,
-        ),
-    ),
-    Reader(
-        "opencv",
-        "a.opencv.yaml",
-        partial(_foreign, parse_opencv, format_opencv),
-        (CameraError,),
-        _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_opencv),
-        (b"camera_matrix: ", b"fisheye_model: ", b"image_width: ", *_YAML_WORDS),
-        files=40,
-    ),
-    Reader(
-        "camera info",
-        "a.ros.yaml",
-        partial(_foreign, parse_ros, format_ros),
-        (CameraError,),
-        _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_ros),
-        (b"distortion_model: ", b"roi: ", b"binning_x: ", b"plumb_bob", *_YAML_WORDS),
-        files=40,
-    ),
-    Reader(
-        "kalibr",
-        "camchain.yaml",
-        partial(_foreign, parse_kalibr, format_kalibr),
-        (CameraError,),
-        _texts(_OPENCV, _FISHEYE, write=format_kalibr),
-        (b"cam1:\n  ", b"intrinsics: ", b"resolution: ", b"equi", b"none", *_YAML_WORDS),
-        files=40,
-    ),
-    Reader(
-        "colmap",
-        "cameras.txt",
-        partial(_foreign, parse_colmap, format_colmap),
-        (CameraError,),
-        (
-            *_texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_colmap),
-            b"2 SIMPLE_RADIAL 640 480 500 320 240 0.1\n",
-        ),
-        (b"PINHOLE", b"SIMPLE_PINHOLE", b"RADIAL_FISHEYE", b"FULL_OPENCV", *NUMBERS),
-    ),
-    Reader(
-        "any calibration",
-        "calibration.yaml",
-        _guessed,
-        (CameraError,),
-        (
-            CAMERA_TEXT,
-            *_texts(_OPENCV, write=format_opencv),
-            *_texts(_OPENCV, write=format_ros),
-            *_texts(_OPENCV, write=format_kalibr),
-        ),
-        _YAML_WORDS,
-        files=40,
-    ),
-    Reader(
-        "floor points",
-        "floor.csv",
-        read_floor_points,
-        (CameraError,),
-        (b"u,v,x,y\n10,20.5,1,-2\n\n11,20.5,1.5,-2\n",),
-        (b'"', b"u,v,x,y", *NUMBERS),
-    ),
+_CAMERA = (CameraError,)
+_ANY = (
+    CAMERA_TEXT,
+    *_texts(_OPENCV, write=format_opencv),
+    *_texts(_OPENCV, write=format_ros),
+    *_texts(_OPENCV, write=format_kalibr),
 )
+
+CAMERA_READERS: tuple[Reader, ...] = (
+    Reader("camera", "e.cam", _camera, _CAMERA, (CAMERA_TEXT, _DECENTRED_TEXT, _POLYNOMIAL_TEXT),
+           (b"sensor2World:", b"coef:", b"tangential: { 1e-3 -2e-3 }",
+            b"polynomial: { -0.01 1e-3 1e-4 }", b"width:", b"{", b"}", b"[", b"]", b"key: value",
+            *NUMBERS)),
+    Reader("opencv", "a.opencv.yaml", partial(_foreign, parse_opencv, format_opencv), _CAMERA,
+           _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_opencv),
+           (b"camera_matrix: ", b"fisheye_model: ", b"image_width: ", *_YAML_WORDS), files=40),
+    Reader("camera info", "a.ros.yaml", partial(_foreign, parse_ros, format_ros), _CAMERA,
+           _texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_ros),
+           (b"distortion_model: ", b"roi: ", b"binning_x: ", b"plumb_bob", *_YAML_WORDS), files=40),
+    Reader("kalibr", "camchain.yaml", partial(_foreign, parse_kalibr, format_kalibr), _CAMERA,
+           _texts(_OPENCV, _FISHEYE, write=format_kalibr),
+           (b"cam1:\n  ", b"intrinsics: ", b"resolution: ", b"equi", b"none", *_YAML_WORDS),
+           files=40),
+    Reader("colmap", "cameras.txt", partial(_foreign, parse_colmap, format_colmap), _CAMERA,
+           (*_texts(_OPENCV, _RATIONAL, _FISHEYE, write=format_colmap),
+            b"2 SIMPLE_RADIAL 640 480 500 320 240 0.1\n"),
+           (b"PINHOLE", b"SIMPLE_PINHOLE", b"RADIAL_FISHEYE", b"FULL_OPENCV", *NUMBERS)),
+    Reader("any calibration", "calibration.yaml", lambda p: format_of_text(p, read_text(p)),
+           _CAMERA, _ANY, _YAML_WORDS, files=40),
+    Reader("floor points", "floor.csv", read_floor_points, _CAMERA,
+           (b"u,v,x,y\n10,20.5,1,-2\n\n11,20.5,1.5,-2\n",), (b'"', b"u,v,x,y", *NUMBERS)),
+)  # fmt: skip

@@ -11,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
@@ -31,8 +30,8 @@ from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
 from redetect.storage.image_header import claimed_size
 from redetect.storage.parts import left_part
-from tools.fuzz.reader import Reader
-from tools.fuzz.words import CAMERA_TEXT, NUMBERS
+from tools.arrays import ByteArray
+from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader
 
 #: Images are read for a calibration of this size.
 _SIZE = (8, 8)
@@ -112,7 +111,7 @@ class _Message:
         self.height, self.width, self.step, self.is_bigendian = fields
         encoding, _, data = content[13:].partition(b"\n")
         self.encoding = encoding.decode("utf-8", "replace")
-        self.data: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
+        self.data: ByteArray = np.frombuffer(data, np.uint8)
 
 
 def _image_message(path: Path) -> object:
@@ -150,10 +149,6 @@ def _journal_of(*records: bytes) -> bytes:
     return b"".join(lines)
 
 
-def _log(path: Path) -> object:
-    return is_log(path)
-
-
 _TABLE_CAMERA = parse_camera(
     CAMERA_TEXT.decode()
     .replace("768 height: 288", "16 height: 12")
@@ -189,117 +184,60 @@ def _table_content() -> tuple[bytes, ...]:
     return (stream.getvalue(),)
 
 
+_HEADERS = (
+    _JPEG,
+    b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x08\0\0\0\x08\x08\0\0\0\0\0\0\0\0",
+    b"P5 8 8 255\n",
+    b"BM" + bytes(12) + struct.pack("<Iii", 40, 8, 8),
+    _TIFF,
+)
+_MESSAGES = (
+    _message("mono8", 10, 80), _message("16UC1", 16, 128, 1), _message("rgb8", 24, 192),
+    _message("bayer_rggb8", 8, 64), _message("yuv422", 16, 128), _message("bgra16", 64, 512),
+)  # fmt: skip
+_ENCODINGS = (
+    b"mono16", b"8UC1", b"8UC4", b"bayer_bggr16", b"bayer_gbrg8", b"uyvy", b"rgba8", b"bgr16",
+)  # fmt: skip
+_HEADS = (
+    b"# redetect 0.1.0\n# settings radius_m=0.1 samples=16 polarity=any refine=True\n",
+    b"# settings refine_steps_px=((1.0,0.5),(0.5,0.25)) threshold=0.2 alpha=published\n",
+    b"# settings blurred_widths=(2.0,3.0) blurred_sharpness=0.6\n",
+)
+_SETTING_WORDS = (
+    b"settings ", b"radius_m=", b"samples=", b"verify=", b"polarity=", b"threshold=",
+    b"refine_steps_px=", b"blurred_widths=", b"sigma_x_px=", b"evidence=", b"border_px=",
+    b"True", b"1-2", b"1e5e5", *NUMBERS,
+)  # fmt: skip
+_JOURNALS = (
+    _journal_of(b'["ab"]', b'["d","e",{"a":"b"},{"c":1},{},null]', b'["complete",[0],true]'),
+    _journal_of(b'["ab"]', b'["d","e",{},{},{"size":2},"no image"]'),
+)
+_JOURNAL_WORDS = (
+    b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}",
+)  # fmt: skip
+_NPZ_WORDS = (
+    b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", struct.pack("<I", 0xFFFFFFFF),
+)  # fmt: skip
+_DETECT, _FRAME = (DetectError,), (FrameError,)
+
 DETECT_READERS: tuple[Reader, ...] = (
-    Reader(
-        "image header",
-        "image",
-        _header,
-        (),
-        (
-            _JPEG,
-            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x08\0\0\0\x08\x08\0\0\0\0\0\0\0\0",
-            b"P5 8 8 255\n",
-            b"BM" + bytes(12) + struct.pack("<Iii", 40, 8, 8),
-            _TIFF,
-        ),
-        _IMAGE_WORDS,
-    ),
-    Reader(
-        "image", "e.0000.jpg", _image, (FrameError,), (), _IMAGE_WORDS, made_seeds=_encoded,
-    ),
-    Reader(
-        "deep image", "e.png", _deep_image, (), (), _IMAGE_WORDS, made_seeds=_encoded,
-    ),
-    Reader(
-        "calibration image", "e.png", _calibration_image, (CameraError,), (), _IMAGE_WORDS,
-        made_seeds=_encoded,
-    ),
-    Reader(
-        "image message",
-        "message",
-        _image_message,
-        (FrameError,),
-        (
-            _message("mono8", 10, 80),
-            _message("16UC1", 16, 128, 1),
-            _message("rgb8", 24, 192),
-            _message("bayer_rggb8", 8, 64),
-            _message("yuv422", 16, 128),
-            _message("bgra16", 64, 512),
-        ),
-        (b"mono16", b"8UC1", b"8UC4", b"bayer_bggr16", b"bayer_gbrg8", b"uyvy", b"rgba8", b"bgr16"),
-        needed=False,
-    ),
-    Reader(
-        "trajectory",
-        "e.tum",
-        _trajectory,
-        (DetectError,),
-        (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "wheel ticks",
-        "e.ticks",
-        _ticks,
-        (DetectError,),
-        (b"# t left right\n0 0 0\n1 500 510\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "image times",
-        "e.times",
-        read_image_times,
-        (DetectError,),
-        (b"e.0000 0.1\ne.0001 0.2\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "settings",
-        "detected.circles",
-        _head,
-        (DetectError,),
-        (
-            b"# redetect 0.1.0\n# settings radius_m=0.1 samples=16 polarity=any refine=True\n",
-            b"# settings refine_steps_px=((1.0,0.5),(0.5,0.25)) threshold=0.2 alpha=published\n",
-            b"# settings blurred_widths=(2.0,3.0) blurred_sharpness=0.6\n",
-        ),
-        (
-            b"settings ", b"radius_m=", b"samples=", b"verify=", b"polarity=", b"threshold=",
-            b"refine_steps_px=", b"blurred_widths=", b"sigma_x_px=", b"evidence=", b"border_px=",
-            b"True", b"1-2", b"1e5e5", *NUMBERS,
-        ),
-    ),
-    Reader(
-        "journal",
-        ".detected.journal",
-        _journal,
-        (),
-        (
-            _journal_of(
-                b'["ab"]', b'["d","e",{"a":"b"},{"c":1},{},null]', b'["complete",[0],true]'
-            ),
-            _journal_of(b'["ab"]', b'["d","e",{},{},{"size":2},"no image"]'),
-        ),
-        (b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}"),
-    ),
-    Reader(
-        "log",
-        "detected.log.json",
-        _log,
-        (),
-        (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
-        (b"{", b"}", b"\xef\xbb\xbf"),
-        needed=False,
-    ),
-    Reader(
-        "cached table",
-        "table",
-        _table,
-        (),
-        (),
-        (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", struct.pack("<I", 0xFFFFFFFF)),
-        made_seeds=_table_content,
-        files=10,
-    ),
+    Reader("image header", "image", _header, (), _HEADERS, _IMAGE_WORDS),
+    Reader("image", "e.0000.jpg", _image, _FRAME, (), _IMAGE_WORDS, made_seeds=_encoded),
+    Reader("deep image", "e.png", _deep_image, (), (), _IMAGE_WORDS, made_seeds=_encoded),
+    Reader("calibration image", "e.png", _calibration_image, (CameraError,), (), _IMAGE_WORDS,
+           made_seeds=_encoded),
+    Reader("image message", "message", _image_message, _FRAME, _MESSAGES, _ENCODINGS, needed=False),
+    Reader("trajectory", "e.tum", _trajectory, _DETECT,
+           (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
+    Reader("wheel ticks", "e.ticks", _ticks, _DETECT, (b"# t left right\n0 0 0\n1 500 510\n",),
+           NUMBERS),
+    Reader("image times", "e.times", read_image_times, _DETECT, (b"e.0000 0.1\ne.0001 0.2\n",),
+           NUMBERS),
+    Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
+    Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
+    Reader("log", "detected.log.json", is_log, (),
+           (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
+           (b"{", b"}", b"\xef\xbb\xbf"), needed=False),
+    Reader("cached table", "table", _table, (), (), _NPZ_WORDS, files=10,
+           made_seeds=_table_content),
 )  # fmt: skip

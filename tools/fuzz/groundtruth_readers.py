@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import struct
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -23,8 +26,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.fiducials import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.relative_errors import read_relations
-from tools.fuzz.reader import Reader
-from tools.fuzz.words import CAMERA_TEXT, JSON_WORDS, NUMBERS
+from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NUMBERS, Reader
 
 
 def _survey() -> Survey:
@@ -36,12 +38,6 @@ def _npz(**arrays: object) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type]
     return stream.getvalue()
-
-
-def _gzip(text: bytes) -> bytes:
-    import gzip
-
-    return gzip.compress(text, mtime=0)
 
 
 _POSE_JSON = '"translation_m": [0, 0, 1], "quaternion_xyzw": [0, 0, 0, 1]'
@@ -76,174 +72,65 @@ _PTPD = (
 )
 _RAWSEEDS = b"0.1,1,2,0.5," + b",".join([b"0.01", b"0", b"0"] * 3) + b"\n"
 
-GROUNDTRUTH_READERS: tuple[Reader, ...] = (
-    Reader(
-        "poses",
-        "laser.csv",
-        read_planar_poses,
-        (GroundTruthError,),
-        (_RAWSEEDS, b"0 1 2 3\n1 1 2 3\n"),
-        NUMBERS,
-    ),
-    Reader(
-        "times",
-        "a.times",
-        read_times,
-        (GroundTruthError,),
-        (b"e.0000 0.1\ne.0001 0.2\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "rows",
-        "rows.csv",
-        lambda p: read_rows_of_numbers(p, 3, "x, y, z"),
-        (GroundTruthError,),
-        (b"1,2,3\n4 5 6\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "relations",
-        "relations.csv",
-        read_relations,
-        (GroundTruthError,),
-        (b"0,1,0.5,0,0,0,0,0.1\n0 1 0.5 0 0 0 0 0.1\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "scans",
-        "a.scans.csv",
-        lambda p: read_scans(p, 3),
-        (GroundTruthError,),
-        (b"t,r\n0.1,1,2,3\n0.2,1,2,80\n", b"7 0.1 1 2 3\n"),
-        (b"t,", *NUMBERS),
-    ),
-    Reader(
-        "packed scans",
-        "a.scans.csv.gz",
-        read_scans,
-        (GroundTruthError,),
-        (_gzip(b"0.1,1,2,3\n0.2,1,2,80\n"),),
-    ),
-    Reader(
-        "scan arrays",
-        "a.scans.npz",
-        read_scans,
-        (GroundTruthError,),
-        (_npz(times_s=np.arange(2.0), ranges_mm=np.ones((2, 3), np.uint16)),),
-        (
-            b"times_s.npy",
-            b"PK\x03\x04",
-            b"PK\x01\x02",
-            b"'descr': '|O'",
-            struct.pack("<I", 0xFFFFFFFF),
-        ),
-    ),
-    Reader(
-        "scanners",
-        "scanners.json",
-        read_scanners,
-        (GroundTruthError,),
-        (f'{{"version": 1, "scanners": [{_SCANNER_JSON}]}}'.encode(),),
-        JSON_WORDS,
-    ),
-    Reader(
-        "robot",
-        "robot.json",
-        read_robot,
-        (GroundTruthError,),
-        (
-            f'{{"version": 1, "outline": [[0, 0], [1, 0], [0, 1]], "largest_speed_m_s": 1,'
-            f' "largest_turn_rad_s": 2, "scanners": [{_SCANNER_JSON}]}}'.encode(),
-        ),
-        JSON_WORDS,
-    ),
-    Reader(
-        "building",
-        "building.csv",
-        read_building,
-        (GroundTruthError,),
-        (b"x1_m,y1_m,x2_m,y2_m\n0,0,1,1\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "drawing",
-        "building.dxf",
-        read_building,
-        (GroundTruthError,),
-        (_DXF,),
-        (
-            b"\n0\nLINE\n",
-            b"\n0\nINSERT\n",
-            b"\n0\nBLOCK\n",
-            b"\n0\nSPLINE\n",
-            b"\n0\nELLIPSE\n",
-            b"\n0\nARC\n",
-            b"\n0\nLWPOLYLINE\n",
-            b"\n0\nPOLYLINE\n",
-            b"\n0\nSEQEND\n",
-            b"1e999",
-            b"\n70\n",
-            b"\n2\n",
-            b"BLOCKS",
-        ),
-    ),
-    Reader(
-        "survey",
-        "fiducials.json",
-        read_survey,
-        (GroundTruthError,),
-        (
-            b'{"version": 1, "fiducials": {"p": [0, 1], "q": [1, 1]}, "robot_points": {"a": [0, 1],'
-            b' "b": [1, 1]}, "sigma_m": 0.01}',
-        ),
-        JSON_WORDS,
-    ),
-    Reader(
-        "distances",
-        "distances.csv",
-        lambda p: read_distances(p, _survey()),
-        (GroundTruthError,),
-        (b"pose,t,point,fiducial,distance_m\n0,0.5,p,q,1.25\n",),
-        NUMBERS,
-    ),
-    Reader(
-        "rig",
-        "rig.json",
-        read_rig,
-        (GroundTruthError,),
-        (
-            _RIG_JSON.replace("MORE", "").encode(),
-            _RIG_JSON.replace("MORE", ', "sigmas": [1, 1, 1, 1, 1, 1]').encode(),
-        ),
-        JSON_WORDS,
-    ),
-    Reader(
-        "network",
-        "network.json",
-        read_network,
-        (GroundTruthError, CameraError),
-        (f'{{"cameras": {{"a": {{"calibration": "a.cam", {_POSE_JSON}}}}}}}'.encode(),),
-        JSON_WORDS,
-        {"a.cam": CAMERA_TEXT},
-    ),
-    Reader(
-        "boards",
-        "boards.json",
-        read_boards,
-        (GroundTruthError, CameraError),
-        (_BOARDS_JSON.encode(),),
-        (*JSON_WORDS, b"first", b"second"),
-        {"a/a.cam": CAMERA_TEXT},
-    ),
-    Reader(
-        "clock", "clock.json", read_clock, (GroundTruthError,), (_CLOCK_JSON.encode(),), JSON_WORDS
-    ),
-    Reader(
-        "ptpd",
-        "ptpd.log",
-        read_ptpd,
-        (GroundTruthError,),
-        (_PTPD,),
-        (b"offset from master:", b"observed drift:", *NUMBERS),
-    ),
+
+def _reader(
+    name: str, file: str, read: Callable[[Path], object], *seeds: bytes,
+    words: tuple[bytes, ...] = NUMBERS, beside: str = "",
+) -> Reader:  # fmt: skip
+    """A reader of this package; `beside` names a calibration that its file needs."""
+    errors = (GroundTruthError, CameraError) if beside else (GroundTruthError,)
+    return Reader(name, file, read, errors, seeds, words, {beside: CAMERA_TEXT} if beside else {})
+
+
+_DXF_WORDS = (
+    *(f"\n0\n{kind}\n".encode() for kind in (
+        "LINE", "INSERT", "BLOCK", "SPLINE", "ELLIPSE", "ARC", "LWPOLYLINE", "POLYLINE", "SEQEND",
+    )),
+    b"1e999", b"\n70\n", b"\n2\n", b"BLOCKS",
+)  # fmt: skip
+_NPZ_WORDS = (
+    b"times_s.npy", b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", struct.pack("<I", 0xFFFFFFFF),
+)  # fmt: skip
+_SCAN_ARRAYS = _npz(times_s=np.arange(2.0), ranges_mm=np.ones((2, 3), np.uint16))
+_SCANNERS_JSON = f'{{"version": 1, "scanners": [{_SCANNER_JSON}]}}'
+_ROBOT_JSON = (
+    '{"version": 1, "outline": [[0, 0], [1, 0], [0, 1]], "largest_speed_m_s": 1,'
+    f' "largest_turn_rad_s": 2, "scanners": [{_SCANNER_JSON}]}}'
 )
+_SURVEY_JSON = (
+    '{"version": 1, "fiducials": {"p": [0, 1], "q": [1, 1]}, "robot_points": {"a": [0, 1],'
+    ' "b": [1, 1]}, "sigma_m": 0.01}'
+)
+_NETWORK_JSON = f'{{"cameras": {{"a": {{"calibration": "a.cam", {_POSE_JSON}}}}}}}'
+_RIGS = (
+    _RIG_JSON.replace("MORE", "").encode(),
+    _RIG_JSON.replace("MORE", ', "sigmas": [1, 1, 1, 1, 1, 1]').encode(),
+)
+
+GROUNDTRUTH_READERS: tuple[Reader, ...] = (
+    _reader("poses", "laser.csv", read_planar_poses, _RAWSEEDS, b"0 1 2 3\n1 1 2 3\n"),
+    _reader("times", "a.times", read_times, b"e.0000 0.1\ne.0001 0.2\n"),
+    _reader("rows", "rows.csv", lambda p: read_rows_of_numbers(p, 3, "x, y, z"), b"1,2,3\n4 5 6\n"),
+    _reader("relations", "relations.csv", read_relations,
+            b"0,1,0.5,0,0,0,0,0.1\n0 1 0.5 0 0 0 0 0.1\n"),
+    _reader("scans", "a.scans.csv", lambda p: read_scans(p, 3), b"t,r\n0.1,1,2,3\n0.2,1,2,80\n",
+            b"7 0.1 1 2 3\n", words=(b"t,", *NUMBERS)),
+    _reader("packed scans", "a.scans.csv.gz", read_scans,
+            gzip.compress(b"0.1,1,2,3\n0.2,1,2,80\n", mtime=0), words=()),
+    _reader("scan arrays", "a.scans.npz", read_scans, _SCAN_ARRAYS, words=_NPZ_WORDS),
+    _reader("scanners", "scanners.json", read_scanners, _SCANNERS_JSON.encode(), words=JSON_WORDS),
+    _reader("robot", "robot.json", read_robot, _ROBOT_JSON.encode(), words=JSON_WORDS),
+    _reader("building", "building.csv", read_building, b"x1_m,y1_m,x2_m,y2_m\n0,0,1,1\n"),
+    _reader("drawing", "building.dxf", read_building, _DXF, words=_DXF_WORDS),
+    _reader("survey", "fiducials.json", read_survey, _SURVEY_JSON.encode(), words=JSON_WORDS),
+    _reader("distances", "distances.csv", lambda p: read_distances(p, _survey()),
+            b"pose,t,point,fiducial,distance_m\n0,0.5,p,q,1.25\n"),
+    _reader("rig", "rig.json", read_rig, *_RIGS, words=JSON_WORDS),
+    _reader("network", "network.json", read_network, _NETWORK_JSON.encode(), words=JSON_WORDS,
+            beside="a.cam"),
+    _reader("boards", "boards.json", read_boards, _BOARDS_JSON.encode(),
+            words=(*JSON_WORDS, b"first", b"second"), beside="a/a.cam"),
+    _reader("clock", "clock.json", read_clock, _CLOCK_JSON.encode(), words=JSON_WORDS),
+    _reader("ptpd", "ptpd.log", read_ptpd, _PTPD,
+            words=(b"offset from master:", b"observed drift:", *NUMBERS)),
+)  # fmt: skip

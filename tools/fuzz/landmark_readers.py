@@ -14,8 +14,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.tum import read_tum
 from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
-from tools.fuzz.reader import Reader
-from tools.fuzz.words import NUMBERS
+from tools.fuzz.reader import NUMBERS, Reader
 
 
 def _landmarks(path: Path) -> object:
@@ -68,85 +67,33 @@ _MAP = _MAP_HEAD + "disc,3,1.0,2.0,0.01,0.0,0.01,5\nline,-1,1.5,2.0,0.01,0.001,0
 _PATH = "# by hand\nprefix,x_m,y_m,theta_rad\nstart,0,0,0\ne.0001,0.1,-0.2,3\n"
 _MAP_OF_ONE = (_MAP_HEAD + "disc,3,1.0,2.0,0.01,0.0,0.01,5\n").encode()
 
-LANDMARK_READERS: tuple[Reader, ...] = (
-    Reader(
-        "landmarks",
-        "e.circles",
-        _landmarks,
-        (LandmarkError,),
-        (
-            _SETTINGS + _STEP + _CIRCLE + _LINE + _MARKER,
-            _STEP + b"# c \\\n" + _CIRCLE[:20] + b"\\\n" + _CIRCLE[20:].replace(b"\n", b"\r\n"),
-            b"\xef\xbb\xbf" + _STEP,
-        ),
-        (
-            b"STEP",
-            b"LANDMARK",
-            b"LANDMARK_C",
-            b"LANDMARK_L",
-            b"LANDMARK_M",
-            b"XDETECTOR",
-            b"\\\n",
-            b"\r\n",
-            *NUMBERS,
-        ),
-    ),
-    Reader(
-        "tilts",
-        "e.tilt",
-        read_tilts,
-        (LandmarkError,),
-        (b"# x\nTILT e.0000 0.01 -0.02 1e-6 0 1e-6 9\nNOTILT e.0001 2\n",),
-        (b"TILT", b"NOTILT", *NUMBERS),
-    ),
-    Reader(
-        "map",
-        "map.csv",
-        read_map,
-        (LandmarkError,),
-        (_MAP.encode(),),
-        (b"disc,", b"line,", b'"', *NUMBERS),
-    ),
-    Reader(
-        "path",
-        "path.csv",
-        read_path,
-        (LandmarkError,),
-        (_PATH.encode(),),
-        (b"start,", b'"', *NUMBERS),
-    ),
-    Reader(
-        "map covariance",
-        covariance_file(Path("map.csv")).name,
-        _joint,
-        (SlamError,),
-        (_npy(0.01 * np.eye(2)),),
-        (b"NUMPY", b"'descr': '|O'", b"(2, 2)"),
-        {"map.csv": _MAP_OF_ONE},
-        needed=False,
-    ),
-    Reader(
-        "g2o",
-        "e.g2o",
-        read_g2o,
-        (SlamError,),
-        (_G2O,),
-        (
-            b"VERTEX_SE2 ",
-            b"VERTEX_XY ",
-            b"EDGE_SE2 ",
-            b"EDGE_SE2_XY ",
-            b"FIX ",
-            b"# FRAME ",
-            *NUMBERS,
-        ),
-    ),
-    Reader(
-        "tum",
-        "e.tum",
-        read_tum,
-        (SlamError,),
-        (b"# AXES robotics\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",),
-        NUMBERS,
-    ),
+_RECORDS = (
+    _SETTINGS + _STEP + _CIRCLE + _LINE + _MARKER,
+    _STEP + b"# c \\\n" + _CIRCLE[:20] + b"\\\n" + _CIRCLE[20:].replace(b"\n", b"\r\n"),
+    b"\xef\xbb\xbf" + _STEP,
 )
+_RECORD_WORDS = (
+    b"STEP", b"LANDMARK", b"LANDMARK_C", b"LANDMARK_L", b"LANDMARK_M", b"XDETECTOR", b"\\\n",
+    b"\r\n", *NUMBERS,
+)  # fmt: skip
+_G2O_WORDS = (
+    b"VERTEX_SE2 ", b"VERTEX_XY ", b"EDGE_SE2 ", b"EDGE_SE2_XY ", b"FIX ", b"# FRAME ", *NUMBERS,
+)  # fmt: skip
+_LANDMARK, _SLAM = (LandmarkError,), (SlamError,)
+
+LANDMARK_READERS: tuple[Reader, ...] = (
+    Reader("landmarks", "e.circles", _landmarks, _LANDMARK, _RECORDS, _RECORD_WORDS),
+    Reader("tilts", "e.tilt", read_tilts, _LANDMARK,
+           (b"# x\nTILT e.0000 0.01 -0.02 1e-6 0 1e-6 9\nNOTILT e.0001 2\n",),
+           (b"TILT", b"NOTILT", *NUMBERS)),
+    Reader("map", "map.csv", read_map, _LANDMARK, (_MAP.encode(),),
+           (b"disc,", b"line,", b'"', *NUMBERS)),
+    Reader("path", "path.csv", read_path, _LANDMARK, (_PATH.encode(),),
+           (b"start,", b'"', *NUMBERS)),
+    Reader("map covariance", covariance_file(Path("map.csv")).name, _joint, _SLAM,
+           (_npy(0.01 * np.eye(2)),), (b"NUMPY", b"'descr': '|O'", b"(2, 2)"),
+           {"map.csv": _MAP_OF_ONE}, needed=False),
+    Reader("g2o", "e.g2o", read_g2o, _SLAM, (_G2O,), _G2O_WORDS),
+    Reader("tum", "e.tum", read_tum, _SLAM,
+           (b"# AXES robotics\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
+)  # fmt: skip

@@ -10,51 +10,49 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+#: Numbers and signs that readers of text may stumble over.
+NUMBERS = (b"nan", b"inf", b"1e308", b"-1e-320", b"1_0", b"0x1", b",", b"#", b"\\", b"\x1b[2J")
+
+JSON_WORDS = (b"[", b"]", b"{", b"}", b'"', b":", b"null", b"true", b"1e999", b"NaN", b"-0")
+
+#: A calibration: that of the data set's run e.
+CAMERA_TEXT = b"""{ SmRadialDistortedCamera
+sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
+[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
+[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
+sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
+[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
+[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
+mountIndex: 0
+width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
+coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
+}
+"""
+
 #: Characters of a message beside the file's name.
 LONGEST_MESSAGE = 500
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader and what fuzzing it begins with.
-
-    Attributes
-    ----------
-    name : str
-    file : str
-        What the file is called; it may lie in a folder.
-    read : callable
-        Reads a file; what else it demands of the result it asserts.
-    errors : tuple of exception types
-        What it may raise.
-    seeds : tuple of bytes
-        Files that it accepts.
-    words : tuple of bytes
-        Words of its language, for those who put files together.
-    beside : mapping of str to bytes
-        Other files that it needs in the same folder.
-    made_seeds : callable or None
-        Makes further files that it accepts, where that takes a while.
-    files : int
-        So many damaged files are read by the tests: fewer where each takes milliseconds.
-    needed : bool
-        Whether it is an error that there is no file.
-    content : callable or None
-        Makes a file's content of bytes, where damage to the file's own would not lead far; seeds
-        are then such bytes.
-    """
+    """A reader and what fuzzing it begins with."""
 
     name: str
-    file: str
-    read: Callable[[Path], object]
-    errors: tuple[type[Exception], ...]
-    seeds: tuple[bytes, ...] = ()
-    words: tuple[bytes, ...] = ()
+    file: str  # What the file is called; it may lie in a folder.
+    read: Callable[[Path], object]  # Reads a file; what else it demands of the result it asserts.
+    errors: tuple[type[Exception], ...]  # What it may raise.
+    seeds: tuple[bytes, ...] = ()  # Files that it accepts.
+    words: tuple[bytes, ...] = ()  # Words of its language, for those who put files together.
     beside: Mapping[str, bytes] = field(default_factory=dict)
+    """Other files that it needs in the same folder."""
     made_seeds: Callable[[], tuple[bytes, ...]] | None = None
+    """Makes further files that it accepts, where that takes a while."""
     files: int = 150
-    needed: bool = True
+    """So many damaged files are read by the tests: fewer where each takes milliseconds."""
+    needed: bool = True  # Whether it is an error that there is no file.
     content: Callable[[bytes], bytes] | None = None
+    """Makes a file's content of bytes, where damage to the file's own would not lead far; seeds are
+    then such bytes."""
 
     def all_seeds(self) -> tuple[bytes, ...]:
         """All files that it accepts."""
@@ -75,13 +73,7 @@ class Reader:
 
 
 def attempt(reader: Reader, path: Path) -> Exception | None:
-    """Let a reader read a file: its typed error, if any; whatever else it raises escapes.
-
-    Raises
-    ------
-    AssertionError
-        If the error's message is none that a user can read in safety.
-    """
+    """Let a reader read a file: its typed error, if any; whatever else it raises escapes."""
     try:
         reader.read(path)
     except reader.errors as error:

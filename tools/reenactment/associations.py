@@ -10,16 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from camera import Camera
-from tools.reenactment.model import Geometry, predict_pixels, rotation_exp
-from tools.reenactment.objective import mahalanobis, row_distances
+from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
+from tools.arrays import FloatArray, IntArray
+from tools.reenactment.fitting import mahalanobis, row_distances
 from tools.reenactment.recording import Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Discs of the data set have a radius of 0.10 m: two that are nearer than this would overlap.
 DISC_DIAMETER_M = 0.2
@@ -30,21 +27,11 @@ _AGREEMENT_M = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Mending:
-    """A recording and a geometry whose discs are numbered anew.
+    """A recording and a geometry whose discs are numbered anew."""
 
-    Parameters
-    ----------
-    recording : Recording
-        The same rows in the same order; some show another disc.
-    geometry : Geometry
-        Discs merged, and added where rows asked for one.
-    merged, reassigned, added : int
-        Discs that fell to another one, rows that went to a neighbour, discs added.
-    """
-
-    recording: Recording
-    geometry: Geometry
-    merged: int
+    recording: Recording  # The same rows in the same order; some show another disc.
+    geometry: Geometry  # Discs merged, and added where rows asked for one.
+    merged: int  # Discs that fell to another one, rows that went to a neighbour, discs added.
     reassigned: int
     added: int
 
@@ -57,23 +44,7 @@ class Mending:
 def mend_associations(
     camera: Camera, recording: Recording, geometry: Geometry, *, gate: float = 4.0
 ) -> Mending:
-    """Merge discs that overlap; give stray rows to the disc they show, or to a new one.
-
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    recording : Recording
-        Rows with doubtful discs.
-    geometry : Geometry
-        A robust fit to them.
-    gate : float
-        A row further from its disc than so many standard deviations is a stray.
-
-    Returns
-    -------
-    Mending
-    """
+    """Merge discs that overlap; give stray rows to the disc they show, or to a new one."""
     heir = _merge_overlapping(geometry.disc_xy, recording)
     disc = heir[recording.disc]
 
@@ -114,11 +85,7 @@ def map_positions(
     camera: Camera, recording: Recording, geometry: Geometry, rows: IntArray
 ) -> FloatArray:
     """Where in the map rows saw their discs, through the camera as mounted and tilted.
-
-    Returns
-    -------
-    (len(rows), 2) float array
-        Metres; NaN for pixels that don't look down on the floor.
+    Returns (len(rows), 2).
     """
     frame = recording.frame[rows]
     tilt = np.concatenate([geometry.tilt[frame], np.zeros((len(frame), 1))], axis=1)

@@ -6,17 +6,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.slam.models.mounted_discs import Geometry, predict_pixels
+from tools.arrays import FloatArray
 from tools.reenactment.associations import mend_associations
-from tools.reenactment.model import Geometry, nominal_geometry, odometry_residuals, predict_pixels
-from tools.reenactment.objective import Weighting, mahalanobis
+from tools.reenactment.fitting import (
+    RefitError,
+    Weighting,
+    mahalanobis,
+    nominal_geometry,
+    odometry_residuals,
+    refit,
+)
 from tools.reenactment.recording import Recording, start_from_odometry
-from tools.reenactment.refit import RefitError, refit
 from tools.reenactment.world import World
-
-FloatArray = NDArray[np.float64]
 
 #: A row counts as found again within so many standard deviations of its shipped covariance.
 GATE_SIGMA = 4.0
@@ -41,42 +45,20 @@ _MOST_MENDINGS = 10
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a geometry explains a recording.
+    """How well a geometry explains a recording."""
 
-    Parameters
-    ----------
-    label : str
-        The stage it came from.
-    chi_squared : float
-        Of odometry and the rows in sight, under the file's own covariances.
-    out_of_sight : int
-        Rows whose disc lies where the camera can't see it.
-    rotation : 3 floats
-        Rotation vector from nominal to true mounting, robot frame, radians.
-    height : float
-        True minus nominal height, metres.
-    tilt_deg : 2 floats
-        Root mean square of pitch and roll, degrees.
-    discs : int
-        Number of discs.
-    share : float
-        Of rows predicted within `GATE_SIGMA`.
-    share_whole_pixel : float
-        The same after rounding the predictions to whole pixels, as the published detector does.
-    median_px : float
-        Median distance of the rows' pixels from the predicted ones.
-    """
-
-    label: str
-    chi_squared: float
-    out_of_sight: int
+    label: str  # The stage it came from.
+    chi_squared: float  # Of odometry and the rows in sight, under the file's own covariances.
+    out_of_sight: int  # Rows whose disc lies where the camera can't see it.
     rotation: tuple[float, float, float]
-    height: float
-    tilt_deg: tuple[float, float]
-    discs: int
-    share: float
+    """Rotation vector from nominal to true mounting, robot frame, radians."""
+    height: float  # True minus nominal height, metres.
+    tilt_deg: tuple[float, float]  # Root mean square of pitch and roll, degrees.
+    discs: int  # Number of discs.
+    share: float  # Of rows predicted within `GATE_SIGMA`.
     share_whole_pixel: float
-    median_px: float
+    """The same after rounding the predictions to whole pixels, as the published detector does."""
+    median_px: float  # Median distance of the rows' pixels from the predicted ones.
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +79,7 @@ def assess(label: str, camera: Camera, recording: Recording, geometry: Geometry)
     distance = mahalanobis(camera, pixels, *rows)
     whole = mahalanobis(camera, np.round(pixels), *rows)
     seen = np.isfinite(distance)
-    steps, _, _ = odometry_residuals(geometry.poses, recording.steps)
+    steps = odometry_residuals(geometry.poses, recording.steps)
     weighted = np.linalg.solve(recording.step_covariance, steps[..., None])[..., 0]
     turn = Rotation.from_matrix(geometry.rotation @ np.linalg.inv(camera.rotation)).as_rotvec()
     pitch, roll = np.degrees(np.sqrt(np.mean(geometry.tilt**2, axis=0)))
@@ -118,27 +100,7 @@ def assess(label: str, camera: Camera, recording: Recording, geometry: Geometry)
 def stages(
     camera: Camera, recording: Recording, start: tuple[FloatArray, FloatArray] | None
 ) -> Iterator[Stage]:
-    """Fit a world to a recording, better with each stage.
-
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    recording : Recording
-        Rows and odometry.
-    start : (N, 3) and (M, 2) float arrays, optional
-        Poses and disc centres in the map; without them, odometry is the start.
-
-    Yields
-    ------
-    Stage
-        The last one is the world to render.
-
-    Raises
-    ------
-    RefitError
-        If a fit doesn't settle.
-    """
+    """Fit a world to a recording, better with each stage. `start` (N, 3)."""
 
     def stage(label: str, geometry: Geometry) -> Stage:
         return Stage(geometry, recording, assess(label, camera, recording, geometry))

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
-from tools.reenactment.model import chain_odometry
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.slam.models.motion import chain_steps
+from tools.arrays import BoolArray, FloatArray, IntArray
 
 
 class RecordingError(ValueError):
@@ -24,55 +22,22 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a run's landmark file says, as arrays; rows without an ID are left out.
+    """What a run's landmark file says, as arrays; rows without an ID are left out."""
 
-    Parameters
-    ----------
-    prefixes : (N,) array of str
-        Names of the frames' images.
-    steps : (N, 3) float array
-        Odometry: dx, dy, dphi in the robot frame before the step.
-    step_covariance : (N, 3, 3) float array
-        Their covariances.
-    disc_ids : (M,) int array
-        The discs' IDs, ascending; one ID can stand for several discs.
-    frame, disc : (n,) int arrays
-        For each row its frame and its disc (an index into `disc_ids`, not an ID).
-    row_xy : (n, 2) float array
-        The rows' positions in the robot frame, metres.
-    row_covariance : (n, 2, 2) float array
-        Their covariances.
-    pixels : (n, 2) float array
-        Where in the image the rows came from.
-    """
-
-    prefixes: NDArray[np.str_]
-    steps: FloatArray
-    step_covariance: FloatArray
-    disc_ids: IntArray
+    prefixes: NDArray[np.str_]  # (N,) Names of the frames' images.
+    steps: FloatArray  # (N, 3) Odometry: dx, dy, dphi in the robot frame before the step.
+    step_covariance: FloatArray  # (N, 3, 3) Their covariances.
+    disc_ids: IntArray  # (M,) The discs' IDs, ascending; one ID can stand for several discs.
     frame: IntArray
-    disc: IntArray
-    row_xy: FloatArray
-    row_covariance: FloatArray
-    pixels: FloatArray
+    """(n,) For each row its frame and its disc (an index into `disc_ids`, not an ID)."""
+    disc: IntArray  # (n,)
+    row_xy: FloatArray  # (n, 2) The rows' positions in the robot frame, metres.
+    row_covariance: FloatArray  # (n, 2, 2) Their covariances.
+    pixels: FloatArray  # (n, 2) Where in the image the rows came from.
 
 
 def recording_of_frames(camera: Camera, frames: Iterable[Frame]) -> Recording:
-    """Gather the frames of a landmark file.
-
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated: the one that put the rows on the floor.
-    frames : iterable of Frame
-        E.g. from `redetect.landmarks.read_frames`.
-
-    Raises
-    ------
-    RecordingError
-        If no row has an ID, a covariance cannot be inverted, or a row lies where the camera sees no
-        floor; the frame is named.
-    """
+    """Gather the frames of a landmark file."""
     frames = list(frames)
     circles = [circle_arrays(frame.circles) for frame in frames]
     ids = np.concatenate([np.zeros(0, dtype=np.int64), *(c.ids for c in circles)])
@@ -114,25 +79,16 @@ def recording_of_frames(camera: Camera, frames: Iterable[Frame]) -> Recording:
     )
 
 
-def _demand(good: NDArray[np.bool_], prefixes: NDArray[np.str_], problem: str) -> None:
+def _demand(good: BoolArray, prefixes: NDArray[np.str_], problem: str) -> None:
     if not good.all():
         raise RecordingError(f"STEP {prefixes[np.argmin(good)]}: {problem}")
 
 
 def read_path(path: str | os.PathLike[str], frames: int) -> FloatArray:
     """Read a path: rows x, y (m), theta (rad); the start (0, 0, 0), then the pose after each step.
-
-    Returns
-    -------
-    (frames, 3) float array
-        Without the start.
-
-    Raises
-    ------
-    RecordingError
-        If the file isn't one; the file is named.
+    Returns (frames, 3).
     """
-    poses = _read_table(path, 3)
+    poses = _read_table(path)
     if len(poses) != frames + 1:
         raise RecordingError(
             f"{path}: {len(poses)} poses: expected {frames + 1}, the start and one for each STEP"
@@ -143,19 +99,8 @@ def read_path(path: str | os.PathLike[str], frames: int) -> FloatArray:
 
 
 def read_map(path: str | os.PathLike[str], disc_ids: IntArray) -> FloatArray:
-    """Read a map: rows ID, x, y (m).
-
-    Returns
-    -------
-    (M, 2) float array
-        Places of the discs asked for, in their order.
-
-    Raises
-    ------
-    RecordingError
-        If the file isn't one, or lacks a disc; the file is named.
-    """
-    table = _read_table(path, 3)
+    """Read a map: rows ID, x, y (m). Returns (M, 2)."""
+    table = _read_table(path)
     place = {int(disc_id): (x, y) for disc_id, x, y in table}
     missing = [int(disc_id) for disc_id in disc_ids if int(disc_id) not in place]
     if missing:
@@ -163,36 +108,23 @@ def read_map(path: str | os.PathLike[str], disc_ids: IntArray) -> FloatArray:
     return np.array([place[int(disc_id)] for disc_id in disc_ids])
 
 
-def _read_table(path: str | os.PathLike[str], columns: int) -> FloatArray:
+def _read_table(path: str | os.PathLike[str]) -> FloatArray:
+    expected = "expected 3 numbers a row, separated by commas"
     try:
-        with Path(path).open(encoding="utf-8") as stream:
-            table = np.array(
-                [
-                    [float(word) for word in line.split(",")]
-                    for line in stream
-                    if line.strip() and not line.startswith("#")
-                ]
-            )
+        with warnings.catch_warnings(action="ignore"):
+            table = np.loadtxt(path, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise RecordingError(
-            f"{path}: {error}: expected {columns} numbers a row, separated by commas"
-        ) from None
-    if table.ndim != 2 or table.shape[1] != columns or not np.all(np.isfinite(table)):
-        raise RecordingError(f"{path}: expected {columns} numbers a row, separated by commas")
+        raise RecordingError(f"{path}: {error}: {expected}") from None
+    if table.shape[1] != 3 or len(table) == 0 or not np.all(np.isfinite(table)):
+        raise RecordingError(f"{path}: {expected}")
     return table
 
 
 def start_from_odometry(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """The path that odometry alone gives, and the discs where they were seen from it on average.
-
-    Returns
-    -------
-    poses : (N, 3) float array
-        x, y, theta in the map.
-    disc_xy : (M, 2) float array
-        Metres, in the map.
+    Returns `poses` (N, 3), `disc_xy` (M, 2).
     """
-    poses = chain_odometry(recording.steps)
+    poses = chain_steps(recording.steps)[1:]
     x, y, theta = poses[recording.frame].T
     cos, sin = np.cos(theta), np.sin(theta)
     left, back = recording.row_xy.T

@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.storage import write_whole
-
-FloatArray = NDArray[np.float64]
+from tools.arrays import FloatArray, IntArray
 
 # Zip entries carry a date; a constant one makes the same world the same bytes.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
@@ -41,30 +40,17 @@ class WorldError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A path, the discs beside it and the camera that saw them.
+    """A path, the discs beside it and the camera that saw them."""
 
-    Parameters
-    ----------
-    prefixes : (N,) array of str
-        The prefix of each STEP's image.
-    poses : (N, 3) float array
-        x, y (metres) and theta (radians) in the map after each STEP.
-    tilt : (N, 2) float array
-        Pitch and roll per frame: a rotation vector's x and y in the robot frame, radians.
-    disc_ids : (M,) int array
-        The discs' IDs, ascending; an ID that the recording gave to two discs occurs twice.
-    disc_xy : (M, 2) float array
-        The discs' centres in the map, metres.
-    robot_from_camera : (3, 4) float array
-        The true mounting: rotation and translation camera -> robot, metres.
-    """
-
-    prefixes: NDArray[np.str_]
-    poses: FloatArray
+    prefixes: NDArray[np.str_]  # (N,) The prefix of each STEP's image.
+    poses: FloatArray  # (N, 3) x, y (metres) and theta (radians) in the map after each STEP.
     tilt: FloatArray
-    disc_ids: NDArray[np.int64]
-    disc_xy: FloatArray
+    """(N, 2) Pitch and roll per frame: a rotation vector's x and y in the robot frame, radians."""
+    disc_ids: IntArray
+    """(M,) The discs' IDs, ascending; an ID that the recording gave to two discs occurs twice."""
+    disc_xy: FloatArray  # (M, 2) The discs' centres in the map, metres.
     robot_from_camera: FloatArray
+    """(3, 4) The true mounting: rotation and translation camera -> robot, metres."""
 
     def __post_init__(self) -> None:
         frames, discs = len(self.prefixes), len(self.disc_ids)
@@ -85,13 +71,7 @@ _FIELDS = ("prefixes", "poses", "tilt", "disc_ids", "disc_xy", "robot_from_camer
 
 
 def write_world(path: str | os.PathLike[str], world: World, *, overwrite: bool = False) -> None:
-    """Write a world as ``.npz``, one array per field of `World`; the same world, the same bytes.
-
-    Raises
-    ------
-    OutputExistsError
-        If the file exists and `overwrite` is false.
-    """
+    """Write a world as ``.npz``, one array per field of `World`; the same world, the same bytes."""
     with write_whole(path, overwrite=overwrite) as stream, zipfile.ZipFile(stream, "w") as archive:
         for name in _FIELDS:
             entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE)
@@ -101,15 +81,7 @@ def write_world(path: str | os.PathLike[str], world: World, *, overwrite: bool =
 
 
 def read_world(path: str | os.PathLike[str]) -> World:
-    """Read a world that `write_world` wrote.
-
-    Raises
-    ------
-    WorldError
-        If the file is no ``.npz`` or lacks an array; the file is named.
-    OSError
-        If the file cannot be read.
-    """
+    """Read a world that `write_world` wrote."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return World(**{name: archive[name] for name in _FIELDS})

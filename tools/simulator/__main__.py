@@ -1,8 +1,281 @@
-"""``python -m tools.simulator``."""
+"""The command line of the simulator: ``python -m tools.simulator --help``."""
+
+from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
 
-from tools.simulator.cli import main
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+from redetect.storage.command_line import exit_code_of
+from tools.simulator.driving import DriveStyle
+from tools.simulator.laser.settings import LaserSettings
+from tools.simulator.markers.samples import SampleSettings
+from tools.simulator.markers.session import CalibrationErrors, ImageFormat, SessionSettings
+from tools.simulator.renderer import Sensor
+from tools.simulator.runs import PUBLISHED_CAMERA, RunSettings
+
+# A run of the data set has so many frames, discs and things that look like discs.
+_FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Render the demo run of the project (images/e) anew."""
+
+    output: Path = Path("images/e")  # Folder of the run.
+    jobs: int = 1  # Processes that render.
+    force: bool = False  # Replace files that exist.
+
+    def __call__(self) -> str:
+        from tools.simulator.runs import DEMO
+
+        return _write_run(DEMO, self.output, self.jobs, self.force)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Render a run through the office: images, odometry, and the truth."""
+
+    output: Positional[Path]  # Folder of the run; its name is the run's.
+    frames: int = _FULL_FRAMES  # Frames to render.
+    seed: int = 1  # Everything about the run follows from it.
+    discs: int | None = None  # On the floor along the way; by default 576 in 3297 frames.
+    lookalikes: int | None = None  # Other things on the floor; by default 140 in 3297 frames.
+    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
+    skip: int = 0  # Steps of the drive that go by before the first frame.
+    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
+    camera: Path | None = None  # Calibration (.cam); the published one by default.
+    jobs: int = 1  # Processes that render.
+    force: bool = False  # Replace files that exist.
+    style: DriveStyle = field(default_factory=DriveStyle)
+    sensor: Sensor = field(default_factory=Sensor)
+
+    def __call__(self) -> str:
+        settings = RunSettings(
+            name=self.output.resolve().name, frames=self.frames, seed=self.seed,
+            discs=_by_length(self.discs, _FULL_DISCS, self.frames),
+            lookalikes=_by_length(self.lookalikes, _FULL_LOOKALIKES, self.frames),
+            visits=self.visits, skip=self.skip, unlabelled=self.unlabelled, style=self.style,
+            camera_text=_camera_text(self.camera), sensor=self.sensor,
+        )  # fmt: skip
+        return _write_run(settings, self.output, self.jobs, self.force)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Write odometry and disc rows of a run, without images."""
+
+    output: Positional[Path]  # Folder of the run; its name is the run's.
+    frames: int = _FULL_FRAMES  # Steps to drive.
+    seed: int = 1  # Everything about the run follows from it.
+    discs: int | None = None  # On the floor along the way; by default 576 in 3297 frames.
+    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
+    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
+    camera: Path | None = None  # Calibration (.cam); the published one by default.
+    exact: bool = False  # Leave the rows without measurement noise.
+    miss: float = 0.0  # Probability that a row is left out.
+    force: bool = False  # Replace files that exist.
+    style: DriveStyle = field(default_factory=DriveStyle)
+
+    def __call__(self) -> str:
+        from tools.simulator.runs import write_rows
+
+        settings = RunSettings(
+            name=self.output.resolve().name, frames=self.frames, seed=self.seed, lookalikes=0,
+            discs=_by_length(self.discs, _FULL_DISCS, self.frames), visits=self.visits,
+            unlabelled=self.unlabelled, camera_text=_camera_text(self.camera), style=self.style,
+        )  # fmt: skip
+        rows = write_rows(
+            settings, self.output, noisy=not self.exact, miss=self.miss, overwrite=self.force
+        )
+        return f"{settings.frames} steps, {rows} disc rows"
+
+
+@dataclass(frozen=True)
+class Reenact:
+    """Render what the camera of a recorded run would have seen.
+
+    Prints the discs' quality by distance, shipped and rendered.
+    """
+
+    landmarks: Positional[Path]  # The recorded run's .circles file.
+    output: Positional[Path]  # Folder of the run; its name is the run's.
+    camera: Path  # The calibration (.cam) that belongs to it.
+    world: Path  # What `python -m tools.reenactment prepare` wrote.
+    every: int = 5  # Render every n-th frame.
+    seed: int = 1  # Of noise and light.
+    jobs: int = 1  # Processes that render.
+    force: bool = False  # Replace files that exist.
+
+    def __call__(self) -> str:
+        from tools.simulator.reenact import prepare, quality_table, write_reenactment
+
+        run = prepare(self.landmarks, self.camera, self.world, self.seed)
+        rendered = len(range(0, len(run.frames), self.every))
+        with _progress(rendered) as tick:
+            qualities = write_reenactment(
+                run, self.output, self.every, jobs=self.jobs, overwrite=self.force, on_frame=tick
+            )
+        print("\n".join(quality_table(qualities)))
+        return f"{rendered} frames"
+
+
+@dataclass(frozen=True)
+class MarkerFrames:
+    """Render random frames of markers among things that look like markers, with exact truth."""
+
+    output: Positional[Path]  # Folder of the frames.
+    count: int = 100  # Frames to render.
+    seed: int = 1  # Everything about them follows from it.
+    jobs: int = 1  # Processes that render.
+    force: bool = False  # Replace files that exist.
+    sample: SampleSettings = field(default_factory=SampleSettings)
+
+    def __call__(self) -> str:
+        from tools.simulator.markers.samples import write_samples
+
+        with _progress(self.count) as tick:
+            markers = write_samples(
+                self.sample, self.output, count=self.count, seed=self.seed, jobs=self.jobs,
+                overwrite=self.force, on_frame=tick,
+            )  # fmt: skip
+        return f"{self.count} frames, {markers} markers"
+
+
+@dataclass(frozen=True)
+class MarkerSession:
+    """Render a session: cameras in a room, a robot with six markers, standing and driving.
+
+    With images for estimating the calibrations of robot and cameras, in `calibration`.
+    """
+
+    output: Positional[Path]  # Folder of the session; its name is the session's.
+    calibration: bool = True  # Also render the images for calibrations.
+    image_format: ImageFormat = "jpg"  # Of the images.
+    quality: int = 92  # Of the jpg images.
+    jobs: int = 1  # Processes that render.
+    force: bool = False  # Replace files that exist.
+    session: SessionSettings = field(default_factory=SessionSettings)
+    errors: CalibrationErrors = field(default_factory=CalibrationErrors)
+
+    def __call__(self) -> str:
+        from tools.simulator.markers.calibration_set import write_calibration_set
+        from tools.simulator.markers.session import SessionWriter, plan_session, write_session
+
+        settings = replace(self.session, name=self.output.resolve().name)
+        writer = SessionWriter(self.errors, self.image_format, self.quality, self.force)
+        with _progress(settings.cameras * (settings.references + settings.steps)) as tick:
+            images = write_session(settings, self.output, writer, jobs=self.jobs, on_frame=tick)
+        if not self.calibration:
+            return f"{images} images"
+        with _progress(None) as tick:
+            more = write_calibration_set(
+                plan_session(settings), self.output / "calibration", writer, on_frame=tick
+            )
+        return f"{images} images, {more} for calibrations"
+
+
+@dataclass(frozen=True)
+class MarkerDemo:
+    """Render the session of the project (images/m) anew."""
+
+    output: Path = Path("images/m")  # Folder of the session.
+    force: bool = False  # Replace files that exist.
+
+    def __call__(self) -> str:
+        from tools.simulator.markers.session import DEMO, DEMO_QUALITY, SessionWriter, write_session
+
+        writer = SessionWriter(quality=DEMO_QUALITY, overwrite=self.force)
+        return f"{write_session(DEMO, self.output, writer)} images"
+
+
+@dataclass(frozen=True)
+class LaserSession:
+    """Simulate a session of a robot watched by fixed laser scanners and marker cameras.
+
+    No images: scans, odometry, poses from markers, distances, clocks, and the truth.
+    """
+
+    output: Positional[Path]  # Folder of the session.
+    seed: int = 1  # Everything about it follows from it and the settings.
+    picture: bool = False  # Also draw map, way, scanners and one set of scans: session.png.
+    force: bool = False  # Replace files that exist.
+    session: Annotated[LaserSettings, arg(name="")] = field(default_factory=LaserSettings)
+
+    def __call__(self) -> str:
+        from tools.simulator.laser.session_files import draw_session, write_session
+
+        with _progress(10) as tick:
+            plan = write_session(
+                self.session, self.output, seed=self.seed, overwrite=self.force, on_file=tick
+            )
+        if self.picture:
+            draw_session(self.output, self.output / "session.png", overwrite=self.force)
+        inside = sum(end - begin for begin, end in plan.visits)
+        away = plan.route.end_s - plan.route.start_s - inside
+        return f"{len(plan.visits)} visits, {inside:.0f} s in the room and {away:.0f} s outside"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; 0 if all went well."""
+    command = tyro.cli(
+        Annotated[Demo, subcommand("demo")]
+        | Annotated[Run, subcommand("run")]
+        | Annotated[Rows, subcommand("rows")]
+        | Annotated[Reenact, subcommand("reenact")]
+        | Annotated[MarkerFrames, subcommand("marker-frames")]
+        | Annotated[MarkerSession, subcommand("marker-session")]
+        | Annotated[MarkerDemo, subcommand("marker-demo")]
+        | Annotated[LaserSession, subcommand("laser-session")],
+        prog="python -m tools.simulator",
+        description="Rendered runs and sessions with known truth.",
+        args=arguments,
+    )
+
+    def perform() -> int:
+        begin = time.perf_counter()
+        made = command()
+        print(f"{command.output}: {made}, {time.perf_counter() - begin:.0f} s")
+        return 0
+
+    return exit_code_of(perform)
+
+
+def _write_run(settings: RunSettings, output: Path, jobs: int, force: bool) -> str:
+    from tools.simulator.runs import write_run
+
+    with _progress(settings.frames) as tick:
+        rows = write_run(settings, output, jobs=jobs, overwrite=force, on_frame=tick)
+    return f"{settings.frames} frames, {rows} disc rows"
+
+
+def _by_length(given: int | None, full: int, frames: int) -> int:
+    """What was asked for, or as many things as the length of a run allows."""
+    return given if given is not None else max(1, round(full * frames / _FULL_FRAMES))
+
+
+def _camera_text(path: Path | None) -> str:
+    from camera import format_camera, read_camera
+
+    return PUBLISHED_CAMERA if path is None else format_camera(read_camera(path))
+
+
+@contextmanager
+def _progress(total: int | None) -> Iterator[Callable[[], None]]:
+    """A bar; what it gives is called after each frame."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    with Progress(BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda: bar.advance(task)
+
 
 if __name__ == "__main__":
     sys.exit(main())

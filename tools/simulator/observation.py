@@ -1,19 +1,59 @@
-"""What is truly in view: discs and vertical edges, from the world's geometry."""
+"""What is truly in view: discs and vertical edges, and the quality of discs in an image."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect.landmarks import CircleLandmark, LineLandmark
-from tools.simulator.construction import UprightEdge
-from tools.simulator.poses import world_from_robot, world_to_robot
-from tools.simulator.quality import disc_quality
+from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from tools.simulator.driving import world_from_robot, world_to_robot
 from tools.simulator.renderer import camera_in_world
-from tools.simulator.scene import FloatArray, Scene
+from tools.simulator.scene import Scene, UprightEdge
+
+INNER_M, OUTER_M = 0.06, 0.14
+SAMPLES = 16
+
+#: Borders of forward distance (m), and the shipped rows' median quality between them.
+DISTANCE_BORDERS_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+SHIPPED_MEDIANS = (0.987, 0.973, 0.924, 0.836, 0.781, 0.703)
+
+
+def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
+    """Otsu quality of a disc whose centre is seen at a pixel. `grey` (H, W); `pixel` (2,)."""
+    centre = camera.floor_from_pixel(np.asarray(pixel, dtype=np.float64))
+    angle = np.arange(SAMPLES) * (2.0 * np.pi / SAMPLES)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    outlines = centre + np.array([INNER_M, OUTER_M])[:, None, None] * circle
+    seen = camera.project_floor(outlines)
+    if np.isnan(seen).any():
+        return 0.0
+    u = np.clip(np.rint(seen[..., 0]).astype(int), 0, grey.shape[1] - 1)
+    v = np.clip(np.rint(seen[..., 1]).astype(int), 0, grey.shape[0] - 1)
+    values = grey[v, u].astype(np.float64)
+    total = values.var()
+    if total <= 0.0:
+        return 0.0
+    difference = values[0].mean() - values[1].mean()
+    return float(0.25 * difference * difference / total)
+
+
+def best_quality_near(
+    grey: ByteArray, camera: Camera, pixel: ArrayLike, reach: int = 2
+) -> tuple[float, tuple[int, int]]:
+    """The best quality within `reach` pixels of a place, and its pixel (u, v): a detector's row."""
+    u0, v0 = np.rint(np.asarray(pixel, dtype=np.float64)).astype(int)
+    best, where = -1.0, (int(u0), int(v0))
+    for v in range(max(v0 - reach, 0), min(v0 + reach, grey.shape[0] - 1) + 1):
+        for u in range(max(u0 - reach, 0), min(u0 + reach, grey.shape[1] - 1) + 1):
+            found = disc_quality(grey, camera, (u, v))
+            if found > best:
+                best, where = found, (int(u), int(v))
+    return best, where
+
 
 #: A row's centre lies at least so many pixels inside the image, as in the data set.
 BORDER_PX = 12
@@ -91,33 +131,12 @@ def see_discs(
     nominal: Camera,
     true: Camera,
     pose: FloatArray,
-    disc_ids: NDArray[np.int64],
+    disc_ids: IntArray,
     disc_xy: FloatArray,
     radius_m: float,
 ) -> list[SeenDisc]:
-    """Which discs are in view from a pose.
-
-    Parameters
-    ----------
-    scene : Scene
-        The world.
-    nominal : Camera
-        The camera as calibrated; it decides the far limit of rows.
-    true : Camera
-        The camera as it is mounted at that moment, tilt included.
-    pose : (3,) array
-        x, y (m), heading (rad) of the robot.
-    disc_ids, disc_xy : (M,), (M, 2) arrays
-        The discs' numbers and places in the world (m).
-    radius_m : float
-        Their radius.
-
-    Returns
-    -------
-    list of SeenDisc
-        In scan order of the image.
-    """
-    from tools.simulator.tracing.kernels import points_visible
+    """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
+    from tools.simulator.ray_kernels import points_visible
 
     robot_xy = world_to_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
@@ -151,20 +170,10 @@ def see_discs(
 
 
 def circle_row(
-    disc: SeenDisc, nominal: Camera, grey: NDArray[np.uint8] | None, disc_id: int
+    disc: SeenDisc, nominal: Camera, grey: ByteArray | None, disc_id: int
 ) -> CircleLandmark:
     """Row of a disc: its true place, the published covariance, and the image's quality there.
-
-    Parameters
-    ----------
-    disc : SeenDisc
-        The disc.
-    nominal : Camera
-        The camera as calibrated.
-    grey : (H, W) uint8, optional
-        The image; without it the quality is 1.
-    disc_id : int
-        The ID that the row gets, -1 for unknown.
+    `grey` (H, W).
     """
     pixel = np.rint(disc.pixel)
     covariance = published_covariance(nominal, pixel)
@@ -182,29 +191,10 @@ def published_covariance(camera: Camera, pixel: FloatArray) -> FloatArray:
 
 
 def see_edges(
-    scene: Scene,
-    true: Camera,
-    pose: FloatArray,
-    edges: list[UprightEdge],
-    grey: NDArray[np.uint8],
+    scene: Scene, true: Camera, pose: FloatArray, edges: list[UprightEdge], grey: ByteArray
 ) -> list[SeenEdge]:
-    """Which vertical edges within 12 m are in view from a pose.
-
-    Parameters
-    ----------
-    scene, true, pose
-        As in `see_discs`.
-    edges : list of UprightEdge
-        All edges of the world.
-    grey : (H, W) uint8
-        The image, by which their contrast is measured.
-
-    Returns
-    -------
-    list of SeenEdge
-        In the order of `edges`.
-    """
-    from tools.simulator.tracing.kernels import points_visible
+    """Which vertical edges within 12 m are in view from a pose. `grey` (H, W)."""
+    from tools.simulator.ray_kernels import points_visible
 
     eye = camera_in_world(true, pose)[:, 3]
     place = np.array([[e.x, e.y] for e in edges]).reshape(-1, 2)
@@ -299,7 +289,7 @@ def _rotated(points: FloatArray, angle: float) -> FloatArray:
     return np.asarray(points @ np.array([[c, s], [-s, c]]))
 
 
-def _longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
+def _longest_run(flags: BoolArray) -> tuple[int, int]:
     """First and last index of the longest run of true values; (0, -1) if there is none."""
     padded = np.concatenate([[False], flags, [False]]).astype(np.int8)
     steps = np.diff(padded)
@@ -310,7 +300,7 @@ def _longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
     return int(begin[best]), int(end[best])
 
 
-def _appearance(grey: NDArray[np.uint8], uv: FloatArray) -> tuple[float, int, float]:
+def _appearance(grey: ByteArray, uv: FloatArray) -> tuple[float, int, float]:
     """How an edge shows in the image along its points (u, v).
 
     Returns the median step in grey values across it (right minus left), how many rows show it, and

@@ -15,29 +15,30 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
 from redetect.landmarks import Frame, read_frames, write_frames
 from redetect.storage import write_whole
+from tools.arrays import BoolArray, ByteArray, FloatArray
 from tools.reenactment.world import World, read_world
-from tools.simulator.construction import (
+from tools.simulator.driving import joined_steps, with_mounting
+from tools.simulator.observation import DISTANCE_BORDERS_M, SeenDisc, best_quality_near, see_discs
+from tools.simulator.parallel import in_order
+from tools.simulator.renderer import Sensor, encode_jpeg, grey_values, render_light, smeared
+from tools.simulator.runs import SIMULATED
+from tools.simulator.scene import (
     CEILING_M,
     Construction,
+    Flooring,
     FloorMark,
     Look,
+    Mark,
+    Scene,
+    Texture,
     flooring,
     make_scene,
     raster_shape,
 )
-from tools.simulator.observation import SeenDisc, see_discs
-from tools.simulator.odometry import joined_steps
-from tools.simulator.poses import with_mounting
-from tools.simulator.quality import DISTANCE_BORDERS_M, best_quality_near
-from tools.simulator.renderer import render_light, smeared
-from tools.simulator.run_folder import SIMULATED
-from tools.simulator.scene import FloatArray, Flooring, Mark, Scene, Texture
-from tools.simulator.sensor import Sensor, encode_jpeg, grey_values
 
 #: Tuned on the shipped rows' median quality by distance (see `quality_table`): no other figure than
 #: the blur makes quality fall with distance as it does, and this one fits all distances at once.
@@ -64,13 +65,10 @@ _REMEMBERED_FRAMES = 30
 class Reenactment:
     """A recorded run that needs only be rendered."""
 
-    camera: Camera
-    """As calibrated: what detectors are given."""
+    camera: Camera  # As calibrated: what detectors are given.
     world: World
-    frames: tuple[Frame, ...]
-    """The shipped rows, one frame per pose."""
-    scene: Scene
-    """The floor with all discs."""
+    frames: tuple[Frame, ...]  # The shipped rows, one frame per pose.
+    scene: Scene  # The floor with all discs.
     seed: int
 
 
@@ -79,31 +77,14 @@ class ReenactedFrame:
     """A rendered frame, what is truly in view, and the quality at each shipped row."""
 
     index: int
-    grey: NDArray[np.uint8]
+    grey: ByteArray
     discs: tuple[SeenDisc, ...]
     qualities: tuple[tuple[float, float, float], ...]
     """Forward distance (m), shipped quality and rendered quality of shipped rows with an ID."""
 
 
 def prepare(landmarks: Path, camera: Path, world: Path, seed: int) -> Reenactment:
-    """Read a recorded run and the world it happened in.
-
-    Parameters
-    ----------
-    landmarks : Path
-        The shipped landmark file.
-    camera : Path
-        The calibration that belongs to it.
-    world : Path
-        What ``python -m tools.reenactment prepare`` wrote.
-    seed : int
-        Of the noise and the light.
-
-    Raises
-    ------
-    ValueError
-        If the world does not belong to the landmark file.
-    """
+    """Read a recorded run and the world it happened in."""
     found = read_world(world)
     frames = tuple(read_frames(landmarks))
     if [f.step.prefix for f in frames] != [str(p) for p in found.prefixes]:
@@ -144,34 +125,14 @@ def write_reenactment(
     jobs: int = 1,
     sensor: Sensor = REENACTED_SENSOR,
     overwrite: bool = False,
-    on_frame: Callable[[int], None] | None = None,
+    on_frame: Callable[[], None] | None = None,
 ) -> FloatArray:
     """Render every `every`-th frame of a recorded run and write a run folder.
 
     Its ``map.circles`` holds the shipped rows of the rendered frames, so that what is detected
     again can be compared with them; odometry between them is joined.
 
-    Parameters
-    ----------
-    run : Reenactment
-        What `prepare` read.
-    folder : Path
-        Where the run folder goes; made if missing. Its name is the run's.
-    every : int
-        Frames are rendered at this distance, from the first.
-    jobs : int
-        Processes that render.
-    sensor : Sensor
-        Photometry.
-    overwrite : bool
-        Whether existing files may be replaced.
-    on_frame : callable, optional
-        Called with the index of each frame that is done.
-
-    Returns
-    -------
-    (K, 3) array
-        Forward distance (m), shipped and rendered quality of every shipped row with an ID.
+    Returns (K, 3).
     """
     name = folder.resolve().name
     images = folder / "images"
@@ -180,7 +141,7 @@ def write_reenactment(
     indices = range(0, len(run.frames), every)
     truth: list[str] = []
     qualities: list[tuple[float, float, float]] = []
-    for frame in _rendered(run, indices, sensor, jobs):
+    for frame in in_order(_rendered, (run, sensor), indices, jobs):
         index = frame.index
         prefix = run.frames[index].step.prefix
         with write_whole(images / f"{prefix}.jpg", overwrite=overwrite) as out:
@@ -188,7 +149,7 @@ def write_reenactment(
         qualities += frame.qualities
         truth.append(_truth_json(run, frame))
         if on_frame is not None:
-            on_frame(index)
+            on_frame()
     steps = joined_steps([f.step for f in run.frames], list(indices))
     kept = [Frame(step, run.frames[index].landmarks) for step, index in zip(steps, indices)]
     what = f"re-enactment, every {every}th frame, seed {run.seed}"
@@ -207,11 +168,7 @@ def write_reenactment(
 
 def quality_table(qualities: FloatArray) -> Iterator[str]:
     """Lines of a table: median quality of shipped and rendered rows by forward distance.
-
-    Parameters
-    ----------
-    qualities : (K, 3) array
-        Forward distance (m), shipped quality, rendered quality.
+    `qualities` (K, 3).
     """
     yield f"{'distance / m':>14}{'rows':>8}{'shipped':>10}{'rendered':>10}{'difference':>12}"
     borders = DISTANCE_BORDERS_M
@@ -227,35 +184,8 @@ def quality_table(qualities: FloatArray) -> Iterator[str]:
         )
 
 
-_worker: tuple[Reenactment, Sensor] | None = None
-
-
-def _rendered(
-    run: Reenactment, indices: range, sensor: Sensor, jobs: int
-) -> Iterator[ReenactedFrame]:
-    """Frames in order."""
-    if jobs <= 1:
-        yield from (reenacted_frame(run, index, sensor) for index in indices)
-        return
-    import multiprocessing
-
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(jobs, _start_worker, (run, sensor)) as pool:
-        yield from pool.imap(_render_in_worker, indices)
-
-
-def _start_worker(run: Reenactment, sensor: Sensor) -> None:
-    global _worker
-    import cv2
-
-    cv2.setNumThreads(1)
-    _worker = run, sensor
-
-
-def _render_in_worker(index: int) -> ReenactedFrame:
-    if _worker is None:
-        raise RuntimeError("the worker has no run: it was not started by _start_worker")
-    run, sensor = _worker
+def _rendered(state: tuple[Reenactment, Sensor], index: int) -> ReenactedFrame:
+    run, sensor = state
     return reenacted_frame(run, index, sensor)
 
 
@@ -293,14 +223,14 @@ def _scene(world: World, seed: int) -> Scene:
     return scene._replace(floor_light=light, side_light=side)
 
 
-def _remembered(run: Reenactment, index: int) -> NDArray[np.bool_]:
+def _remembered(run: Reenactment, index: int) -> BoolArray:
     """Discs that are reported some frames before or after: what walls hide is not shown."""
     near = run.frames[max(index - _REMEMBERED_FRAMES, 0) : index + _REMEMBERED_FRAMES + 1]
     ids = {i for frame in near for row in frame.circles for i in row.ids}
     return np.isin(run.world.disc_ids, list(ids))
 
 
-def _showing(scene: Scene, shown: NDArray[np.bool_]) -> Scene:
+def _showing(scene: Scene, shown: BoolArray) -> Scene:
     """The same floor with some of its discs."""
     keep = shown[scene.mark_items]
     counted = np.concatenate([[0], np.cumsum(keep)])
@@ -316,7 +246,7 @@ def _motion(before: FloatArray, after: FloatArray) -> FloatArray:
 
 
 def _qualities(
-    run: Reenactment, index: int, grey: NDArray[np.uint8], discs: list[SeenDisc]
+    run: Reenactment, index: int, grey: ByteArray, discs: list[SeenDisc]
 ) -> tuple[tuple[float, float, float], ...]:
     """Distance, shipped and rendered quality of shipped rows whose disc is in view."""
     found = []

@@ -9,10 +9,72 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
+from tools.arrays import FloatArray
+
+
+@nb.njit(cache=True)
+def polygon_coverage(x: FloatArray, y: FloatArray, width: int, height: int) -> FloatArray:
+    """Share of every grid cell's area inside a closed polygon, exact.
+
+    Each edge adds the signed area to its right, cell by cell; the running sum along a row is the
+    coverage (the accumulation buffer of scan-line font rasterisers).
+
+    `x`, `y` (N,); returns (height, width).
+    """
+    deltas = np.zeros((height, width + 2))
+    count = x.shape[0]
+    for k in range(count):
+        x0, y0 = x[k], y[k]
+        x1, y1 = x[(k + 1) % count], y[(k + 1) % count]
+        if y0 == y1:
+            continue
+        sense = 1.0
+        if y0 > y1:
+            x0, y0, x1, y1 = x1, y1, x0, y0
+            sense = -1.0
+        slope = (x1 - x0) / (y1 - y0)
+        for row in range(max(int(np.floor(y0)), 0), min(int(np.ceil(y1)), height)):
+            top = max(y0, float(row))
+            bottom = min(y1, float(row + 1))
+            if bottom <= top:
+                continue
+            xa = x0 + slope * (top - y0)
+            xb = x0 + slope * (bottom - y0)
+            left, right = min(xa, xb), max(xa, xb)
+            rise = sense * (bottom - top)
+            first, last = int(np.floor(left)), int(np.floor(right))
+            if first == last or right == left:
+                # Within one column: the cell gets the trapezoid to the right of the edge.
+                share = first + 1.0 - 0.5 * (left + right)
+                deltas[row, first] += rise * share
+                deltas[row, first + 1] += rise * (1.0 - share)
+                continue
+            # Across columns: what lies right of the edge grows quadratically in the first and last
+            # column and linearly between them.
+            per_column = rise / (right - left)
+            before = 0.0
+            for column in range(first, last + 1):
+                begin, end = max(left, float(column)), min(right, column + 1.0)
+                crossed = per_column * (end - begin)
+                area = before + crossed * (column + 1.0 - 0.5 * (begin + end))
+                # `area` is the coverage of this column; the buffer holds its increments.
+                deltas[row, column] += area
+                deltas[row, column + 1] -= area
+                before += crossed
+            deltas[row, last + 1] += rise
+    coverage = np.empty((height, width))
+    for row in range(height):
+        total = 0.0
+        for column in range(width):
+            total += deltas[row, column]
+            coverage[row, column] = total
+    return coverage
+
 
 _OUTLINE_POINTS = 2048
 _BLUR_REACH = 5.0  # standard deviations after which the blur is cut off
@@ -22,12 +84,9 @@ _WHITEST = 255
 class DiscCrop(NamedTuple):
     """The part of an image round one disc."""
 
-    grey: NDArray[Any]
-    """(H, W) grey values: uint8 if they were rounded, else float64."""
-    u0: int
-    """Column of the image that is the crop's first."""
-    v0: int
-    """Row of the image that is the crop's first."""
+    grey: NDArray[Any]  # (H, W) grey values: uint8 if they were rounded, else float64.
+    u0: int  # Column of the image that is the crop's first.
+    v0: int  # Row of the image that is the crop's first.
 
 
 def render_disc(
@@ -121,7 +180,7 @@ def render_disc(
     return DiscCrop(np.clip(np.rint(grey), 0, _WHITEST).astype(np.uint8), u0, v0)
 
 
-def _outline(camera: Camera, floor_xy: ArrayLike, radius_m: float) -> NDArray[np.float64]:
+def _outline(camera: Camera, floor_xy: ArrayLike, radius_m: float) -> FloatArray:
     """(N, 2) pixels of a circle on the floor."""
     angle = np.arange(_OUTLINE_POINTS) * (2.0 * np.pi / _OUTLINE_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -132,7 +191,7 @@ def _outline(camera: Camera, floor_xy: ArrayLike, radius_m: float) -> NDArray[np
 
 
 def _crop_bounds(
-    camera: Camera, floor_xy: ArrayLike, reach_m: float, disc: NDArray[np.float64]
+    camera: Camera, floor_xy: ArrayLike, reach_m: float, disc: FloatArray
 ) -> tuple[int, int, int, int]:
     """First and last column and row of the crop, as u0, v0, u1, v1."""
     try:
@@ -149,10 +208,8 @@ def _crop_bounds(
 
 
 def _supersampled_coverage(
-    outline: NDArray[np.float64], width: int, height: int, supersampling: int
-) -> NDArray[np.float64]:
-    from tools.simulator.kernels import polygon_coverage
-
+    outline: FloatArray, width: int, height: int, supersampling: int
+) -> FloatArray:
     # Pixel centres are integers, cell corners are the kernel's: half a pixel between them.
     x, y = ((outline + 0.5) * supersampling).T
     signed = polygon_coverage(
@@ -164,7 +221,7 @@ def _supersampled_coverage(
     return np.asarray(np.abs(signed))
 
 
-def _blurred(covered: NDArray[np.float64], sigma_u: float, sigma_v: float) -> NDArray[np.float64]:
+def _blurred(covered: FloatArray, sigma_u: float, sigma_v: float) -> FloatArray:
     """Gaussian blur; standard deviations in cells."""
     from scipy.ndimage import gaussian_filter1d
 
@@ -176,9 +233,7 @@ def _blurred(covered: NDArray[np.float64], sigma_u: float, sigma_v: float) -> ND
     return covered
 
 
-def _integrated(
-    covered: NDArray[np.float64], supersampling: int, row_aperture: float
-) -> NDArray[np.float64]:
+def _integrated(covered: FloatArray, supersampling: int, row_aperture: float) -> FloatArray:
     """Mean over each pixel's sensitive area: full width, `row_aperture` of the height."""
     height, width = (side // supersampling for side in covered.shape)
     cells = covered.reshape(height, supersampling, width, supersampling).mean(axis=3)

@@ -8,12 +8,15 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from tools.soak.processes import ProcessState, family
+from tools.soak.processes import family
 
 #: Throughput is compared between these shares of the run: before and after them, processes start
 #: and files take their places.
@@ -33,66 +36,37 @@ class SoakError(ValueError):
     """A run that did not end well, or too short a one."""
 
 
-@dataclass(frozen=True)
-class _Look:
+class _Look(NamedTuple):
     time_s: float
     frames: int
-    processes: tuple[ProcessState, ...]
-    decoding_s: float
-
-    @property
-    def processor_s(self) -> float:
-        return sum(process.processor_s for process in self.processes)
-
-    @property
-    def resident_mib(self) -> float:
-        """Of the process that hands out the frames."""
-        return self.processes[0].resident_bytes / _MIB
-
-    @property
-    def worker_mib(self) -> float:
-        """Of the largest other one."""
-        return max((p.resident_bytes for p in self.processes[1:]), default=0) / _MIB
-
-    @property
-    def descriptors(self) -> int:
-        return sum(process.descriptors for process in self.processes)
+    processor_s: float  # Of all processes.
+    resident_mib: float  # Of the process that hands out the frames.
+    worker_mib: float  # Of the largest other one.
+    descriptors: int  # Of all processes.
+    processes: int
+    decoding_s: float  # What decoding an image took of the processor just now.
 
 
 @dataclass(frozen=True)
 class SoakResult:
-    """What came of a long run.
-
-    Attributes
-    ----------
-    frames, jobs : int
-    duration_s : float
-    frames_per_s : (float, float)
-        In the first tenth and in the last one, by the clock.
-    decoding_ms : (float, float)
-        What decoding one of the images took of the processor meanwhile, in this process: how fast
-        the machine was, beside whatever else it had to do.
-    decodings_per_frame : (float, float)
-        What all processes computed for a frame, in units of that: this is compared.
-    resident_mib, worker_mib : tuple of float
-        Memory of the process that hands out the frames, and of the largest worker, at 10, 50, 90
-        and 99 % of the run.
-    descriptors : tuple of int
-        Open in all processes, at the same moments; the least of nine looks around each.
-    processes : int
-        The most that there were.
-    """
+    """What came of a long run."""
 
     frames: int
     jobs: int
     duration_s: float
-    frames_per_s: tuple[float, float]
+    frames_per_s: tuple[float, float]  # In the first tenth and in the last one, by the clock.
     decoding_ms: tuple[float, float]
+    """What decoding one of the images took of the processor meanwhile, in this process: how fast
+    the machine was, beside whatever else it had to do."""
     decodings_per_frame: tuple[float, float]
+    """What all processes computed for a frame, in units of that: this is compared."""
     resident_mib: tuple[float, ...]
+    """Memory of the process that hands out the frames, and of the largest worker, at 10, 50, 90 and
+    99 % of the run."""
     worker_mib: tuple[float, ...]
     descriptors: tuple[int, ...]
-    processes: int
+    """Open in all processes, at the same moments; the least of nine looks around each."""
+    processes: int  # The most that there were.
 
     def unmet(self) -> list[str]:
         """The demands that are not met, a sentence each."""
@@ -128,13 +102,7 @@ class SoakResult:
 
 
 def link_run(source: Path, folder: Path, frames: int) -> Path:
-    """A run folder of any length: hard links to the images of another run, over and over.
-
-    Raises
-    ------
-    SoakError
-        If the source has no images or no calibration, or is on another file system.
-    """
+    """A run folder of any length: hard links to the images of another run, over and over."""
     images = sorted((source / "images").glob("*.jpg"))
     cameras = sorted(source.glob("*.cam"))
     if not images or not cameras:
@@ -155,13 +123,7 @@ def link_run(source: Path, folder: Path, frames: int) -> Path:
 
 
 def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
-    """Work on a run by `detect all`, and watch its processes.
-
-    Raises
-    ------
-    SoakError
-        If it does not end well, or before it could be looked at often enough.
-    """
+    """Work on a run by `detect all`, and watch its processes."""
     output.mkdir()
     arguments = ["all", str(run), "-o", str(output), "--jobs", str(jobs)]
     begin_s = time.monotonic()
@@ -190,34 +152,28 @@ def _looks_at(
     """Look at the processes whenever more than so many further frames are noted in the journal."""
     looks: list[_Look] = []
     lines, place = -1, 0  # the first line is no frame
-    looked_at = 0
     while process.poll() is None:
-        try:
-            with journal.open("rb") as stream:
-                stream.seek(place)
-                content = stream.read()
-        except OSError:
-            content = b""
-        if content:
-            lines += content.count(b"\n")
-            place += len(content)
-            states = family(process.pid) if lines - looked_at > least else []
-            if states:
-                looks.append(_Look(time.monotonic(), lines, tuple(states), _decoding_s(image)))
-                looked_at = lines
+        content = b""
+        with suppress(OSError), journal.open("rb") as stream:
+            stream.seek(place)
+            content = stream.read()
+        lines += content.count(b"\n")
+        place += len(content)
+        if lines - (looks[-1].frames if looks else 0) > least and (own := family(process.pid)):
+            resident = [state.resident_bytes / _MIB for state in own]
+            looks.append(
+                _Look(
+                    time.monotonic(), lines, sum(state.processor_s for state in own), resident[0],
+                    max(resident[1:], default=0.0), sum(state.descriptors for state in own),
+                    len(own), _decoding_s(image),
+                )
+            )  # fmt: skip
         time.sleep(_POLL_EVERY_S)
     return looks
 
 
-def _staying_descriptors(looks: list[_Look], moment: int) -> int:
-    """Open descriptors around a look, without an image's that happened to be read just then."""
-    return min(look.descriptors for look in looks[max(moment - 4, 0) : moment + 5])
-
-
 def _decoding_s(image: bytes) -> float:
     """What decoding an image takes of the processor; the first of some is not counted."""
-    import cv2
-
     content = np.frombuffer(image, np.uint8)
     times_s = []
     for _ in range(_DECODINGS):
@@ -231,33 +187,36 @@ def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> So
     done = np.array([look.frames for look in looks], float)
     if len(looks) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
         raise SoakError(f"{frames} frames: too few to be looked at, expected more")
+    columns = _Look(*np.array(looks, float).T)
 
-    def rate(values: list[float], share: tuple[float, float]) -> float:
+    def per_frame(values: Any, share: tuple[float, float]) -> float:
         begin, end = np.interp([share[0] * frames, share[1] * frames], done, values)
-        return float((share[1] - share[0]) * frames / (end - begin))
+        return float((end - begin) / ((share[1] - share[0]) * frames))
 
     def decoding_s(share: tuple[float, float]) -> float:
         meanwhile = (done >= share[0] * frames) & (done <= share[1] * frames)
-        return float(np.mean([look.decoding_s for look, chosen in zip(looks, meanwhile) if chosen]))
+        return float(np.mean(np.asarray(columns.decoding_s)[meanwhile]))
 
-    times_s = [look.time_s for look in looks]
-    processor_s = [look.processor_s for look in looks]
-    decodings_s = (decoding_s(_FIRST), decoding_s(_LAST))
+    decoding = decoding_s(_FIRST), decoding_s(_LAST)
+    computed = [per_frame(columns.processor_s, share) for share in (_FIRST, _LAST)]
     moments = [int(np.argmax(done >= share * frames)) for share in (0.1, 0.5, 0.9)]
     moments.append(int(np.argmax(done >= min(0.99 * frames, done[-1]))))
-    chosen = [looks[moment] for moment in moments]
     return SoakResult(
         frames=frames,
         jobs=jobs,
         duration_s=duration_s,
-        frames_per_s=(rate(times_s, _FIRST), rate(times_s, _LAST)),
-        decoding_ms=(1e3 * decodings_s[0], 1e3 * decodings_s[1]),
-        decodings_per_frame=(
-            1.0 / rate(processor_s, _FIRST) / decodings_s[0],
-            1.0 / rate(processor_s, _LAST) / decodings_s[1],
+        frames_per_s=(
+            1.0 / per_frame(columns.time_s, _FIRST),
+            1.0 / per_frame(columns.time_s, _LAST),
         ),
-        resident_mib=tuple(look.resident_mib for look in chosen),
-        worker_mib=tuple(look.worker_mib for look in chosen),
-        descriptors=tuple(_staying_descriptors(looks, moment) for moment in moments),
-        processes=max(len(look.processes) for look in looks),
+        decoding_ms=(1e3 * decoding[0], 1e3 * decoding[1]),
+        decodings_per_frame=(computed[0] / decoding[0], computed[1] / decoding[1]),
+        resident_mib=tuple(looks[moment].resident_mib for moment in moments),
+        worker_mib=tuple(looks[moment].worker_mib for moment in moments),
+        # The least around a moment: an image may be read just then.
+        descriptors=tuple(
+            min(look.descriptors for look in looks[max(moment - 4, 0) : moment + 5])
+            for moment in moments
+        ),
+        processes=max(look.processes for look in looks),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import multiprocessing
 import os
 import subprocess
@@ -10,9 +9,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 from tools.soak.long_run import SoakError, link_run
 from tools.soak.processes import marked
@@ -24,26 +24,18 @@ _TRACKER_S = 10.0
 
 @dataclass(frozen=True)
 class ShortRuns:
-    """What many short runs left behind.
-
-    Attributes
-    ----------
-    runs : int
-    processes, shared, temporary, hidden, caches : int
-        Processes that still run; pieces of shared memory; files in the folder for temporary
-        files; hidden files beside the results; and files that the cache of tables has more of
-        than after the first run.
-    different : int
-        Runs whose results were not those of the first.
-    """
+    """What many short runs left behind."""
 
     runs: int
     processes: int
+    """Processes that still run; pieces of shared memory; files in the folder for temporary files;
+    hidden files beside the results; and files that the cache of tables has more of than after the
+    first run."""
     shared: int
     temporary: int
     hidden: int
     caches: int
-    different: int
+    different: int  # Runs whose results were not those of the first.
 
     def unmet(self) -> list[str]:
         """What there should be none of, a sentence each."""
@@ -70,42 +62,20 @@ class ShortRuns:
 def repeat_short_runs(
     source: Path, folder: Path, runs: int, jobs: int, *, warm: bool = False
 ) -> ShortRuns:
-    """Carry out `detect all` on a few frames again and again.
-
-    Parameters
-    ----------
-    source : path
-        A run folder whose images are repeated.
-    folder : path
-        Where the run and its results are made.
-    runs, jobs : int
-        So many runs, every second one by so many processes.
-    warm : bool
-        Fork each run from a process that has all kernels loaded, which is twenty times as fast;
-        none has workers.
-
-    Raises
-    ------
-    SoakError
-        If a run does not end well.
-    """
+    """Carry out `detect all` on a few frames again and again."""
     run = link_run(source, folder / "short", _FRAMES)
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
         path.mkdir()
     mark = f"REDETECT_SOAK={folder}"
-    added = {
-        "REDETECT_SOAK": str(folder),
-        "TMPDIR": str(temporary),
-        "REDETECT_CACHE": str(caches),
-    }
+    added = {"REDETECT_SOAK": str(folder), "TMPDIR": str(temporary), "REDETECT_CACHE": str(caches)}
     arguments = ["all", str(run), "-o", str(output), "--force", "--jobs"]
     first: dict[str, bytes] = {}
     cached = different = 0
     shared = _shared()
     with _environment(added):
         if warm:
-            _warm_up([*arguments, "1"])
+            _command([*arguments, "1"])  # loads all that is needed
         for number in range(runs):
             if warm:
                 _forked([*arguments, "1"])
@@ -129,38 +99,16 @@ def repeat_short_runs(
 @contextmanager
 def _environment(added: dict[str, str]) -> Iterator[None]:
     """Variables of the environment for the time of a block."""
-    before = dict(os.environ)
-    os.environ.update(added)
-    tempfile.tempdir = None  # look at the variable again
-    try:
+    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
         yield
-    finally:
-        for name in added:
-            os.environ.pop(name)
-        os.environ.update(before)
-        tempfile.tempdir = None
 
 
 def _started(arguments: list[str]) -> None:
     """Carry out a command in a new process."""
-    done = subprocess.run(
-        [sys.executable, "-m", "detect", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-m", "detect", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
-
-
-def _warm_up(arguments: list[str]) -> None:
-    """Load whatever a command needs into this process."""
-    from detect.cli import main
-
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:
-        code = main(arguments)
-    if code != 0:
-        raise SoakError(f"detect ended with {code}: {said.getvalue().strip()[-500:]}")
 
 
 def _forked(arguments: list[str]) -> None:
@@ -177,7 +125,8 @@ def _command(arguments: list[str]) -> None:
 
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
         code = main(arguments)
-    sys.exit(code)
+    if code != 0:
+        sys.exit(code)
 
 
 def _shared() -> set[str]:

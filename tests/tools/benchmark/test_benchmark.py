@@ -5,16 +5,22 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from camera import write_camera
 from detect.run import open_run
-from tools.benchmark.cli import main
-from tools.benchmark.errors import BenchmarkError
-from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, RESPONSE
-from tools.benchmark.material import repeated_run
-from tools.benchmark.runs import commands, measure_runs, perform
+from tools.benchmark.__main__ import main, measure_runs
+from tools.benchmark.functions import (
+    ALL,
+    CIRCLES,
+    DECODING,
+    KERNEL,
+    LINES,
+    RESPONSE,
+    commands,
+    perform,
+)
+from tools.benchmark.material import BenchmarkError, repeated_run
 
 
 @pytest.fixture
@@ -26,12 +32,11 @@ def short_run(project_root: Path, tmp_path: Path) -> Path:
 def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_path: Path) -> None:
     output = tmp_path / "output"
     output.mkdir()
-    all_commands = commands(short_run, output)
-    frames, decoding, reading, seconds = measure_runs(all_commands, short_run, 1)
-    assert frames == 2
-    assert decoding.shape == reading.shape == (1,)
-    assert set(seconds) == set(all_commands)
-    assert all(np.all(taken > 0.0) for taken in seconds.values())
+    every = [(name, 1) for name in commands(short_run, output)]
+    times = measure_runs(short_run, every, output, 1)
+    assert [(time.command, time.jobs) for time in times] == every
+    assert all(time.frames == 2 for time in times)
+    assert all(time.images_per_s.median > 0.0 for time in times)
     written = {path.name for path in output.iterdir()}
     assert {"published.circles", "detected.circles", "detected.lines", "detected.tilt"} <= written
 
@@ -65,40 +70,35 @@ def test_the_command_measures_everything(
     short_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = {kind: tmp_path / f"speed.{kind}" for kind in ("json", "png", "md")}
-    readme = tmp_path / "README.md"
-    readme.write_text("<!-- benchmark begins -->\n<!-- benchmark ends -->\n")
     arguments = [
         "--run", str(short_run), "--photographs", str(short_run / "images"),
         "--pictures", "1", "--rounds", "1", "--run-rounds", "1", "--run-frames", "3",
         "--factors", "0.5", "1", "--landmarks", "0", "3", "--frames", "1", "2", "--jobs", "1",
         "--json", str(files["json"]), "--plot", str(files["png"]), "--markdown", str(files["md"]),
-        "--readme", str(readme),
     ]  # fmt: skip
     assert main(arguments) == 0
     assert "decoding" in capsys.readouterr().out
 
     document = json.loads(files["json"].read_text())
-    assert [kind["kind"] for kind in document["kinds"]] == ["demo", "noise", "photographs"]
-    for kind in document["kinds"]:
-        names = [function["name"] for function in kind["functions"]]
+    times = document["times"]
+    assert all(time["ms"]["median"] > 0.0 for time in times)
+    for case in ("demo", "noise", "photographs"):
+        names = [t["function"] for t in times if (t["part"], t["case"]) == ("images", case)]
         assert len(set(names)) == len(names)
         assert {DECODING, KERNEL, CIRCLES, RESPONSE, LINES, ALL} <= set(names)
         assert {"cv2.HoughCircles", "cv2.SimpleBlobDetector", "skimage hough_circle"} <= set(names)
-        assert all(function["ms"]["median"] > 0.0 for function in kind["functions"])
-        for compared in kind["comparisons"]:
-            assert {compared["slower"], compared["faster"]} <= set(names)
-    assert [point["amount"] for point in document["by_megapixels"]] == pytest.approx(
-        [384 * 144 / 1e6, 768 * 288 / 1e6]
-    )
-    assert [point["amount"] for point in document["by_discs"]] == [0, 3]
-    assert [(times["frames"], times["jobs"]) for times in document["by_frames"]] == [(1, 1), (2, 1)]
-    assert [times["command"] for times in document["runs"]] == [*commands(short_run, tmp_path)]
-    for times in document["runs"]:
-        assert times["frames"] == 3
+    sizes = dict.fromkeys(float(t["case"]) for t in times if t["part"] == "megapixels")
+    assert list(sizes) == pytest.approx([384 * 144 / 1e6, 768 * 288 / 1e6])
+    for part in ("discs", "verticals"):
+        assert {t["case"] for t in times if t["part"] == part} == {"0", "3"}
+    whole = [run for run in document["runs"] if run["frames"] == 3]
+    assert [run["command"] for run in whole] == [*commands(short_run, tmp_path)]
+    growing = [(run["frames"], run["jobs"]) for run in document["runs"] if run["frames"] < 3]
+    assert growing == [(1, 1), (2, 1)]
+    for run in document["runs"]:
         for kind in ("decoding", "reading"):
-            alone = times[f"{kind}_images_per_s"]["median"]
-            share = times[f"share_of_{kind}"]["median"]
-            assert times["images_per_s"]["median"] == pytest.approx(share * alone)
+            alone = run[f"{kind}_images_per_s"]["median"]
+            share = run[f"share_of_{kind}"]["median"]
+            assert run["images_per_s"]["median"] == pytest.approx(share * alone)
     assert files["png"].read_bytes().startswith(b"\x89PNG")
     assert KERNEL in files["md"].read_text()
-    assert KERNEL in readme.read_text()

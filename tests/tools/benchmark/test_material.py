@@ -14,17 +14,19 @@ from detect.lines import detect_lines
 from detect.run import open_run
 from detect.settings import CircleSettings
 from lut import build_disc_table, build_vertical_table
-from tools.benchmark.errors import BenchmarkError
 from tools.benchmark.material import (
+    BenchmarkError,
+    contents_of,
+    disc_places,
+    floor_with_discs,
     noise_pictures,
     photograph_pictures,
     repeated_run,
     run_pictures,
     scaled_camera,
     scaled_picture,
+    wall_with_edges,
 )
-from tools.benchmark.painted import disc_places, floor_with_discs, wall_with_edges
-from tools.benchmark.runs import contents_of
 
 
 def test_a_scaled_camera_sees_the_same_directions(published_camera: Camera) -> None:

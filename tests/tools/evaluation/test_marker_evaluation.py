@@ -9,29 +9,39 @@ import cv2
 import numpy as np
 import pytest
 
-from tools.evaluation.cli import main
-from tools.evaluation.markers import offences, score_frames, search_photographs
-from tools.evaluation.markers_detectors import OURS, PEERS, Found, detector_of, known_to_opencv
-from tools.evaluation.markers_report import bins_lines, counts_lines, statistics_picture
-from tools.evaluation.markers_scoring import (
+from tools.evaluation.__main__ import main
+from tools.evaluation.markers import (
+    DECODING,
+    GIVEN_WIDTH,
+    SEARCH,
+    offences,
+    score_frames,
+    search_photographs,
+    time_searches,
+    timing_lines,
+)
+from tools.evaluation.markers_statistics import (
+    BINS,
     COLUMNS,
     FOUND,
     MISIDENTIFIED,
     MISSED,
+    OURS,
+    PEERS,
+    Found,
     Outcome,
     ScoredFrame,
+    binned,
+    bins_json,
+    bins_lines,
+    counts_lines,
+    detector_of,
+    known_to_opencv,
     score_frame,
+    statistics_picture,
     table_of,
 )
-from tools.evaluation.markers_statistics import BINS, binned, bins_json
-from tools.evaluation.markers_timing import (
-    DECODING,
-    GIVEN_WIDTH,
-    SEARCH,
-    time_searches,
-    timing_lines,
-)
-from tools.simulator.markers.sampling import SampleSettings, sample_frame
+from tools.simulator.markers.samples import SampleSettings, sample_frame
 from tools.simulator.markers.truth import MarkerTruth
 
 SQUARE = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]])
@@ -139,9 +149,9 @@ def test_opencv_is_measured_as_it_is() -> None:
     table = table_of(score_frames(settings, PEERS, frames=6, seed=3))
     offsets = {}
     for name in PEERS:
-        found = table.status[name] == FOUND
+        found = table.outcomes[name].status == FOUND
         assert found.mean() > 0.7
-        offsets[name] = np.median(table.errors_px[name][found], axis=(0, 1))
+        offsets[name] = np.median(table.outcomes[name].errors_px[found], axis=(0, 1))
     # The AprilTag code's zero is half a pixel off.
     np.testing.assert_allclose(offsets["aruco apriltag"], 0.5, atol=0.15)
     np.testing.assert_allclose(offsets["apriltag - 0.5"], 0.0, atol=0.15)

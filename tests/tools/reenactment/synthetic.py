@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect.landmarks import Frame, Step, circle_landmarks
-from tools.reenactment.model import Geometry, odometry_residuals
+from redetect.slam.models.mounted_discs import Geometry
+from tools.reenactment.fitting import odometry_residuals
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ def make_run(camera: Camera, seed: int, *, tilt_deg: float = 0.0, noisy: bool = 
     geometry = _geometry(camera, rng, tilt_deg)
     disc_ids = np.arange(len(geometry.disc_xy), dtype=np.int64) * 3 + 5
     nothing = np.zeros((len(geometry.poses), 3))
-    steps, _, _ = odometry_residuals(geometry.poses, nothing)
+    steps = odometry_residuals(geometry.poses, nothing)
     if noisy:
         steps = steps + rng.normal(size=steps.shape) * STEP_SIGMA
     frames = []

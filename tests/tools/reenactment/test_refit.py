@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from redetect.slam.models.mounted_discs import Geometry
 from tests.tools.reenactment.synthetic import MOUNTING_HEIGHT, MOUNTING_VECTOR, make_run
-from tools.reenactment.model import Geometry, nominal_geometry
-from tools.reenactment.objective import Weighting, cost, normal_equations, row_distances
+from tools.reenactment.fitting import RefitError, Weighting, nominal_geometry, refit, row_distances
 from tools.reenactment.recording import Recording, recording_of_frames, start_from_odometry
-from tools.reenactment.refit import RefitError, moved, refit
 
 
 def mounting_error(geometry: Geometry, truth: Geometry) -> NDArray[np.float64]:
@@ -40,20 +39,16 @@ def test_without_noise_the_truth_comes_back_exactly(published_camera: Camera, me
     assert fit.cost < 1e-6
 
 
-def test_mounting_is_as_far_off_as_predicted(published_camera: Camera) -> None:
-    squared, chi_squared = [], []
-    for seed in range(12):
+def test_the_cost_is_chi_squared(published_camera: Camera) -> None:
+    chi_squared = []
+    for seed in range(6):
         run = make_run(published_camera, seed)
         recording = recording_of_frames(published_camera, run.frames)
         fit = refit(
             published_camera, recording, odometry_start(published_camera, recording), Weighting()
         )
-        error = mounting_error(fit.geometry, run.geometry)
-        squared.append(error @ np.linalg.solve(fit.mounting_covariance, error))
         freedom = 2 * len(recording.disc) - 2 * len(recording.disc_ids) - 4
         chi_squared.append(fit.cost / freedom)
-    # 48 degrees of freedom: the 99.9 % band of chi squared is 21.4 to 84.0.
-    assert 21.4 < np.sum(squared) < 84.0
     np.testing.assert_allclose(chi_squared, 1.0, atol=0.15)
 
 
@@ -66,7 +61,6 @@ def test_without_the_mounting_as_unknown_it_stays_and_the_fit_is_bad(
     fixed = refit(published_camera, recording, start, Weighting(mounting=False))
     free = refit(published_camera, recording, start, Weighting())
     np.testing.assert_array_equal(fixed.geometry.rotation, published_camera.rotation)
-    assert fixed.mounting_covariance.shape == (0, 0)
     assert fixed.cost > 1.3 * free.cost
 
 
@@ -133,34 +127,6 @@ def test_running_out_of_steps_is_an_error(published_camera: Camera) -> None:
     start = odometry_start(published_camera, recording)
     with pytest.raises(RefitError, match="within 1 steps"):
         refit(published_camera, recording, start, Weighting(), max_steps=1)
-
-
-@pytest.mark.parametrize("metric", ["floor", "pixel"])
-@pytest.mark.parametrize("robust_scale", [None, 3.0])
-def test_gradient_is_that_of_the_cost(
-    published_camera: Camera, metric: str, robust_scale: float | None
-) -> None:
-    run = make_run(published_camera, 8, tilt_deg=0.5)
-    recording = recording_of_frames(published_camera, run.frames)
-    weighting = Weighting(
-        metric="floor" if metric == "floor" else "pixel",
-        robust_scale=robust_scale,
-        odometry_scale=2.0,
-        tilt_sigma=0.01,
-    )
-    rng = np.random.default_rng(9)
-    equations = normal_equations(published_camera, recording, run.geometry, weighting)
-    for _ in range(3):
-        step, mounting = rng.normal(size=equations.gradient.shape), rng.normal(size=4)
-        slope = 2.0 * (equations.gradient @ step + equations.border_gradient @ mounting)
-        h = 1e-7
-        ahead, behind = (
-            cost(
-                published_camera, recording, moved(run.geometry, s * step, s * mounting), weighting
-            )
-            for s in (h, -h)
-        )
-        assert (ahead - behind) / (2.0 * h) == pytest.approx(slope, rel=1e-4, abs=1e-2)
 
 
 def test_the_synthetic_camera_is_really_mounted_otherwise(published_camera: Camera) -> None:

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Scanner
-from tools.simulator.laser.clock import RobotClock, ptpd_lines
-from tools.simulator.laser.kernels import cast_on_discs, cast_on_robot, cast_on_walls
-from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
-from tools.simulator.laser.people import LEG_RADIUS_M, Passer
-from tools.simulator.laser.route import Curve, Route, Stop
+from tools.simulator.laser.measuring import (
+    Scene,
+    cast_on_discs,
+    cast_on_robot,
+    cast_on_walls,
+    compose,
+    measured,
+    true_ranges,
+)
+from tools.simulator.laser.motion import Curve, RobotClock, Route, Stop, measured_path, ptpd_lines
 from tools.simulator.laser.session import plan_session, sides_of
 from tools.simulator.laser.settings import (
     DrivingLimits,
@@ -26,8 +31,7 @@ from tools.simulator.laser.settings import (
     ReadingErrors,
     WheelErrors,
 )
-from tools.simulator.laser.site import clearance, rectangle
-from tools.simulator.laser.wheels import measured_path
+from tools.simulator.laser.site import LEG_RADIUS_M, Passer, clearance, rectangle
 
 FloatArray = NDArray[np.float64]
 

@@ -17,21 +17,20 @@ from redetect.groundtruth.lasers.scans import find_scans, read_scans
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.groundtruth.validation.fiducials import read_distances, read_survey
 from redetect.landmarks import wrap_angle
-from tools.simulator.cli import main
+from tools.simulator.__main__ import main
 from tools.simulator.laser.measuring import compose
-from tools.simulator.laser.people import Passer, legs_of
 from tools.simulator.laser.session import EPOCH_S, SessionPlan, plan_session, sides_of
-from tools.simulator.laser.session_files import write_session
-from tools.simulator.laser.settings import Faults, LaserSettings
-from tools.simulator.laser.site import is_covered
-from tools.simulator.laser.streams import (
+from tools.simulator.laser.session_files import (
     camera_covariances,
     camera_stream,
     exact_poses,
     measured_distances,
     odometry_stream,
     survey_of,
+    write_session,
 )
+from tools.simulator.laser.settings import Faults, LaserSettings
+from tools.simulator.laser.site import Passer, is_covered, legs_of
 
 FloatArray = NDArray[np.float64]
 

@@ -12,23 +12,26 @@ from scipy.special import erf
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
-from tools.simulator.kernels import polygon_coverage
-from tools.simulator.markers.imaging import Imaging, exact_grey, grey_image, uneven_light
+from tools.arrays import FloatArray
 from tools.simulator.markers.kernels import project_point
-from tools.simulator.markers.placing import random_pose
-from tools.simulator.markers.prints import (
+from tools.simulator.markers.rendering import (
+    Imaging,
+    exact_grey,
+    grey_image,
+    pixel_rays,
+    render_light,
+    surface_arrays,
+    uneven_light,
+)
+from tools.simulator.markers.samples import random_pose, sample_cameras
+from tools.simulator.markers.surface import (
+    Surface,
+    Texture,
+    box_sides,
     marker_surface,
     marker_texture,
     near_pattern,
     pattern_distance,
-)
-from tools.simulator.markers.rendering import pixel_rays, render_light
-from tools.simulator.markers.sampling import sample_cameras
-from tools.simulator.markers.surface import (
-    FloatArray,
-    Surface,
-    Texture,
-    box_sides,
     plain,
     pose_of,
     square_corners,
@@ -39,6 +42,7 @@ from tools.simulator.markers.truth import (
     slant_deg,
     visible_shares,
 )
+from tools.simulator.single_disc import polygon_coverage
 
 WIDTH, HEIGHT = 320, 240
 
@@ -323,20 +327,24 @@ def test_random_poses_have_the_width_and_slant_asked_for(camera: Camera) -> None
         np.testing.assert_allclose(camera.project(pose[:3, 3]), pixel, atol=1e-6)
 
 
+def _shares(camera: Camera, surfaces: list[Surface]) -> tuple[float, float]:
+    return visible_shares(camera, surfaces, 0, 0.2, surface_arrays(camera, surfaces))
+
+
 def test_visible_share(pinhole: Camera) -> None:
     card = marker_surface(marker_dictionary("rawseeds"), 5, 0.2, _facing(0.0, 0.0, 1.0))
-    assert visible_shares(pinhole, [card], 0, 0.2) == (1.0, 1.0)
+    assert _shares(pinhole, [card]) == (1.0, 1.0)
     half = Surface(_facing(0.25, 0.0, 0.999), 0.5, 0.5, plain(0.5), 0.5)
-    visible, rim = visible_shares(pinhole, [card, half], 0, 0.2)
+    visible, rim = _shares(pinhole, [card, half])
     assert visible == pytest.approx(0.5, abs=0.03)
     assert rim == pytest.approx(0.5, abs=0.03)
     # Half of it beyond the image's left border, and one that turns its back.
     x = float(pinhole.undistort([-0.5, 120.0])[0])
     cut = marker_surface(marker_dictionary("rawseeds"), 5, 0.2, _facing(x, 0.0, 1.0))
-    assert visible_shares(pinhole, [cut], 0, 0.2)[0] == pytest.approx(0.5, abs=0.03)
+    assert _shares(pinhole, [cut])[0] == pytest.approx(0.5, abs=0.03)
     turned = pose_of([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0])
     away = marker_surface(marker_dictionary("rawseeds"), 5, 0.2, turned)
-    assert visible_shares(pinhole, [away], 0, 0.2) == (0.0, 0.0)
+    assert _shares(pinhole, [away]) == (0.0, 0.0)
 
 
 def test_near_patterns_are_in_no_dictionary() -> None:

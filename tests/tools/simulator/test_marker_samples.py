@@ -12,12 +12,15 @@ import pytest
 
 from camera import read_camera
 from detect.markers.dictionaries import marker_dictionary
-from tools.simulator.cli import main
-from tools.simulator.markers.clutter import THINGS, near_marker, thing
-from tools.simulator.markers.prints import marker_texture, texture_distance
-from tools.simulator.markers.sample_files import sample_frames
-from tools.simulator.markers.sampling import SampleSettings, sample_cameras, sample_frame
-from tools.simulator.markers.surface import Texture
+from tools.simulator.__main__ import main
+from tools.simulator.markers.samples import (
+    SampleSettings,
+    sample_cameras,
+    sample_frame,
+    sample_frames,
+)
+from tools.simulator.markers.surface import Texture, marker_texture, texture_distance
+from tools.simulator.markers.things import THINGS, near_marker, thing
 from tools.simulator.markers.truth import marker_corners, mean_side_px, slant_deg
 
 SETTINGS = SampleSettings(width=320, height=240, width_px=(12.0, 90.0))

@@ -23,7 +23,7 @@ from redetect.groundtruth.markers.calibration import read_network, read_rig
 from redetect.groundtruth.markers.chain import ChainPoints, project_chain
 from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
-from tools.simulator.cli import main
+from tools.simulator.__main__ import main
 from tools.simulator.markers.calibration_set import (
     DOUBLE,
     WORLD,
@@ -31,23 +31,21 @@ from tools.simulator.markers.calibration_set import (
     first_from_second,
     write_calibration_set,
 )
-from tools.simulator.markers.demo import DEMO
-from tools.simulator.markers.errors import (
-    CalibrationErrors,
-    disturbed_network,
-    disturbed_rig,
-)
-from tools.simulator.markers.imaging import Imaging, grey_image
-from tools.simulator.markers.rendering import render_light
-from tools.simulator.markers.robot import facing_pose, robot_rig
+from tools.simulator.markers.rendering import Imaging, grey_image, render_light
+from tools.simulator.markers.room import facing_pose, robot_rig
 from tools.simulator.markers.session import (
+    DEMO,
+    CalibrationErrors,
     SessionPlan,
     SessionSettings,
+    SessionWriter,
+    disturbed_network,
+    disturbed_rig,
     plan_session,
     random_for,
     view_frame,
+    write_session,
 )
-from tools.simulator.markers.session_files import write_session
 
 SMALL = SessionSettings(
     name="small", seed=2, cameras=2, area_m=(2.4, 2.0), width=640, height=480, references=2,
@@ -58,7 +56,7 @@ SMALL = SessionSettings(
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("session") / "small"
-    assert write_session(SMALL, path, image_format="png") == 8
+    assert write_session(SMALL, path, SessionWriter(image_format="png")) == 8
     return path
 
 
@@ -222,7 +220,7 @@ def test_errors_have_the_covariance_that_the_files_state() -> None:
 
 def test_images_do_not_depend_on_the_errors_in_the_files(tmp_path: Path, folder: Path) -> None:
     errors = CalibrationErrors(network_m=0.05, rig_deg=1.0, focal=0.01)
-    write_session(SMALL, tmp_path / "small", errors=errors, image_format="png")
+    write_session(SMALL, tmp_path / "small", SessionWriter(errors, "png"))
     for path in (folder / "a" / "images").iterdir():
         assert path.read_bytes() == (tmp_path / "small" / "a" / "images" / path.name).read_bytes()
     truths = [json.loads((f / "truth.json").read_text()) for f in (folder, tmp_path / "small")]
@@ -250,7 +248,7 @@ def test_rigs_boards_look_outward_and_differ_from_robot_to_robot() -> None:
 @pytest.mark.long
 def test_calibration_set(tmp_path: Path) -> None:
     plan = plan_session(SMALL)
-    count = write_calibration_set(plan, tmp_path, image_format="png")
+    count = write_calibration_set(plan, tmp_path, SessionWriter(image_format="png"))
     content = json.loads((tmp_path / "network" / "boards.json").read_text())
     truth = json.loads((tmp_path / "network" / "truth.json").read_text())["boards"]
     assert count == 48 + len(truth)

@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.landmarks import Step, parse_record
-from tools.simulator.drive import DriveStyle, drive, robot_tilt
-from tools.simulator.odometry import joined_steps, measured_steps, step_covariance, step_record
-from tools.simulator.poses import relative_pose
+from tools.simulator.driving import (
+    DriveStyle,
+    drive,
+    joined_steps,
+    measured_steps,
+    relative_pose,
+    robot_tilt,
+    step_covariance,
+    step_record,
+)
 
 PRINTED_STEPS = [
     "STEP e.0067 0.00391 -0.15602 -0.00218 0.000014424957 0.000000041534 0.000012538057 "

@@ -7,20 +7,22 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.construction import (
+from tools.simulator.driving import tilted_camera, world_from_robot, world_to_robot
+from tools.simulator.frame_kernels import camera_ray
+from tools.simulator.ray_kernels import nearest_quad, points_visible
+from tools.simulator.renderer import Light, optics_of, render_light, smeared
+from tools.simulator.scene import (
     Construction,
+    Flooring,
     FloorMark,
     Look,
+    Mark,
+    Scene,
     flooring,
     make_scene,
     raster_shape,
 )
-from tools.simulator.frame.kernels import camera_ray
-from tools.simulator.poses import tilted_camera, world_from_robot, world_to_robot
-from tools.simulator.renderer import Light, optics_of, render_light, smeared
-from tools.simulator.scene import Flooring, Mark, Scene
 from tools.simulator.single_disc import render_disc
-from tools.simulator.tracing.kernels import nearest_quad, points_visible
 
 EXTENT = (-12.0, -12.0, 12.0, 12.0)
 WHITE, GREY = 1.0, 0.2

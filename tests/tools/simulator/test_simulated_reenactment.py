@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from camera import Camera, write_camera
 from redetect.landmarks import CircleLandmark, Frame, read_frames, write_frames
 from tools.reenactment.world import World, write_world
-from tools.simulator.odometry import step_record
-from tools.simulator.poses import relative_pose, with_mounting, world_to_robot
+from tools.simulator.driving import relative_pose, step_record, with_mounting, world_to_robot
 from tools.simulator.reenact import (
     REENACTED_SENSOR,
     prepare,
@@ -23,7 +22,7 @@ from tools.simulator.reenact import (
     true_camera,
     write_reenactment,
 )
-from tools.simulator.run_folder import SIMULATED
+from tools.simulator.runs import SIMULATED
 
 PREFIXES = ["run.0000", "run.0001", "run.0002", "run.0003"]
 DISC_XY = np.array([[0.4, -1.8], [-0.6, -2.2], [0.1, -3.1], [8.0, 8.0]])

@@ -13,12 +13,10 @@ from scipy.stats import chi2
 
 from camera import Camera, read_camera
 from redetect.landmarks import read_frames
-from tools.simulator.cli import main
-from tools.simulator.demo import DEMO
+from tools.simulator.__main__ import main
+from tools.simulator.driving import tilted_camera, world_to_robot
 from tools.simulator.observation import published_covariance
-from tools.simulator.plan import RunPlan, RunSettings, plan_run
-from tools.simulator.poses import tilted_camera, world_to_robot
-from tools.simulator.run_folder import render_frame, write_rows
+from tools.simulator.runs import DEMO, RunPlan, RunSettings, plan_run, render_frame, write_rows
 
 SETTINGS = RunSettings(name="sim", frames=40, seed=3, discs=25, lookalikes=10)
 
@@ -219,25 +217,11 @@ def test_demo_frames_come_out_again(demo_folder: Path) -> None:
 def test_existing_run_is_not_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["discs", str(tmp_path / "discs.npz"), "--count", "3"]
+    arguments = ["rows", str(tmp_path / "run"), "--frames", "5", "--discs", "4"]
     assert main(arguments) == 0
-    first = (tmp_path / "discs.npz").read_bytes()
+    first = (tmp_path / "run" / "map.circles").read_bytes()
     capsys.readouterr()
     assert main(arguments) == 1
     assert "exists already" in capsys.readouterr().err
     assert main([*arguments, "--force"]) == 0
-    assert (tmp_path / "discs.npz").read_bytes() == first
-
-
-def test_disc_set_holds_its_truth(tmp_path: Path, published_camera: Camera) -> None:
-    assert main(["discs", str(tmp_path / "d.npz"), "--count", "5", "--noise-grey", "0"]) == 0
-    with np.load(tmp_path / "d.npz") as discs:
-        np.testing.assert_allclose(
-            published_camera.project_floor(discs["floor_xy"]), discs["pixel"], atol=1e-9
-        )
-        for k in range(5):
-            grey = discs[f"grey_{k:04d}"].astype(np.float64) - 100.0
-            v, u = np.indices(grey.shape)
-            at = np.array([(u * grey).sum(), (v * grey).sum()]) / grey.sum() + discs["u0_v0"][k]
-            # The centroid of the image is near the image of the centre, not at it.
-            assert np.abs(at - discs["pixel"][k]).max() < 0.6
+    assert (tmp_path / "run" / "map.circles").read_bytes() == first

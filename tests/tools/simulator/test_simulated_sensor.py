@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.quality import best_quality_near, disc_quality
-from tools.simulator.sensor import Sensor, encode_jpeg, grey_values
+from tools.simulator.observation import best_quality_near, disc_quality
+from tools.simulator.renderer import Sensor, encode_jpeg, grey_values
 from tools.simulator.single_disc import render_disc
 
 PLAIN = Sensor(

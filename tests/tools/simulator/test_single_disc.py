@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.kernels import polygon_coverage
-from tools.simulator.single_disc import render_disc
+from tools.simulator.single_disc import polygon_coverage, render_disc
 
 RADIUS_M = 0.10
 PLACES = [(0.1, -0.9), (-0.35, -1.4), (0.8, -2.1), (-1.1, -2.8), (0.2, -3.9), (0.9, -0.75)]

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tools.soak import short_runs
-from tools.soak.cli import main
+from tools.soak.__main__ import main
 from tools.soak.long_run import MOST_GROWTH_MIB, SoakError, SoakResult, link_run
 from tools.soak.processes import family, marked
 from tools.soak.short_runs import ShortRuns

@@ -1,19 +1,102 @@
-"""What a scanner measures: rays cast, and then everything that goes wrong with readings."""
+"""What a scanner measures: rays cast in the plane, and errors of the readings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from tools.simulator.laser.kernels import cast_on_discs, cast_on_robot, cast_on_walls
+from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 
-FloatArray = NDArray[np.float64]
+
+@nb.njit(cache=True, error_model="numpy")
+def _meet(
+    ox: float, oy: float, dx: float, dy: float, wall: FloatArray, nearest: np.float64
+) -> np.float64:
+    """Distance to a wall x1, y1, x2, y2 along a unit direction, if below `nearest`."""
+    ex, ey = wall[2] - wall[0], wall[3] - wall[1]
+    rx, ry = wall[0] - ox, wall[1] - oy
+    across = dx * ey - dy * ex
+    beside = rx * dy - ry * dx
+    # Both ends on the same side of the ray, or a wall along it, whose end its neighbour shows.
+    if beside * (beside - across) > 0.0 or across == 0.0:
+        return nearest
+    distance = (rx * ey - ry * ex) / across
+    if 0.0 < distance < nearest:
+        return np.float64(distance)
+    return nearest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def cast_on_walls(
+    origins: FloatArray, directions: FloatArray, walls: FloatArray, ranges: FloatArray
+) -> None:
+    """Shorten ranges to the nearest wall.
+    `origins` (B, 2); `directions` (B,); `walls` (S, 4); `ranges` (B,).
+    """
+    for b in range(ranges.size):
+        dx, dy = np.cos(directions[b]), np.sin(directions[b])
+        nearest = ranges[b]
+        for s in range(walls.shape[0]):
+            nearest = _meet(origins[b, 0], origins[b, 1], dx, dy, walls[s], nearest)
+        ranges[b] = nearest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def cast_on_robot(
+    origins: FloatArray,
+    directions: FloatArray,
+    robot_poses: FloatArray,
+    sides: FloatArray,
+    ranges: FloatArray,
+) -> None:
+    """Shorten ranges to a polygon that stands elsewhere for every ray.
+    `origins`, `directions` (B, 2); `robot_poses` (B, 3); `sides` (K, 4); `ranges` (B,).
+    """
+    for b in range(ranges.size):
+        c, s = np.cos(robot_poses[b, 2]), np.sin(robot_poses[b, 2])
+        x, y = origins[b, 0] - robot_poses[b, 0], origins[b, 1] - robot_poses[b, 1]
+        ox, oy = c * x + s * y, c * y - s * x
+        angle = directions[b] - robot_poses[b, 2]
+        dx, dy = np.cos(angle), np.sin(angle)
+        nearest = ranges[b]
+        for k in range(sides.shape[0]):
+            nearest = _meet(ox, oy, dx, dy, sides[k], nearest)
+        ranges[b] = nearest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def cast_on_discs(
+    origins: FloatArray,
+    directions: FloatArray,
+    discs: FloatArray,
+    of_ray: IntArray,
+    ranges: FloatArray,
+) -> None:
+    """Shorten ranges to discs that stand elsewhere from scan to scan.
+    `origins`, `directions` (B, 2); `discs` (N, D, 3); `of_ray` (B,); `ranges` (B,).
+    """
+    for b in range(ranges.size):
+        dx, dy = np.cos(directions[b]), np.sin(directions[b])
+        here = discs[of_ray[b]]
+        for d in range(here.shape[0]):
+            radius = here[d, 2]
+            if radius <= 0.0:
+                continue
+            x, y = here[d, 0] - origins[b, 0], here[d, 1] - origins[b, 1]
+            along = x * dx + y * dy
+            across = x * dy - y * dx
+            deep = radius * radius - across * across
+            if deep > 0.0:
+                distance = along - np.sqrt(deep)
+                if 0.0 < distance < ranges[b]:
+                    ranges[b] = distance
+
 
 _AT_ONCE = 256
 _EDGE_M = 0.1
@@ -21,24 +104,13 @@ _EDGE_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What there is to be hit.
+    """What there is to be hit."""
 
-    Attributes
-    ----------
-    walls : (S, 4) float64
-        What stands still: x1, y1, x2, y2 (m).
-    robot_poses : callable or None
-        (N, 3) poses at times (s); None if the robot is not there, or not to be seen.
-    sides : (K, 4) float64
-        Sides of the robot in its frame (m).
-    legs : callable
-        (N, D, 3) x, y, radius of discs at times (m).
-    """
-
-    walls: FloatArray
+    walls: FloatArray  # (S, 4) What stands still: x1, y1, x2, y2 (m).
     robot_poses: Callable[[FloatArray], FloatArray] | None
-    sides: FloatArray
-    legs: Callable[[FloatArray], FloatArray]
+    """(N, 3) poses at times (s); None if the robot is not there, or not to be seen."""
+    sides: FloatArray  # (K, 4) Sides of the robot in its frame (m).
+    legs: Callable[[FloatArray], FloatArray]  # (N, D, 3) x, y, radius of discs at times (m).
 
 
 def true_ranges(
@@ -48,25 +120,7 @@ def true_ranges(
     scene: Scene,
     sweep_s: float = 0.0,
 ) -> FloatArray:
-    """Exact distances along all beams.
-
-    Parameters
-    ----------
-    scanner : Scanner
-        Its pose is in the world, or in the frame of its carrier.
-    carrier : callable or None
-        (N, 3) poses at times of what carries the scanner; None if it stands still.
-    times_s : (N,) float64
-        Times of the scans' middle beams.
-    scene : Scene
-    sweep_s : float
-        From the first beam to the last; legs do not move within a scan.
-
-    Returns
-    -------
-    (N, readings) float64
-        Metres, infinite where nothing is hit.
-    """
+    """Exact distances along all beams. `times_s` (N,); returns (N, readings)."""
     readings = scanner.readings
     share = np.arange(readings) / max(readings - 1, 1) - 0.5
     ranges = np.empty((len(times_s), readings))
@@ -113,24 +167,7 @@ def measured(
     errors: ReadingErrors,
     rng: np.random.Generator,
 ) -> Scans:
-    """Exact distances as the scanner reports them.
-
-    Parameters
-    ----------
-    times_s : (N,) float64
-        Their stamps.
-    ranges_m : (N, readings) float64
-        Exact distances, infinite for none.
-    scanner : Scanner
-        Its largest range is where readings end.
-    errors : ReadingErrors
-    rng : numpy Generator
-
-    Returns
-    -------
-    Scans
-        Without those that are lost.
-    """
+    """Exact distances as the scanner reports them. `times_s` (N,); `ranges_m` (N, readings)."""
     noisy = ranges_m.copy()
     near, far = ranges_m[:, :-1], ranges_m[:, 1:]
     with np.errstate(invalid="ignore"):

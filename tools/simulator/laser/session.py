@@ -6,24 +6,23 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from tools.simulator.laser.clock import RobotClock
-from tools.simulator.laser.people import Passer, crossing, strolling
-from tools.simulator.laser.route import Curve, Route, Stop
+from tools.arrays import FloatArray
+from tools.simulator.laser.motion import Curve, RobotClock, Route, Stop
 from tools.simulator.laser.settings import LaserSettings
 from tools.simulator.laser.site import (
     DOOR_Y_M,
     ROOM_M,
+    Passer,
     Site,
     clearance,
+    crossing,
     is_covered,
     make_site,
+    strolling,
 )
-
-FloatArray = NDArray[np.float64]
 
 #: Near the session's beginning, as stamps of real logs are: seconds since 1970.
 EPOCH_S = 1235561600.0
@@ -41,38 +40,18 @@ _ROUND_S = 62.0
 
 @dataclass(frozen=True, eq=False)
 class SessionPlan:
-    """What is true of a session.
-
-    Attributes
-    ----------
-    seed : int
-    settings : LaserSettings
-    site : Site
-    robot : Robot
-        With the scanners on board, exact.
-    scanners : tuple of Scanner
-        The fixed ones, exact, as they stood when the empty room was scanned.
-    moved : tuple of Scanner
-        As they stand in the session.
-    route : Route
-        On the ground truth's clock.
-    visits : tuple of (float, float)
-        From and to when the robot is in the room.
-    references : tuple of (float, float)
-        From and to when it stands for a reference pose.
-    passers : tuple of Passer
-    clock : RobotClock
-    """
+    """What is true of a session."""
 
     seed: int
     settings: LaserSettings
     site: Site
-    robot: Robot
+    robot: Robot  # With the scanners on board, exact.
     scanners: tuple[Scanner, ...]
-    moved: tuple[Scanner, ...]
-    route: Route
-    visits: tuple[tuple[float, float], ...]
-    references: tuple[tuple[float, float], ...]
+    """The fixed ones, exact, as they stood when the empty room was scanned."""
+    moved: tuple[Scanner, ...]  # As they stand in the session.
+    route: Route  # On the ground truth's clock.
+    visits: tuple[tuple[float, float], ...]  # From and to when the robot is in the room.
+    references: tuple[tuple[float, float], ...]  # From and to when it stands for a reference pose.
     passers: tuple[Passer, ...]
     clock: RobotClock
 
@@ -87,23 +66,7 @@ def random_for(seed: int, what: str) -> np.random.Generator:
 
 
 def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
-    """Lay a session out.
-
-    Parameters
-    ----------
-    settings : LaserSettings
-    seed : int
-        The same gives the same.
-
-    Returns
-    -------
-    SessionPlan
-
-    Raises
-    ------
-    GroundTruthError
-        If a setting is impossible, or no way through the room was found.
-    """
+    """Lay a session out."""
     settings.check()
     site = make_site(settings.furniture)
     route, visits, references = _drive(settings, seed, site)

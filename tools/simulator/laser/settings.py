@@ -13,14 +13,11 @@ FIXED_SCANNERS = 4
 class ReadingErrors:
     """What goes wrong with readings."""
 
-    sigma_m: float = 0.01
-    """Standard deviation (m)."""
+    sigma_m: float = 0.01  # Standard deviation (m).
     quantum_m: float = 0.01
     """Readings are whole multiples of this (m), before they are stored in millimetres."""
-    dropouts: float = 0.005
-    """Share of readings that are lost."""
-    lost_scans: float = 0.002
-    """Share of scans that are lost."""
+    dropouts: float = 0.005  # Share of readings that are lost.
+    lost_scans: float = 0.002  # Share of scans that are lost.
     mixed: float = 0.15
     """Share of readings beside an edge that lie between the near and the far side."""
     sweep_s: float = 0.0
@@ -31,20 +28,14 @@ class ReadingErrors:
 class WheelErrors:
     """How wrong odometry is."""
 
-    scale: float = 1.008
-    """Measured way per way."""
-    turn_scale: float = 1.01
-    """Measured turn per turn."""
-    turn_per_m: float = 0.002
-    """Turn that is measured per metre straight on (rad)."""
-    sigma_m: float = 0.006
-    """Random error of the way per square root of a metre (m)."""
+    scale: float = 1.008  # Measured way per way.
+    turn_scale: float = 1.01  # Measured turn per turn.
+    turn_per_m: float = 0.002  # Turn that is measured per metre straight on (rad).
+    sigma_m: float = 0.006  # Random error of the way per square root of a metre (m).
     sigma_turn: float = 0.008
     """Random error of the heading per square root of a radian turned (rad)."""
-    sigma_turn_per_m: float = 0.004
-    """Random error of the heading per square root of a metre (rad)."""
-    sigma_side_m: float = 0.0
-    """Sideways slip per square root of a metre (m)."""
+    sigma_turn_per_m: float = 0.004  # Random error of the heading per square root of a metre (rad).
+    sigma_side_m: float = 0.0  # Sideways slip per square root of a metre (m).
 
 
 @dataclass(frozen=True)
@@ -62,92 +53,55 @@ class Faults:
 
     wrong_scanner: str = ""
     """This fixed scanner's pose measured by hand is wrong, far beyond its sigma."""
-    moved_scanner: str = ""
-    """This fixed scanner was knocked after the empty area was scanned."""
+    moved_scanner: str = ""  # This fixed scanner was knocked after the empty area was scanned.
     by: tuple[float, float, float] = (0.4, -0.3, 0.15)
     """How far the scanner is wrong or was knocked: x, y (m), theta (rad)."""
-    clock_jump_s: float = 0.0
-    """The robot's clock is set by this ..."""
-    clock_jump_at_s: float = 30.0
-    """... at this time."""
-    lost_camera_at_s: float = 20.0
-    """The cameras give nothing from this time on ..."""
-    lost_camera_s: float = 0.0
-    """... for so long."""
-    lost_laser_at_s: float = 20.0
-    """All fixed scanners give nothing from this time on ..."""
-    lost_laser_s: float = 0.0
-    """... for so long."""
-    crossing: bool = False
-    """Somebody passes right beside the robot in the middle of every visit."""
+    clock_jump_s: float = 0.0  # The robot's clock is set by this ...
+    clock_jump_at_s: float = 30.0  # ... at this time.
+    lost_camera_at_s: float = 20.0  # The cameras give nothing from this time on ...
+    lost_camera_s: float = 0.0  # ... for so long.
+    lost_laser_at_s: float = 20.0  # All fixed scanners give nothing from this time on ...
+    lost_laser_s: float = 0.0  # ... for so long.
+    crossing: bool = False  # Somebody passes right beside the robot in the middle of every visit.
 
 
 @dataclass(frozen=True)
 class LaserSettings:
     """Everything about a session but its seed."""
 
-    visits: int = 3
-    """Visits to the covered room."""
-    visit_s: float = 60.0
-    """About how long each of them lasts."""
-    between_s: float = 120.0
-    """About how long the robot is away between them."""
-    straight: bool = False
-    """The robot goes straight through the room, without turns."""
-    references: int = 23
-    """Poses at which it stands and distances to fiducials are measured."""
-    stand_s: float = 1.5
-    """How long it stands there."""
-    passers: int = 2
-    """Passers-by in each visit."""
-    furniture: bool = True
-    """Things that stand there without being in the map."""
+    visits: int = 3  # Visits to the covered room.
+    visit_s: float = 60.0  # About how long each of them lasts.
+    between_s: float = 120.0  # About how long the robot is away between them.
+    straight: bool = False  # The robot goes straight through the room, without turns.
+    references: int = 23  # Poses at which it stands and distances to fiducials are measured.
+    stand_s: float = 1.5  # How long it stands there.
+    passers: int = 2  # Passers-by in each visit.
+    furniture: bool = True  # Things that stand there without being in the map.
     front_cut_m: float = 0.12
     """The robot's front corners are cut by this; 0 makes it a rectangle, which looks the same
     turned round."""
-    rate_hz: float = 75.0
-    """Of the fixed scanners."""
-    onboard_hz: float = 75.0
-    """Of the scanners on board."""
-    max_range_m: float = 16.0
-    """Of all scanners."""
-    empty_s: float = 4.0
-    """How long the empty room is scanned."""
-    odometry_hz: float = 50.0
-    """Of the odometry."""
-    pause_log: bool = False
-    """The robot's log pauses between the visits."""
-    camera_hz: float = 5.0
-    """Of the poses from markers."""
-    camera_misses: float = 0.1
-    """Share of times at which the cameras see nothing."""
-    truth_hz: float = 100.0
-    """Of the exact poses."""
-    ptpd_hz: float = 0.5
-    """Of ptpd's reports."""
-    clock_offset_s: float = 0.18
-    """Robot's clock minus ground truth's at the beginning."""
-    clock_drift: float = 4e-5
-    """The robot's clock goes faster by this share."""
-    hand_sigma_m: float = 0.05
-    """Of the fixed scanners' positions measured by hand."""
-    hand_sigma_deg: float = 2.0
-    """Of their directions."""
-    distance_sigma_m: float = 0.005
-    """Of the distances to the fiducials."""
+    rate_hz: float = 75.0  # Of the fixed scanners.
+    onboard_hz: float = 75.0  # Of the scanners on board.
+    max_range_m: float = 16.0  # Of all scanners.
+    empty_s: float = 4.0  # How long the empty room is scanned.
+    odometry_hz: float = 50.0  # Of the odometry.
+    pause_log: bool = False  # The robot's log pauses between the visits.
+    camera_hz: float = 5.0  # Of the poses from markers.
+    camera_misses: float = 0.1  # Share of times at which the cameras see nothing.
+    truth_hz: float = 100.0  # Of the exact poses.
+    ptpd_hz: float = 0.5  # Of ptpd's reports.
+    clock_offset_s: float = 0.18  # Robot's clock minus ground truth's at the beginning.
+    clock_drift: float = 4e-5  # The robot's clock goes faster by this share.
+    hand_sigma_m: float = 0.05  # Of the fixed scanners' positions measured by hand.
+    hand_sigma_deg: float = 2.0  # Of their directions.
+    distance_sigma_m: float = 0.005  # Of the distances to the fiducials.
     reading: ReadingErrors = field(default_factory=ReadingErrors)
     wheels: WheelErrors = field(default_factory=WheelErrors)
     driving: DrivingLimits = field(default_factory=DrivingLimits)
     faults: Faults = field(default_factory=Faults)
 
     def check(self) -> None:
-        """Refuse what cannot be.
-
-        Raises
-        ------
-        GroundTruthError
-            Naming the setting, its value and what was expected.
-        """
+        """Refuse what cannot be."""
         positive = ("visits", "visit_s", "rate_hz", "onboard_hz", "odometry_hz", "camera_hz",
                     "truth_hz", "ptpd_hz", "max_range_m", "empty_s", "stand_s")  # fmt: skip
         for name in positive:

@@ -11,7 +11,7 @@ the printed face, the upper left square black.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,24 +24,19 @@ from redetect.groundtruth.geometry.transforms import (
     quaternion_xyzw,
 )
 from redetect.groundtruth.json_file import write_json
-from tools.simulator.markers.clutter import checkerboard
-from tools.simulator.markers.errors import CalibrationErrors
-from tools.simulator.markers.imaging import Imaging, grey_image
-from tools.simulator.markers.rendering import render_light
-from tools.simulator.markers.robot import facing_pose
-from tools.simulator.markers.room import lit
-from tools.simulator.markers.session import SessionPlan, View, random_for, view_robot
-from tools.simulator.markers.session_files import (
+from tools.arrays import ByteArray, FloatArray
+from tools.simulator.markers.rendering import Imaging, grey_image, render_light
+from tools.simulator.markers.room import facing_pose, lit
+from tools.simulator.markers.session import (
     NOTE,
-    ImageFormat,
     SeenFrame,
-    write_calibrations,
-    write_image,
-    write_poses,
-    write_times,
-    write_truth,
+    SessionPlan,
+    SessionWriter,
+    random_for,
+    view_robot,
 )
-from tools.simulator.markers.surface import FloatArray, Surface
+from tools.simulator.markers.surface import Surface
+from tools.simulator.markers.things import checkerboard
 
 _TURN_STEPS = 24
 _PAUSE_S = 1.0
@@ -86,12 +81,9 @@ class BoardView:
 
     camera: int
     board: str
-    placement: int
-    """Which placement of the double board; -1 for the board that defines the world."""
-    pose: FloatArray
-    """world_from_board."""
-    corners: FloatArray
-    """(N, 2) pixels of its inner corners."""
+    placement: int  # Which placement of the double board; -1 for the board that defines the world.
+    pose: FloatArray  # world_from_board.
+    corners: FloatArray  # (N, 2) pixels of its inner corners.
 
 
 def first_from_second(rng: np.random.Generator) -> FloatArray:
@@ -107,24 +99,12 @@ def first_from_second(rng: np.random.Generator) -> FloatArray:
 
 
 def world_board_pose(plan: SessionPlan) -> FloatArray:
-    """(4, 4) world_from_board of the board on the floor, before the first camera.
-
-    Raises
-    ------
-    ValueError
-        If it is not in view anywhere.
-    """
+    """(4, 4) world_from_board of the board on the floor, before the first camera."""
     return _world_view(plan).pose
 
 
 def _world_view(plan: SessionPlan) -> BoardView:
-    """The board on the floor as near to the first camera as it is seen whole.
-
-    Raises
-    ------
-    ValueError
-        If it is not in view anywhere.
-    """
+    """The board on the floor as near to the first camera as it is seen whole."""
     middle = 0.5 * np.array(plan.settings.area_m)
     for share in np.arange(0.4, -0.6, -0.1):
         at = middle + share * (plan.network.world_from_camera[0, :2, 3] - middle)
@@ -138,23 +118,7 @@ def _world_view(plan: SessionPlan) -> BoardView:
 
 def board_views(plan: SessionPlan, offset: FloatArray) -> list[BoardView]:
     """Placements of the double board before neighbouring cameras, and the board of the world.
-
-    Parameters
-    ----------
-    plan : SessionPlan
-        The session whose cameras look.
-    offset : (4, 4) array
-        first_from_second.
-
-    Returns
-    -------
-    list of BoardView
-        For each placement two, of the two cameras.
-
-    Raises
-    ------
-    ValueError
-        If there are cameras before which no place for a board was found.
+    `offset` (4, 4).
     """
     count = len(plan.network.names)
     pairs = [(c, (c + 1) % count) for c in range(count if count > 2 else count - 1)]
@@ -222,41 +186,28 @@ def _seen(
     )
 
 
-def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> View:
+def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> ByteArray:
     settings, model = plan.settings, plan.network.cameras[view.camera]
     imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
     seen = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
-    light = render_light(
-        model, [seen], plan.background(view.camera), fine=imaging.fine, samples=settings.samples
-    )
+    background = plan.background(view.camera)
+    light = render_light(model, [seen], background, fine=imaging.fine, samples=settings.samples)
     rng = random_for(settings.seed, "frame", view.camera, noise)
-    return View(grey_image(light, plan.illumination(view.camera), imaging, rng), ())
+    return grey_image(light, plan.illumination(view.camera), imaging, rng)
 
 
 def write_calibration_set(
     plan: SessionPlan,
     folder: Path,
+    writer: SessionWriter | None = None,
     *,
-    errors: CalibrationErrors | None = None,
-    image_format: ImageFormat = "jpg",
-    quality: int = 92,
-    overwrite: bool = False,
     on_frame: Callable[[], None] | None = None,
 ) -> int:
-    """Write ``rig/`` and ``network/`` below a folder; parameters as in `write_session`.
-
-    Returns
-    -------
-    int
-        Number of images.
-    """
-    errors = CalibrationErrors() if errors is None else errors
-    count = _write_rig_images(
-        plan, errors, folder / "rig", image_format, quality, overwrite, on_frame
-    )
-    return count + _write_network_images(
-        plan, errors, folder / "network", image_format, quality, overwrite, on_frame
-    )
+    """Write ``rig/`` and ``network/`` below a folder; returns the number of images."""
+    tick = on_frame or (lambda: None)
+    writer = writer or SessionWriter()
+    count = _write_rig_images(plan, folder / "rig", writer, tick)
+    return count + _write_network_images(plan, folder / "network", writer, tick)
 
 
 def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
@@ -283,53 +234,33 @@ def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
 
 
 def _write_rig_images(
-    plan: SessionPlan,
-    errors: CalibrationErrors,
-    folder: Path,
-    image_format: ImageFormat,
-    quality: int,
-    overwrite: bool,
-    on_frame: Callable[[], None] | None,
+    plan: SessionPlan, folder: Path, writer: SessionWriter, tick: Callable[[], None]
 ) -> int:
-    write_calibrations(plan, errors, folder, overwrite=overwrite)
+    writer.calibrations(plan, folder)
     seen: list[SeenFrame] = []
-    times: list[float] = []
     poses: list[FloatArray] = []
     for camera, name in enumerate(plan.network.names):
-        own = []
         for pose in turning_poses(plan, camera):
-            number = len(times)
+            number = len(seen)
             view = view_robot(plan, camera, pose, np.zeros(3), 1_000_000 + number)
             prefix = f"rig.{number:04d}"
-            write_image(
-                folder / name / "images" / f"{prefix}.{image_format}", view, quality,
-                overwrite=overwrite,
-            )  # fmt: skip
-            times.append(_RIG_S + _PAUSE_S * number)
+            writer.image(folder, name, prefix, view.image)
             poses.append(pose)
-            own.append(SeenFrame(name, prefix, times[-1], view.markers))
-            if on_frame is not None:
-                on_frame()
-        write_times(folder / name / f"{name}.times", own, overwrite=overwrite)
-        seen += own
-    write_poses(folder / "truth.csv", np.array(times), np.stack(poses), overwrite=overwrite)
-    write_truth(folder / "truth.json", plan, errors, seen, overwrite=overwrite)
+            seen.append(SeenFrame(name, prefix, _RIG_S + _PAUSE_S * number, view.markers))
+            tick()
+    writer.times(folder, plan, seen)
+    writer.poses(folder / "truth.csv", np.array([s.time_s for s in seen]), np.stack(poses))
+    writer.truth(folder / "truth.json", plan, seen)
     return len(seen)
 
 
 def _write_network_images(
-    plan: SessionPlan,
-    errors: CalibrationErrors,
-    folder: Path,
-    image_format: ImageFormat,
-    quality: int,
-    overwrite: bool,
-    on_frame: Callable[[], None] | None,
+    plan: SessionPlan, folder: Path, writer: SessionWriter, tick: Callable[[], None]
 ) -> int:
-    write_calibrations(plan, errors, folder, overwrite=overwrite)
+    writer.calibrations(plan, folder)
     offset = first_from_second(random_for(plan.settings.seed, "boards", 99))
     views = board_views(plan, offset)
-    names = plan.network.names
+    after = max(view.placement for view in views) + 1
     rows, truth = [], []
     seen: list[SeenFrame] = []
     for number, view in enumerate(views):
@@ -338,45 +269,29 @@ def _write_network_images(
         else:
             first = view.pose if view.board == "first" else view.pose @ inverse(offset)
             boards = [DOUBLE.surface(first), DOUBLE.surface(first @ offset)]
-        name = names[view.camera]
-        place = view.placement if view.placement >= 0 else max(v.placement for v in views) + 1
-        prefix, time_s = f"network.{place:04d}", _NETWORK_S + _PAUSE_S * place
-        image = f"{name}/images/{prefix}.{image_format}"
-        write_image(
-            folder / image, _render(plan, view, boards, 2_000_000 + number), quality,
-            overwrite=overwrite,
-        )  # fmt: skip
-        seen.append(SeenFrame(name, prefix, time_s, ()))
+        name = plan.network.names[view.camera]
+        place = view.placement if view.placement >= 0 else after
+        prefix = f"network.{place:04d}"
+        grey = _render(plan, view, boards, 2_000_000 + number)
+        image = writer.image(folder, name, prefix, grey)
+        seen.append(SeenFrame(name, prefix, _NETWORK_S + _PAUSE_S * place, ()))
         rows.append({"camera": name, "image": image, "placement": place, "board": view.board})
         truth.append(
             {"image": image, "board": view.board, "world_from_board": _pose_json(view.pose),
              "corners": np.round(view.corners, 4).tolist()}
         )  # fmt: skip
-        if on_frame is not None:
-            on_frame()
-    for name in names:
-        own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
-        write_times(folder / name / f"{name}.times", own, overwrite=overwrite)
+        tick()
+    writer.times(folder, plan, seen)
     content: dict[str, Any] = {
         "note": NOTE,
-        "boards": {
-            "first": _board_json(DOUBLE),
-            "second": _board_json(DOUBLE),
-            "world": _board_json(WORLD),
-        },
+        "boards": {"first": asdict(DOUBLE), "second": asdict(DOUBLE), "world": asdict(WORLD)},
         "first_from_second": _pose_json(offset),
         "world_from_board": _pose_json(world_board_pose(plan)),
         "images": rows,
     }
-    write_json(folder / "boards.json", content, overwrite=overwrite)
-    write_truth(
-        folder / "truth.json", plan, errors, (), overwrite=overwrite, extra={"boards": truth}
-    )
+    write_json(folder / "boards.json", content, overwrite=writer.overwrite)
+    writer.truth(folder / "truth.json", plan, (), extra={"boards": truth})
     return len(views)
-
-
-def _board_json(board: Board) -> dict[str, float]:
-    return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
 
 
 def _pose_json(pose: FloatArray) -> dict[str, list[float]]:

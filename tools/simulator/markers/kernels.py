@@ -8,13 +8,27 @@ takes a ray (x, y, 1) to (column, row, 1) / depth.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.brown_kernels import brown_shift_point
 from camera.kernels import has_brown
+from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
+
+
+class SurfaceArrays(NamedTuple):
+    """Surfaces as the kernels take them."""
+
+    from_texel: FloatArray  # (S, 3, 3) (column, row, 1) to a point in the camera frame.
+    to_texel: FloatArray  # (S, 3, 3) Their inverses.
+    sizes: IntArray  # (S, 2) Rows and columns of each texture.
+    starts: IntArray  # (S,) Where each texture begins in `texels`.
+    texels: Float32Array  # All textures, row by row; NaN is a hole.
+    smooth: ByteArray  # (S,) Whether it is interpolated: then only its outline is an edge.
+    given: IntArray  # (S,) Number of each surface among those given.
+
 
 #: Side of the square tiles for which the surfaces that may be seen are gathered, pixels.
 TILE = 16
@@ -27,11 +41,8 @@ _NEAREST = 1e-3
 
 
 @nb.njit(cache=True, error_model="numpy")
-def project_point(
-    numbers: NDArray[np.float64], x: float, y: float, z: float
-) -> tuple[float, float]:
+def project_point(numbers: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Pixel of a point in the camera frame; both NaN where it is not seen.
-
     `numbers` as `camera.kernels.camera_numbers` gives them.
     """
     if z < _NEAREST:
@@ -56,7 +67,7 @@ def project_point(
 
 @nb.njit(cache=True, error_model="numpy")
 def _texel_point(
-    numbers: NDArray[np.float64], from_texel: NDArray[np.float64], a: float, b: float
+    numbers: FloatArray, from_texel: FloatArray, a: float, b: float
 ) -> tuple[float, float]:
     return project_point(
         numbers,
@@ -68,19 +79,17 @@ def _texel_point(
 
 @nb.njit(cache=True, error_model="numpy")
 def _mark_segment(
-    crossed: NDArray[np.uint8],
-    box: NDArray[np.int64],
-    numbers: NDArray[np.float64],
-    from_texel: NDArray[np.float64],
-    a0: float,
-    b0: float,
-    a1: float,
-    b1: float,
+    crossed: ByteArray,
+    box: IntArray,
+    numbers: FloatArray,
+    from_texel: FloatArray,
+    ends: tuple[float, float, float, float],
     pieces: int,
 ) -> None:
     """Mark the quarters of pixels that a segment crosses, and widen the box (in pixels) by it."""
     rows, columns = crossed.shape
     height, width = rows // 2, columns // 2
+    a0, b0, a1, b1 = ends
     u0, v0 = _texel_point(numbers, from_texel, a0, b0)
     for piece in range(pieces):
         t = (piece + 1.0) / pieces
@@ -117,49 +126,27 @@ def _mark_segment(
 
 @nb.njit(cache=True, error_model="numpy")
 def mark_edges(
-    crossed: NDArray[np.uint8],
-    boxes: NDArray[np.int64],
-    numbers: NDArray[np.float64],
-    from_texel: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.float32],
-    smooth: NDArray[np.uint8],
+    crossed: ByteArray, boxes: IntArray, numbers: FloatArray, surfaces: SurfaceArrays
 ) -> None:
     """Mark where any edge between unequal texels runs; find each surface's box.
 
-    Parameters
-    ----------
-    crossed : (2 H, 2 W) uint8
-        Set to 1 where an edge runs; else left alone.
-    boxes : (S, 4) int64
-        Filled with the first and last columns and rows that may see the surface: u0, v0, u1, v1.
-    numbers : (22,) float64
-        The camera.
-    from_texel : (S, 3, 3) float64
-        Of each surface.
-    sizes : (S, 2) int64
-        Rows and columns of each texture.
-    starts : (S,) int64
-        Where each texture begins in `texels`.
-    texels : float32
-        All textures, row by row; NaN is a hole.
-    smooth : (S,) uint8
-        Whether the texture is interpolated: then only its outline is an edge.
+    `crossed` (2 H, 2 W) is set to 1 where an edge runs; `boxes` (S, 4) gets the first and last
+    columns and rows that may see the surface: u0, v0, u1, v1. `numbers` is the camera.
     """
     height, width = crossed.shape[0] // 2, crossed.shape[1] // 2
-    for s in range(len(sizes)):
-        rows, columns = sizes[s, 0], sizes[s, 1]
-        box = boxes[s]
+    for s in range(len(surfaces.sizes)):
+        rows, columns = surfaces.sizes[s, 0], surfaces.sizes[s, 1]
+        box, matrix = boxes[s], surfaces.from_texel[s]
         box[0], box[1], box[2], box[3] = width, height, -1, -1
-        matrix = from_texel[s]
         for k in range(2):
             # Long edges bend under distortion, so they go in pieces.
-            _mark_segment(crossed, box, numbers, matrix, 0.0, k * rows, columns, k * rows, 64)
-            _mark_segment(crossed, box, numbers, matrix, k * columns, 0.0, k * columns, rows, 64)
-        if smooth[s] or box[2] < box[0] or box[3] < box[1]:
+            across = (0.0, float(k * rows), float(columns), float(k * rows))
+            _mark_segment(crossed, box, numbers, matrix, across, 64)
+            down = (float(k * columns), 0.0, float(k * columns), float(rows))
+            _mark_segment(crossed, box, numbers, matrix, down, 64)
+        if surfaces.smooth[s] or box[2] < box[0] or box[3] < box[1]:
             continue
-        start = starts[s]
+        start, texels = surfaces.starts[s], surfaces.texels
         for r in range(rows):
             for c in range(columns):
                 here = texels[start + r * columns + c]
@@ -167,20 +154,18 @@ def mark_edges(
                 if c + 1 < columns:
                     right = texels[start + r * columns + c + 1]
                     if right != here and not (hole and math.isnan(right)):
-                        _mark_segment(
-                            crossed, box, numbers, matrix, c + 1.0, r, c + 1.0, r + 1.0, 4
-                        )
+                        side = (c + 1.0, float(r), c + 1.0, r + 1.0)
+                        _mark_segment(crossed, box, numbers, matrix, side, 4)
                 if r + 1 < rows:
                     below = texels[start + (r + 1) * columns + c]
                     if below != here and not (hole and math.isnan(below)):
-                        _mark_segment(
-                            crossed, box, numbers, matrix, c, r + 1.0, c + 1.0, r + 1.0, 4
-                        )
+                        side = (float(c), r + 1.0, c + 1.0, r + 1.0)
+                        _mark_segment(crossed, box, numbers, matrix, side, 4)
 
 
 @nb.njit(cache=True, error_model="numpy")
 def _smooth_texel(
-    texels: NDArray[np.float32], start: int, rows: int, columns: int, a: float, b: float
+    texels: Float32Array, start: int, rows: int, columns: int, a: float, b: float
 ) -> float:
     x = min(max(a - 0.5, 0.0), columns - 1.0)
     y = min(max(b - 0.5, 0.0), rows - 1.0)
@@ -194,17 +179,10 @@ def _smooth_texel(
 
 @nb.njit(cache=True, error_model="numpy", inline="always")
 def nearest_surface(
-    x: float,
-    y: float,
-    candidates: NDArray[np.int64],
-    count: int,
-    to_texel: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.float32],
-    smooth: NDArray[np.uint8],
+    x: float, y: float, candidates: IntArray, count: int, surfaces: SurfaceArrays
 ) -> tuple[int, float]:
     """The surface that a ray (x, y, 1) meets first, and its texel's value; -1 and 0 if none."""
+    to_texel, sizes = surfaces.to_texel, surfaces.sizes
     best = 0.0
     found = -1
     value = 0.0
@@ -224,10 +202,10 @@ def nearest_surface(
         # Rounding may reach the texture's end.
         a = min(a / inverse_depth, columns - 1e-9)
         b = min(b / inverse_depth, rows - 1e-9)
-        if smooth[s]:
-            light = _smooth_texel(texels, starts[s], rows, columns, a, b)
+        if surfaces.smooth[s]:
+            light = _smooth_texel(surfaces.texels, surfaces.starts[s], rows, columns, a, b)
         else:
-            light = float(texels[starts[s] + int(b) * columns + int(a)])
+            light = float(surfaces.texels[surfaces.starts[s] + int(b) * columns + int(a)])
             if math.isnan(light):
                 continue
         best = inverse_depth
@@ -251,49 +229,32 @@ def _shift(row: int, column: int) -> tuple[float, float]:
 
 @nb.njit(cache=True, error_model="numpy")
 def shade(
-    light: NDArray[np.float32],
+    light: Float32Array,
     weight: float,
-    crossed: NDArray[np.uint8],
-    rays: NDArray[np.float64],
-    boxes: NDArray[np.int64],
-    to_texel: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.float32],
-    smooth: NDArray[np.uint8],
+    crossed: ByteArray,
+    rays: FloatArray,
+    boxes: IntArray,
+    surfaces: SurfaceArrays,
     samples: int,
-    background: NDArray[np.float32],
+    background: Float32Array,
 ) -> None:
     """Let the surfaces of one exposure take the background's place.
 
     Surfaces may touch but should not pass through each other: where they do, the border between
     them is no edge, and may be found up to a tile's width beside its place.
 
-    Parameters
-    ----------
-    light : (2 H, 2 W) or (H, W) float32
-        At first the background; becomes the mean reflectance of what each quarter of a pixel, or
-        each pixel, sees.
-    weight : float
-        Of this exposure; those of all exposures add up to 1.
-    crossed : (2 H, 2 W) uint8
-        1 where a quarter of a pixel may see more than one texel: there `samples` rays are cast.
-    rays : (H, W, 6) float64
-        x, y of the ray through the pixel's centre, and dx/du, dx/dv, dy/du, dy/dv.
-    boxes, to_texel, sizes, starts, texels, smooth
-        The surfaces; see `mark_edges`. `to_texel` is the inverse of `from_texel`.
-    samples : int
-        A power of two.
-    background : (H, W) float32
-        What is seen where no surface is.
+    `light` (2 H, 2 W) or (H, W) is at first the background, and becomes the mean reflectance of
+    what each quarter of a pixel, or each pixel, sees; the weights of all exposures add up to 1.
+    `samples`, a power of two, rays are cast where `crossed` (2 H, 2 W) is 1. `rays` (H, W, 6): x, y
+    through the pixel's centre, and dx/du, dx/dv, dy/du, dy/dv. `boxes` as from `mark_edges`.
     """
     height, width = background.shape
     coarse = light.shape[0] == height
     if coarse:
         weight *= 0.25
-    surfaces = len(sizes)
-    candidates = np.empty(surfaces, np.int64)
-    here = np.empty(surfaces, np.int64)
+    total_surfaces = len(surfaces.sizes)
+    candidates = np.empty(total_surfaces, np.int64)
+    here = np.empty(total_surfaces, np.int64)
     # Hammersley's points: equally spaced in either direction.
     point_x, point_y = np.empty(samples), np.empty(samples)
     for k in range(samples):
@@ -308,7 +269,7 @@ def shade(
         for left in range(0, width, TILE):
             right = min(left + TILE, width)
             count = 0
-            for s in range(surfaces):
+            for s in range(total_surfaces):
                 across = boxes[s, 0] < right and boxes[s, 2] >= left
                 if across and boxes[s, 1] < bottom and boxes[s, 3] >= top:
                     candidates[count] = s
@@ -331,14 +292,14 @@ def shade(
                     if not on_edge and not known:
                         found, value = nearest_surface(
                             rays[row, column, 0], rays[row, column, 1],
-                            candidates, count, to_texel, sizes, starts, texels, smooth,
+                            candidates, count, surfaces,
                         )  # fmt: skip
                         known = True
                     if on_edge:
                         known = False
                     elif found < 0:
                         continue
-                    elif not smooth[found]:
+                    elif not surfaces.smooth[found]:
                         change = np.float32(weight * (value - behind))
                         if coarse:
                             light[row, column] += np.float32(4.0) * change
@@ -380,7 +341,7 @@ def shade(
                                     dv += 0.5 * (q - int(q)) - 0.25
                                 hit, seen = nearest_surface(
                                     x + xu * du + xv * dv, y + yu * du + yv * dv,
-                                    here, near, to_texel, sizes, starts, texels, smooth,
+                                    here, near, surfaces,
                                 )  # fmt: skip
                                 if hit >= 0:
                                     total += seen - behind
@@ -392,40 +353,12 @@ def shade(
 
 
 @nb.njit(cache=True, error_model="numpy")
-def count_visible(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    surface: int,
-    to_texel: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.float32],
-    smooth: NDArray[np.uint8],
-) -> int:
+def count_visible(x: FloatArray, y: FloatArray, surface: int, surfaces: SurfaceArrays) -> int:
     """How many of the rays (x, y, 1) meet the given surface before any other."""
-    surfaces = len(sizes)
-    candidates = np.arange(surfaces)
+    candidates = np.arange(len(surfaces.sizes))
     seen = 0
     for k in range(len(x)):
-        found, _ = nearest_surface(
-            x[k], y[k], candidates, surfaces, to_texel, sizes, starts, texels, smooth
-        )
+        found, _ = nearest_surface(x[k], y[k], candidates, len(candidates), surfaces)
         if found == surface:
             seen += 1
     return seen
-
-
-@nb.njit(cache=True, error_model="numpy")
-def grey_values(
-    grey: NDArray[np.float32], noise: NDArray[np.float32], sigma: float
-) -> NDArray[np.uint8]:
-    """Grey values with noise, rounded (halves up) and cut to 8 bits; all arrays are (H, W)."""
-    rows, columns = grey.shape
-    result = np.empty((rows, columns), np.uint8)
-    s = np.float32(sigma)
-    half = np.float32(0.5)
-    for r in range(rows):
-        for c in range(columns):
-            value = grey[r, c] + s * noise[r, c] + half
-            result[r, c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
-    return result

@@ -1,30 +1,41 @@
-"""A session in a room: where the robot stands and drives, what each camera sees of it, and when."""
+"""A session in a room: where the robot drives, what each camera sees, and its folder."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from camera import Camera
-from redetect.groundtruth.geometry.transforms import apply, inverse, planar_transform
-from redetect.groundtruth.markers.calibration import Network, Rig
-from tools.simulator.markers.clutter import Grey
-from tools.simulator.markers.imaging import Imaging, grey_image, uneven_light
-from tools.simulator.markers.prints import BLACK, WHITE
-from tools.simulator.markers.rendering import SurfaceArrays, render_light
-from tools.simulator.markers.robot import FOOTPRINT_M, robot_rig, robot_surfaces
+from camera import Camera, format_camera, write_camera
+from redetect.groundtruth.geometry.transforms import apply, exp_se3, inverse, planar_transform
+from redetect.groundtruth.markers.calibration import Network, Rig, write_network, write_rig
+from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from redetect.storage import write_whole
+from tools.arrays import ByteArray, Float32Array, FloatArray
+from tools.simulator.markers.rendering import (
+    Imaging,
+    grey_image,
+    render_light,
+    surface_arrays,
+    uneven_light,
+)
 from tools.simulator.markers.room import (
     CAMERA_NAMES,
+    FOOTPRINT_M,
     lit,
     obstacles,
+    robot_rig,
+    robot_surfaces,
     room_cameras,
     room_surfaces,
 )
-from tools.simulator.markers.surface import FloatArray, Surface
+from tools.simulator.markers.surface import BLACK, WHITE, Surface
 from tools.simulator.markers.truth import (
     MarkerTruth,
     marker_corners,
@@ -32,6 +43,60 @@ from tools.simulator.markers.truth import (
     slant_deg,
     visible_shares,
 )
+from tools.simulator.parallel import in_order
+
+
+@dataclass(frozen=True)
+class CalibrationErrors:
+    """Standard deviations of the errors in what a session's files say of cameras and robot."""
+
+    network_m: float = 0.0  # Of each camera's place along each axis (m).
+    network_deg: float = 0.0  # Of each camera's rotation about each axis (degrees).
+    rig_m: float = 0.0  # Of each marker's place on the robot along each axis (m).
+    rig_deg: float = 0.0  # Of each marker's rotation about each axis (degrees).
+    focal: float = 0.0  # Of the focal lengths, as a share of them.
+    centre_px: float = 0.0  # Of the principal point along each axis (pixels).
+
+    @property
+    def any(self) -> bool:
+        """Whether there are errors at all."""
+        return any(vars(self).values())
+
+
+def disturbed_network(
+    network: Network, errors: CalibrationErrors, rng: np.random.Generator
+) -> Network:
+    """The network as a calibration with such errors would have it, covariances included."""
+    count = len(network.names)
+    sigmas = _sigmas(errors.network_m, errors.network_deg)
+    poses = network.world_from_camera @ exp_se3(sigmas * rng.standard_normal((count, 6)))
+    cameras = tuple(_disturbed_lens(camera, errors, rng) for camera in network.cameras)
+    return replace(
+        network, cameras=cameras, world_from_camera=poses,
+        covariance=np.diag(np.tile(sigmas**2, count)),
+    )  # fmt: skip
+
+
+def disturbed_rig(rig: Rig, errors: CalibrationErrors, rng: np.random.Generator) -> Rig:
+    """The rig as a calibration with such errors would have it; see `disturbed_network`."""
+    count = len(rig.ids)
+    sigmas = _sigmas(errors.rig_m, errors.rig_deg)
+    poses = rig.robot_from_marker @ exp_se3(sigmas * rng.standard_normal((count, 6)))
+    return replace(rig, robot_from_marker=poses, covariance=np.diag(np.tile(sigmas**2, count)))
+
+
+def _disturbed_lens(camera: Camera, errors: CalibrationErrors, rng: np.random.Generator) -> Camera:
+    factor = 1.0 + errors.focal * rng.standard_normal()
+    du, dv = errors.centre_px * rng.standard_normal(2)
+    return replace(
+        camera, scale_x=camera.scale_x * factor, scale_y=camera.scale_y * factor,
+        offset_x=camera.offset_x + float(du), offset_y=camera.offset_y + float(dv),
+    )  # fmt: skip
+
+
+def _sigmas(metres: float, degrees: float) -> FloatArray:
+    return np.repeat([metres, np.radians(degrees)], 3)
+
 
 _FIRST_S = 1000.0
 _STANDING_S = 2.0
@@ -43,38 +108,22 @@ _SHADOW = 0.45
 class SessionSettings:
     """What a session is to be like."""
 
-    name: str = "session"
-    """Its name; those of the images begin with it."""
-    seed: int = 1
-    """Everything about it follows from this."""
-    cameras: int = 4
-    """Cameras in the corners of the room, 1 to 4."""
-    area_m: tuple[float, float] = (6.0, 4.5)
-    """Extent of the area in which the robot drives (m)."""
-    width: int = 1280
-    """Of the images (pixels)."""
-    height: int = 960
-    """Of the images (pixels)."""
-    references: int = 23
-    """Poses at which the robot stands still, before the drive."""
-    steps: int = 300
-    """Images of the drive per camera."""
-    rate_hz: float = 5.0
-    """Images per second of the drive."""
-    speed_m_s: float = 0.35
-    """Mean speed of the drive (m/s)."""
-    exposure_s: float = 0.012
-    """How long the shutter is open (s)."""
-    dictionary: str = "rawseeds"
-    """Set of the robot's markers."""
-    marker_m: float = 0.2
-    """Width of the black squares (m)."""
-    blur_px: float = 0.8
-    """Standard deviation of the optics' blur (pixels)."""
-    noise_grey: float = 2.0
-    """Standard deviation of the noise (grey levels)."""
-    samples: int = 16
-    """Rays in each quarter of a pixel that an edge crosses."""
+    name: str = "session"  # Its name; those of the images begin with it.
+    seed: int = 1  # Everything about it follows from this.
+    cameras: int = 4  # Cameras in the corners of the room, 1 to 4.
+    area_m: tuple[float, float] = (6.0, 4.5)  # Extent of the area in which the robot drives (m).
+    width: int = 1280  # Of the images (pixels).
+    height: int = 960  # Of the images (pixels).
+    references: int = 23  # Poses at which the robot stands still, before the drive.
+    steps: int = 300  # Images of the drive per camera.
+    rate_hz: float = 5.0  # Images per second of the drive.
+    speed_m_s: float = 0.35  # Mean speed of the drive (m/s).
+    exposure_s: float = 0.012  # How long the shutter is open (s).
+    dictionary: str = "rawseeds"  # Set of the robot's markers.
+    marker_m: float = 0.2  # Width of the black squares (m).
+    blur_px: float = 0.8  # Standard deviation of the optics' blur (pixels).
+    noise_grey: float = 2.0  # Standard deviation of the noise (grey levels).
+    samples: int = 16  # Rays in each quarter of a pixel that an edge crosses.
 
 
 Purpose = Literal["rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame"]
@@ -90,39 +139,19 @@ def random_for(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class SessionPlan:
-    """A session that needs only be rendered, everything exactly true.
-
-    Attributes
-    ----------
-    settings : SessionSettings
-    rig : Rig
-        The robot's markers.
-    network : Network
-        The cameras.
-    times_s : (N,) float64
-        Of the images; the first `references` are of the robot standing still.
-    poses : (N, 3) float64
-        x, y (m) and heading (rad) of the robot in the world.
-    speeds : (N, 3) float64
-        Their derivatives by time.
-    robot : tuple of Surface
-        Robot frame; the first are the rig's boards in its order.
-    things : tuple of Surface
-        What stands beside the area, world frame.
-    room : tuple of Surface
-        What is behind all that, world frame.
-    """
+    """A session that needs only be rendered, everything exactly true."""
 
     settings: SessionSettings
-    rig: Rig
-    network: Network
+    rig: Rig  # The robot's markers.
+    network: Network  # The cameras.
     times_s: FloatArray
-    poses: FloatArray
-    speeds: FloatArray
-    robot: tuple[Surface, ...]
-    things: tuple[Surface, ...]
-    room: tuple[Surface, ...]
-    _backgrounds: dict[int, Grey] = field(default_factory=dict)
+    """(N,) Of the images; the first `references` are of the robot standing still."""
+    poses: FloatArray  # (N, 3) x, y (m) and heading (rad) of the robot in the world.
+    speeds: FloatArray  # (N, 3) Their derivatives by time.
+    robot: tuple[Surface, ...]  # Robot frame; the first are the rig's boards in its order.
+    things: tuple[Surface, ...]  # What stands beside the area, world frame.
+    room: tuple[Surface, ...]  # What is behind all that, world frame.
+    _backgrounds: dict[int, Float32Array] = field(default_factory=dict)
 
     @property
     def references(self) -> int:
@@ -138,7 +167,7 @@ class SessionPlan:
         """Name of a frame's image, without extension; the same for all cameras."""
         return f"{self.settings.name}.{frame:04d}"
 
-    def background(self, camera: int) -> Grey:
+    def background(self, camera: int) -> Float32Array:
         """(H, W) float32 what a camera sees of the room without robot; worked out once."""
         if camera not in self._backgrounds:
             model = self.network.cameras[camera]
@@ -147,7 +176,7 @@ class SessionPlan:
             self._backgrounds[camera] = render_light(model, [seen], empty, fine=False)
         return self._backgrounds[camera]
 
-    def illumination(self, camera: int) -> Grey:
+    def illumination(self, camera: int) -> Float32Array:
         """(H, W) float32 vignetting and unevenness of a camera's image, the same at all times."""
         model = self.network.cameras[camera]
         rng = random_for(self.settings.seed, "light", camera)
@@ -158,27 +187,12 @@ class SessionPlan:
 class View:
     """What one camera saw at one time."""
 
-    image: NDArray[np.uint8]
-    markers: tuple[MarkerTruth, ...]
-    """The rig's markers that have any part in view."""
+    image: ByteArray
+    markers: tuple[MarkerTruth, ...]  # The rig's markers that have any part in view.
 
 
 def plan_session(settings: SessionSettings) -> SessionPlan:
-    """Build the room and the robot, and drive.
-
-    Parameters
-    ----------
-    settings : SessionSettings
-
-    Returns
-    -------
-    SessionPlan
-
-    Raises
-    ------
-    ValueError
-        If there are not 1 to 4 cameras.
-    """
+    """Build the room and the robot, and drive."""
     seed = settings.seed
     if not 1 <= settings.cameras <= len(CAMERA_NAMES):
         raise ValueError(f"{settings.cameras} cameras: expected 1 to {len(CAMERA_NAMES)}")
@@ -257,23 +271,7 @@ def view_frame(plan: SessionPlan, camera: int, frame: int) -> View:
 def view_robot(
     plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray, noise: int
 ) -> View:
-    """What a camera sees of the robot.
-
-    Parameters
-    ----------
-    plan : SessionPlan
-        The session.
-    camera : int
-        Which one of its cameras.
-    pose, speed : (3,) float64
-        x, y (m) and heading (rad) of the robot in the world, and their derivatives (1/s).
-    noise : int
-        Chooses the noise, together with seed and camera.
-
-    Returns
-    -------
-    View
-    """
+    """What a camera sees of the robot. `pose`, `speed` (3,)."""
     settings, model = plan.settings, plan.network.cameras[camera]
     camera_from_world = plan.camera_from_world[camera]
     exposures = [
@@ -316,10 +314,8 @@ def _instants(
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Grey:
+def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     """The background with the robot's soft shadow on the floor."""
-    import cv2
-
     background, model = plan.background(camera), plan.network.cameras[camera]
     x, y = 1.15 * np.array(FOOTPRINT_M)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
@@ -345,10 +341,14 @@ def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Grey:
 
 
 def _markers(
-    plan: SessionPlan, model: Camera, surfaces: list[Surface], illumination: Grey, gain: float
+    plan: SessionPlan,
+    model: Camera,
+    surfaces: list[Surface],
+    illumination: Float32Array,
+    gain: float,
 ) -> tuple[MarkerTruth, ...]:
     result = []
-    arrays = SurfaceArrays(model, surfaces)
+    arrays = surface_arrays(model, surfaces)
     for which, (marker, width) in enumerate(zip(plan.rig.ids, plan.rig.widths_m)):
         card = surfaces[which]
         visible, rim = visible_shares(model, surfaces, which, float(width), arrays)
@@ -367,3 +367,178 @@ def _markers(
             )
         )  # fmt: skip
     return tuple(result)
+
+
+ImageFormat = Literal["png", "jpg"]
+
+NOTE = (
+    "SIMULATED, rendered by tools/simulator: no real robot drove here, and no real room looks "
+    "like this"
+)
+
+_CONVENTIONS = {
+    "world": "metres, z up, the floor is z = 0; the robot's area spans x and y from 0",
+    "robot": "origin on the floor, x forward, y left, z up; theta: heading of x in the world, "
+    "counter-clockwise (rad)",
+    "marker": "origin at its centre, x right, y up, z out of the printed face; corners top left, "
+    "top right, bottom right, bottom left of the marker as printed",
+    "camera": "x right, y down, z forward; pixels u right, v down, (0, 0) the centre of the top "
+    "left pixel; corners are where the lens images them, distortion included",
+    "visible": "share of the black square that is in the image and not hidden; rim_visible: of the "
+    "white rim round it",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """The truth of one image."""
+
+    camera: str
+    prefix: str
+    time_s: float
+    markers: tuple[MarkerTruth, ...]
+
+
+@dataclass(frozen=True)
+class SessionWriter:
+    """How a session's files are written."""
+
+    errors: CalibrationErrors = CalibrationErrors()
+    """Of what the calibration files say; images are always rendered with the true ones."""
+    image_format: ImageFormat = "jpg"  # `png` without loss, or `jpg`.
+    quality: int = 92  # Of the jpg files.
+    overwrite: bool = False  # Whether existing files may be replaced.
+
+    def text(self, path: Path, content: str) -> None:
+        """Write a text file."""
+        with write_whole(path, overwrite=self.overwrite) as stream:
+            stream.write(content.encode())
+
+    def calibrations(self, plan: SessionPlan, folder: Path) -> None:
+        """Write ``network.json``, ``rig.json`` and a ``.cam`` per camera; make the folders."""
+        seed = plan.settings.seed
+        network = disturbed_network(plan.network, self.errors, random_for(seed, "errors", 0))
+        rig = disturbed_rig(plan.rig, self.errors, random_for(seed, "errors", 1))
+        for name, camera in zip(network.names, network.cameras):
+            (folder / name / "images").mkdir(parents=True, exist_ok=True)
+            write_camera(camera, folder / name / f"{name}.cam", overwrite=self.overwrite)
+        extra = {"note": NOTE, "errors": asdict(self.errors)}
+        write_network(folder / "network.json", network, extra, overwrite=self.overwrite)
+        write_rig(folder / "rig.json", rig, extra, overwrite=self.overwrite)
+
+    def image(self, folder: Path, camera: str, prefix: str, image: ByteArray) -> str:
+        """Write a camera's image; returns its place in the session's folder."""
+        place = f"{camera}/images/{prefix}.{self.image_format}"
+        jpg = self.image_format == "jpg"
+        options = [cv2.IMWRITE_JPEG_QUALITY, self.quality] if jpg else []
+        done, encoded = cv2.imencode(f".{self.image_format}", image, options)
+        if not done:
+            raise ValueError(f"{place}: an image of {image.shape} could not be encoded")
+        with write_whole(folder / place, overwrite=self.overwrite) as stream:
+            stream.write(bytes(encoded))
+        return place
+
+    def times(self, folder: Path, plan: SessionPlan, seen: Sequence[SeenFrame]) -> None:
+        """Write the rows ``prefix seconds`` of each camera's images, in the order of time."""
+        for name in plan.network.names:
+            own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
+            rows = [f"# {NOTE}", "# image seconds", *(f"{s.prefix} {s.time_s:.6f}" for s in own)]
+            self.text(folder / name / f"{name}.times", "\n".join(rows) + "\n")
+
+    def poses(self, path: Path, times_s: FloatArray, poses: FloatArray) -> None:
+        """Write rows t, x, y, theta as RAWSEEDS' streams have them."""
+        write_planar_poses(path, PlanarPoses(times_s, poses), overwrite=self.overwrite)
+
+    def truth(
+        self, path: Path, plan: SessionPlan, seen: Sequence[SeenFrame],
+        extra: dict[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Write all that is known: true calibrations, and markers image by image."""
+        network, rig = plan.network, plan.rig
+        head: dict[str, Any] = {
+            "note": NOTE,
+            "conventions": _CONVENTIONS,
+            "settings": asdict(plan.settings),
+            "errors": asdict(self.errors),
+            "references": plan.references,
+            "cameras": {
+                name: {"calibration": format_camera(camera), "world_from_camera": _rows_of(pose)}
+                for name, camera, pose in zip(
+                    network.names, network.cameras, network.world_from_camera
+                )
+            },
+            "markers": {
+                str(marker): {"width_m": float(width), "robot_from_marker": _rows_of(pose)}
+                for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
+            },
+            **(extra or {}),
+        }
+        frames = ",\n".join(
+            json.dumps(
+                {"camera": s.camera, "image": s.prefix, "t": s.time_s,
+                 "markers": [_marker_json(m) for m in s.markers]},
+                separators=(",", ":"),
+            )
+            for s in seen
+        )  # fmt: skip
+        self.text(path, json.dumps(head, indent=1)[:-2] + f',\n "frames": [\n{frames}\n ]\n}}\n')
+
+
+def write_session(
+    settings: SessionSettings,
+    folder: Path,
+    writer: SessionWriter | None = None,
+    *,
+    jobs: int = 1,
+    on_frame: Callable[[], None] | None = None,
+) -> int:
+    """Render a session and write its folder."""
+    plan, writer = plan_session(settings), writer or SessionWriter()
+    names = plan.network.names
+    writer.calibrations(plan, folder)
+    work = [(c, f) for c in range(len(names)) for f in range(len(plan.times_s))]
+    seen: list[SeenFrame] = []
+    for (camera, frame), view in zip(work, in_order(_view, plan, work, jobs)):
+        prefix = plan.prefix(frame)
+        writer.image(folder, names[camera], prefix, view.image)
+        seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))
+        if on_frame is not None:
+            on_frame()
+    writer.times(folder, plan, seen)
+    writer.poses(folder / "truth.csv", plan.times_s, plan.poses)
+    still = slice(0, plan.references)
+    writer.poses(folder / "reference.csv", plan.times_s[still], plan.poses[still])
+    writer.truth(folder / "truth.json", plan, seen)
+    return len(work)
+
+
+def _view(plan: SessionPlan, work: tuple[int, int]) -> View:
+    return view_frame(plan, *work)
+
+
+def _rows_of(pose: FloatArray) -> list[list[float]]:
+    """A (4, 4) transform's first three rows as plain numbers."""
+    return [[round(float(x), 12) for x in row] for row in pose[:3]]
+
+
+def _marker_json(marker: MarkerTruth) -> dict[str, Any]:
+    numbers = marker.as_json()
+    for known in ("dictionary", "width_m", "camera_from_marker"):
+        del numbers[known]
+    numbers["corners"] = np.round(marker.corners, 4).tolist()
+    return numbers
+
+
+DEMO = SessionSettings(
+    name="m",
+    seed=5,
+    cameras=2,
+    area_m=(2.2, 1.8),
+    width=800,
+    height=600,
+    references=4,
+    steps=14,
+    rate_hz=1.0,
+    speed_m_s=0.3,
+)
+DEMO_QUALITY = 90

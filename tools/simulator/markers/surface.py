@@ -1,4 +1,4 @@
-"""Textured rectangles in space, the only thing that scenes with markers are made of.
+"""Textured rectangles in space, of which scenes with markers consist, and what is printed on them.
 
 Frame of a surface, as of a marker: origin at its centre, x right, y up, z out of the printed face
 towards a viewer; metres.
@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from detect.markers.dictionaries import MarkerDictionary
+from tools.arrays import BoolArray, Float32Array, FloatArray
 
 #: Outward face of each side of a box, as the surface's x and y axes in the box's frame.
 _SIDES = {
@@ -25,19 +26,14 @@ _SIDES = {
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """What is printed on a surface.
+    """What is printed on a surface."""
 
-    Attributes
-    ----------
-    values : (R, C) float32
-        Reflectance of each texel, 0 black to 1 white; NaN is a hole. Row 0 is the upper edge.
-    smooth : bool
-        Whether it is interpolated between the texels' centres; else every texel is a rectangle of
-        one value with sharp edges. A smooth texture has no holes.
-    """
-
-    values: NDArray[np.float32]
+    values: Float32Array
+    """(R, C) Reflectance of each texel, 0 black to 1 white; NaN is a hole. Row 0 is the upper
+    edge."""
     smooth: bool = False
+    """Whether it is interpolated between the texels' centres; else every texel is a rectangle of
+    one value with sharp edges. A smooth texture has no holes."""
 
 
 def plain(value: float) -> Texture:
@@ -47,25 +43,14 @@ def plain(value: float) -> Texture:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A rectangle with a texture.
+    """A rectangle with a texture."""
 
-    Attributes
-    ----------
-    pose : (4, 4) float64
-        parent_from_surface.
-    width_m, height_m : float
-        Its extent along x and y.
-    texture : Texture
-        Of its printed face.
-    back : float
-        Reflectance of its other face; NaN where that one cannot be seen, as inside a box.
-    """
-
-    pose: FloatArray
-    width_m: float
+    pose: FloatArray  # (4, 4) parent_from_surface.
+    width_m: float  # Its extent along x and y.
     height_m: float
-    texture: Texture
+    texture: Texture  # Of its printed face.
     back: float = field(default=np.nan)
+    """Reflectance of its other face; NaN where that one cannot be seen, as inside a box."""
 
     def moved(self, transform: FloatArray) -> Surface:
         """The surface in another frame: `transform` is other_from_parent."""
@@ -102,22 +87,7 @@ def pose_of(x_axis: ArrayLike, y_axis: ArrayLike, origin: ArrayLike) -> FloatArr
 def box_sides(
     size_m: ArrayLike, textures: dict[str, Texture], pose: FloatArray | None = None
 ) -> list[Surface]:
-    """The sides of a box that stands on the origin.
-
-    Parameters
-    ----------
-    size_m : (3,) array
-        Its extent along x (front to rear), y (left to right) and z (height).
-    textures : dict
-        Of the sides ``front`` (+x), ``rear``, ``left`` (+y), ``right``, ``top``; those not named
-        are left out.
-    pose : (4, 4) array, optional
-        parent_from_box.
-
-    Returns
-    -------
-    list of Surface
-    """
+    """The sides of a box that stands on the origin. `size_m` (3,); `pose` (4, 4)."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
     parent = np.eye(4) if pose is None else pose
     centre = np.array([0.0, 0.0, 0.5 * height])
@@ -131,3 +101,129 @@ def box_sides(
         upward = 2.0 * float(np.abs(y_axis) @ half)
         result.append(Surface(parent @ local, across, upward, texture))
     return result
+
+
+#: Reflectance of printer's black and of paper.
+BLACK, WHITE = 0.05, 0.88
+
+#: What differs in fewer cells from a marker could rightly be taken for it.
+LEAST_DIFFERENCE = 3
+_TRIES = 64
+
+# Points along a cell by which a texture is looked at, and again for what is between them.
+_FINE = 4
+
+
+def marker_texture(
+    dictionary: MarkerDictionary,
+    marker_id: int,
+    *,
+    quiet_cells: int = 1,
+    black: float = BLACK,
+    white: float = WHITE,
+) -> Texture:
+    """A marker as it is printed, on a white card."""
+    where = np.flatnonzero(dictionary.ids == marker_id)
+    if len(where) == 0:
+        raise ValueError(f"marker {marker_id}: not in {dictionary.name}")
+    return pattern_texture(dictionary, dictionary.patterns[where[0]], quiet_cells, black, white)
+
+
+def pattern_texture(
+    dictionary: MarkerDictionary,
+    pattern: BoolArray,
+    quiet_cells: int = 1,
+    black: float = BLACK,
+    white: float = WHITE,
+) -> Texture:
+    """Any pattern laid out as the dictionary's markers are; parameters as in `marker_texture`."""
+    cells = round(1.0 / dictionary.cell)
+    first = dictionary.centres[0] * cells - 0.5
+    # The cells of RAWSEEDS lie half a cell off the others' grid.
+    per_cell = 1 if abs(first - round(first)) < 1e-9 else 2
+    quiet = quiet_cells * per_cell
+    side = cells * per_cell + 2 * quiet
+    values = np.full((side, side), white, dtype=np.float32)
+    values[quiet : side - quiet, quiet : side - quiet] = black
+    begin = quiet + round(first * per_cell)
+    inner = np.repeat(np.repeat(pattern, per_cell, axis=0), per_cell, axis=1)
+    end = begin + len(inner)
+    values[begin:end, begin:end][inner] = white
+    return Texture(values)
+
+
+def marker_surface(
+    dictionary: MarkerDictionary,
+    marker_id: int,
+    width_m: float,
+    pose: FloatArray,
+    *,
+    quiet_cells: int = 1,
+    black: float = BLACK,
+    white: float = WHITE,
+    back: float = 0.3,
+) -> Surface:
+    """A marker whose black square is `width_m` wide, as a card in space. `pose` (4, 4)."""
+    texture = marker_texture(
+        dictionary, marker_id, quiet_cells=quiet_cells, black=black, white=white
+    )
+    card_m = width_m * (1.0 + 2.0 * quiet_cells * dictionary.cell)
+    return Surface(pose, card_m, card_m, texture, back)
+
+
+def pattern_distance(dictionary: MarkerDictionary, pattern: BoolArray) -> int:
+    """In how many cells a pattern differs, in any of its four rotations, from the nearest marker.
+    `pattern` (G, G).
+    """
+    known = dictionary.patterns.reshape(len(dictionary), -1)
+    turned = np.stack([np.rot90(pattern, k).ravel() for k in range(4)])
+    return int(min(np.count_nonzero(known != t, axis=1).min() for t in turned))
+
+
+def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
+    """In how many cells a dark thing on a light ground differs from the nearest marker."""
+    import cv2
+
+    dark = texture.values < 0.5 * (BLACK + WHITE)
+    if texture.smooth or not dark.any():
+        return float("inf")
+    rows, columns = np.flatnonzero(dark.any(axis=1)), np.flatnonzero(dark.any(axis=0))
+    square = ~dark[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    units = round(1.0 / dictionary.cell) * _FINE
+    fine = cv2.resize(
+        square.astype(np.float32), (units * _FINE, units * _FINE), interpolation=cv2.INTER_NEAREST
+    )
+    half = 0.5 * dictionary.cell
+    limits = np.rint((dictionary.centres[:, None] + [-half, half]) * len(fine)).astype(int)
+    cells = np.array([[fine[a:b, c:d].mean() for c, d in limits] for a, b in limits])
+    known = dictionary.patterns.reshape(len(dictionary), -1)
+    turned = (np.rot90(cells, k).ravel() for k in range(4))
+    return float(min(np.abs(known - t).sum(axis=1).min() for t in turned))
+
+
+def near_pattern(dictionary: MarkerDictionary, rng: np.random.Generator) -> tuple[BoolArray, int]:
+    """A pattern laid out as the dictionary's, but of no marker in it.
+
+    Half of the patterns are random, half are markers some of whose cells were changed.
+
+    Returns `pattern` (G, G).
+    """
+    used = dictionary.patterns.any(axis=0)
+    changed = rng.random() < 0.5
+    best: tuple[BoolArray, int] | None = None
+    for _ in range(_TRIES):
+        if changed:
+            pattern = dictionary.patterns[rng.integers(len(dictionary))].copy()
+            cells = np.argwhere(used)
+            chosen = rng.choice(len(cells), rng.integers(3, 9), replace=False)
+            pattern[tuple(cells[chosen].T)] ^= True
+        else:
+            pattern = (rng.random(used.shape) < rng.uniform(0.3, 0.7)) & used
+        distance = pattern_distance(dictionary, pattern)
+        if best is None or distance > best[1]:
+            best = pattern, distance
+        if distance >= LEAST_DIFFERENCE:
+            break
+    if best is None:
+        raise RuntimeError("no pattern was tried")
+    return best

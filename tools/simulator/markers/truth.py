@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.markers.kernels import count_visible
-from tools.simulator.markers.rendering import SurfaceArrays
-from tools.simulator.markers.surface import FloatArray, Surface, square_corners
+from tools.arrays import FloatArray
+from tools.simulator.markers.kernels import SurfaceArrays, count_visible
+from tools.simulator.markers.surface import Surface, square_corners
 
 # Of the grid of points by which it is told how much of a marker is seen.
 _POINTS = 24
@@ -25,42 +24,19 @@ RIM = 0.06
 
 @dataclass(frozen=True, eq=False)
 class MarkerTruth:
-    """A marker in an image.
+    """A marker in an image."""
 
-    Attributes
-    ----------
-    dictionary : str
-        Which set it is from.
-    id : int
-        Its number there.
-    corners : (4, 2) float64
-        u, v (px, distortion included) of top left, top right, bottom right, bottom left.
-    camera_from_marker : (4, 4) float64
-        Where it is.
-    width_m : float
-        Width of its black square.
-    width_px : float
-        Mean length of its four sides in the image.
-    slant_deg : float
-        Between its normal and the line from its centre to the camera.
-    contrast_grey : float
-        White minus black in grey levels, at its centre.
-    visible : float
-        Share of the black square that is in the image and not hidden.
-    rim_visible : float
-        The same of the white rim round it, up to 6 % of its width.
-    """
-
-    dictionary: str
-    id: int
+    dictionary: str  # Which set it is from.
+    id: int  # Its number there.
     corners: FloatArray
-    camera_from_marker: FloatArray
-    width_m: float
-    width_px: float
-    slant_deg: float
-    contrast_grey: float
-    visible: float
-    rim_visible: float
+    """(4, 2) u, v (px, distortion included) of top left, top right, bottom right, bottom left."""
+    camera_from_marker: FloatArray  # (4, 4) Where it is.
+    width_m: float  # Width of its black square.
+    width_px: float  # Mean length of its four sides in the image.
+    slant_deg: float  # Between its normal and the line from its centre to the camera.
+    contrast_grey: float  # White minus black in grey levels, at its centre.
+    visible: float  # Share of the black square that is in the image and not hidden.
+    rim_visible: float  # The same of the white rim round it, up to 6 % of its width.
 
     @property
     def clear(self) -> bool:
@@ -104,38 +80,16 @@ def slant_deg(camera_from_marker: FloatArray) -> float:
 
 
 def visible_shares(
-    camera: Camera,
-    surfaces: Sequence[Surface],
-    which: int,
-    width_m: float,
-    arrays: SurfaceArrays | None = None,
+    camera: Camera, surfaces: Sequence[Surface], which: int, width_m: float, arrays: SurfaceArrays
 ) -> tuple[float, float]:
-    """How much of a marker is in the image and not hidden.
+    """How much of a marker's black square, and of the rim round it, is in the image and not hidden.
 
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    surfaces : sequence of Surface
-        All of the scene, in the camera frame.
-    which : int
-        The marker's card among them.
-    width_m : float
-        Width of its black square.
-    arrays : SurfaceArrays, optional
-        Of the same surfaces, if they are at hand.
-
-    Returns
-    -------
-    visible, rim_visible : float
-        Shares of the black square and of the rim round it; 0 where the card shows its back.
+    `surfaces` are all of the scene in the camera frame, `which` is the marker's card among them,
+    `arrays` are the same surfaces for the kernels. 0 where the card shows its back.
     """
     card = surfaces[which]
-    if slant_deg(card.pose) >= 90.0:
-        return 0.0, 0.0
-    if arrays is None:
-        arrays = SurfaceArrays(camera, surfaces)
-    if which not in arrays.index:
+    number = np.flatnonzero(arrays.given == which)
+    if slant_deg(card.pose) >= 90.0 or len(number) == 0:
         return 0.0, 0.0
     ticks = (np.arange(_POINTS) + 0.5) / _POINTS - 0.5
     a, b = np.meshgrid(ticks, ticks)
@@ -149,18 +103,8 @@ def visible_shares(
     for points in (square, rim):
         at = width_m * points @ card.pose[:3, :2].T + card.pose[:3, 3]
         pixels = camera.project(at)
-        inside = (
-            (pixels[:, 0] > -0.5)
-            & (pixels[:, 0] < camera.width - 0.5)
-            & (pixels[:, 1] > -0.5)
-            & (pixels[:, 1] < camera.height - 0.5)
-        )
-        seen: NDArray[np.float64] = at[inside]
-        count = count_visible(
-            np.ascontiguousarray(seen[:, 0] / seen[:, 2]),
-            np.ascontiguousarray(seen[:, 1] / seen[:, 2]),
-            arrays.index.index(which), arrays.to_texel, arrays.sizes, arrays.starts, arrays.texels,
-            arrays.smooth,
-        )  # fmt: skip
-        shares.append(count / len(points))
+        size = np.array([camera.width, camera.height])
+        seen = at[np.all((pixels > -0.5) & (pixels < size - 0.5), axis=1)]
+        x, y = np.ascontiguousarray((seen[:, :2] / seen[:, 2:]).T)
+        shares.append(count_visible(x, y, int(number[0]), arrays) / len(points))
     return shares[0], shares[1]

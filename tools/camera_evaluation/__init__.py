@@ -1,1 +1,0 @@
-"""What calibrating and converting cameras is worth: rendered boards, photographs, conversions."""

@@ -1,0 +1,77 @@
+"""How well rows are associated, by method and by added noise."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from redetect.slam.association.frame_to_frame import LocalSettings
+from redetect.slam.association.run import AssociateSettings, associate_run
+from redetect.slam.commands.associate import score_run
+from redetect.slam.commands.filter_input import camera_xy_of
+from redetect.slam.noise import with_relative_noise
+from redetect.slam.recording import read_recording
+from tools.evaluation.tables import Table, write_json
+
+
+@dataclass(frozen=True)
+class Association:
+    """Associate runs with each method at several levels of noise, and score the results.
+
+    They are compared with the runs' own IDs, before and after the map level.
+    """
+
+    runs: Positional[tuple[Path, ...]]  # Run folders or landmark files with IDs.
+    circles: bool = False  # Use the discs; the default where neither kind is asked for.
+    lines: bool = False  # Use the vertical lines.
+    methods: tuple[Literal["nearest", "joint"], ...] = ("nearest", "joint")  # See `slam associate`.
+    noise: tuple[float, ...] = (0.0, 1.0, 2.0)
+    """Added noise as a factor on the rows' own standard deviations."""
+    sigma_scale: float = 1.4  # Factor on the discs' standard deviations in all gates.
+    seed: int = 1  # Of the noise.
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None  # Write all numbers there as JSON.
+    force: bool = False  # Replace an existing file.
+
+    def __call__(self) -> int:
+        results: list[dict[str, Any]] = []
+        table = Table(
+            {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
+             "precision": ".4f", "recall": ".4f", "rows right": ".4f", "landmarks": "d",
+             "true": "d", "wrong merges": "d", "splits": "d", "s": "6.1f"}
+        )  # fmt: skip
+        for path in self.runs:
+            name = path.name if path.is_dir() else f"{path.parent.name}/"
+            recording = read_recording(path, circles=self.circles or not self.lines,
+                                       lines=self.lines)  # fmt: skip
+            centre = camera_xy_of(recording, path)
+            camera_xy = (float(centre[0]), float(centre[1]))
+            for factor in self.noise:
+                noisy = with_relative_noise(recording, factor, self.seed)
+                for method in self.methods:
+                    local = LocalSettings(method=method, sigma_scale=self.sigma_scale)
+                    began = time.thread_time()
+                    found = associate_run(
+                        noisy, AssociateSettings(local=local), camera_xy=camera_xy
+                    )
+                    seconds = time.thread_time() - began
+                    scores = score_run(recording, found)
+                    for kind, level in ((k, v) for k in scores for v in scores[k]):
+                        s = scores[kind][level]
+                        table.row(
+                            name, factor, method, kind, level, s.pair_precision, s.pair_recall,
+                            s.right_rows, s.found_landmarks, s.true_landmarks, s.wrong_merges,
+                            s.splits, seconds,
+                        )  # fmt: skip
+                        results.append(
+                            {"run": name, "noise": factor, "method": method, "kind": kind,
+                             "level": level, **asdict(s), "seconds": seconds,
+                             "loop_matches": len(found.matches),
+                             "incomplete_frames": found.incomplete_frames}
+                        )  # fmt: skip
+        if self.output is not None:
+            write_json(self.output, results, overwrite=self.force)
+        return 0

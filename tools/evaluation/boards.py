@@ -1,0 +1,155 @@
+"""Pictures of calibration boards by ray casting through a camera, with exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from camera import Camera
+from camera.boards.board import Board
+from camera.calibration.model import rotation_of
+from tools.arrays import ByteArray, FloatArray, IntArray
+
+_PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
+# Dots of a ChArUco board's print per square.
+_DOTS = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Directions (x, y, 1) of all sub-pixels of a camera, (H * n, W * n, 2), and n."""
+
+    xy: FloatArray
+    samples: int
+    camera: Camera
+
+
+def rays_of(camera: Camera, samples: int = 4) -> Rays:
+    """The rays of a camera's sub-pixels, `samples` times `samples` to a pixel."""
+    inner = (np.arange(samples) + 0.5) / samples - 0.5
+    u = (np.arange(camera.width)[:, None] + inner).ravel()
+    v = (np.arange(camera.height)[:, None] + inner).ravel()
+    grid = np.stack(np.meshgrid(u, v), axis=-1)
+    return Rays(camera.undistort(grid), samples, camera)
+
+
+def render_board(
+    rays: Rays,
+    board: Board,
+    rotation: FloatArray,
+    translation: FloatArray,
+    *,
+    blur_px: float = 0.6,
+    noise: float = 2.0,
+    seed: int = 0,
+) -> ByteArray:
+    """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
+    import cv2
+
+    normal = rotation[:, 2]
+    along = rays.xy @ normal[:2] + normal[2]
+    depth = float(normal @ translation) / np.where(np.abs(along) > 1e-9, along, np.nan)
+    point = np.concatenate([rays.xy, np.ones_like(rays.xy[..., :1])], axis=-1) * depth[..., None]
+    on_board = (point - translation) @ rotation[:, :2]
+    visible = np.isfinite(depth) & (depth > 0.0)
+    fine = np.where(visible, _print(board, np.where(visible[..., None], on_board, 1e9)), _ROOM)
+    if blur_px > 0.0:
+        fine = cv2.GaussianBlur(fine, (0, 0), blur_px * rays.samples)
+    n = rays.samples
+    height, width = fine.shape[0] // n, fine.shape[1] // n
+    image = fine.reshape(height, n, width, n).mean(axis=(1, 3))
+    image = image + np.random.default_rng(seed).normal(scale=noise, size=image.shape)
+    return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
+
+
+def _print(board: Board, xy: FloatArray) -> FloatArray:
+    """Grey value of places on the board's plane, (..., 2) in metres."""
+    square = board.square_m
+    half = board.points[:, :2].max(axis=0) + (1.0 if "circles" not in board.kind else 1.5) * square
+    x, y = xy[..., 0], xy[..., 1]
+    inside = (np.abs(x) <= half[0]) & (np.abs(y) <= half[1])
+    margin = (np.abs(x) <= half[0] + square) & (np.abs(y) <= half[1] + square)
+    column = np.where(inside, (x + half[0]) / square, 0.0)
+    row = np.where(inside, (half[1] - y) / square, 0.0)
+    if board.kind == "checkerboard":
+        black = (np.floor(column) + np.floor(row)) % 2 == 0
+    elif board.kind == "charuco":
+        grey = _charuco(board)
+        r = np.clip((row * _DOTS).astype(int), 0, grey.shape[0] - 1)
+        c = np.clip((column * _DOTS).astype(int), 0, grey.shape[1] - 1)
+        black = grey[r, c] < 128
+    else:
+        black = np.zeros(x.shape, dtype=bool)
+        radius = 0.5 * (board.circle_m or square)
+        for centre in board.points:
+            black |= (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius**2
+    return np.asarray(np.where(inside & black, _INK, np.where(margin, _PAPER, _ROOM)))
+
+
+def _charuco(board: Board) -> ByteArray:
+    import cv2
+
+    pattern = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows),
+        board.square_m,
+        board.marker_m,
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
+    )
+    size = (_DOTS * board.columns, _DOTS * board.rows)
+    return np.asarray(pattern.generateImage(size), dtype=np.uint8)
+
+
+def board_poses(
+    camera: Camera,
+    board: Board,
+    count: int,
+    seed: int,
+    *,
+    distances_m: tuple[float, float],
+    tilt_rad: float = 0.45,
+    margin_px: float = 8.0,
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Poses `camera_from_board` in which all of a board is seen, spread over the image.
+
+    Half of them have the board's corner in a corner of the image, so that that is covered.
+    """
+    rng = np.random.default_rng(seed)
+    # Facing the camera: the board's y up is the camera's y down.
+    facing = np.diag([1.0, -1.0, -1.0])
+    size = np.array([camera.width, camera.height])
+    points = board.points
+    outer = np.abs(points[:, :2]).max(axis=0) + board.square_m
+    frame = np.array([[sx * outer[0], sy * outer[1], 0.0] for sx in (-1, 1) for sy in (-1, 1)])
+    poses: list[tuple[FloatArray, FloatArray]] = []
+    while len(poses) < count:
+        pixel = rng.uniform(margin_px, size - 1 - margin_px)
+        distance = rng.uniform(*distances_m)
+        direction = camera.unproject(pixel)
+        direction /= np.linalg.norm(direction)
+        towards = rotation_of(
+            np.arctan2(np.hypot(*direction[:2]), direction[2])
+            * np.array([-direction[1], direction[0], 0.0])
+            / max(np.hypot(*direction[:2]), 1e-12)
+        )
+        tilt = rotation_of(rng.normal(size=3) * np.array([tilt_rad, tilt_rad, 0.3]))
+        rotation = towards @ tilt @ facing
+        translation = distance * direction
+        if rotation[:, 2] @ translation >= 0.0:
+            continue
+        seen = camera.project(np.vstack([points, frame]) @ rotation.T + translation)
+        inside = np.isfinite(seen).all(axis=1) & (seen >= margin_px).all(axis=1)
+        inside = np.asarray(inside & (seen <= size - 1 - margin_px).all(axis=1))
+        if not inside[: len(points)].all() or (len(poses) % 2 == 0 and not inside.all()):
+            continue
+        if len(poses) % 2 == 1 and _corner_distance(seen[: len(points)], size) > 0.12:
+            continue
+        poses.append((rotation, translation))
+    return poses
+
+
+def _corner_distance(pixels: FloatArray, size: IntArray) -> float:
+    """Distance of the nearest point to a corner of the image, in diagonals."""
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (size - 1)
+    away = np.linalg.norm((pixels[:, None, :] - corners) / size, axis=-1)
+    return float(away.min())

@@ -1,0 +1,78 @@
+"""One way to write what studies find: tables on the terminal or in Markdown, JSON, pictures."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from redetect.storage import write_whole
+
+
+class Table:
+    """A table that is printed row by row.
+    `columns` maps headings to formats (`7.2f`, `<22`); a column is as wide as either says.
+    """
+
+    def __init__(self, columns: Mapping[str, str]) -> None:
+        self._formats = list(columns.values())
+        widths = [re.match(r"<?(\d*)", form) for form in self._formats]
+        self._widths = [
+            max(len(name), int(width.group(1) or 0) if width else 0)
+            for name, width in zip(columns, widths)
+        ]
+        self._print(columns)
+
+    def row(self, *values: object) -> None:
+        """Print a row; its values are in the order of the columns."""
+        self._print(format(value, form) for value, form in zip(values, self._formats, strict=True))
+
+    def _print(self, cells: Iterable[str]) -> None:
+        aligned = (
+            cell.ljust(width) if form.startswith("<") else cell.rjust(width)
+            for cell, width, form in zip(cells, self._widths, self._formats)
+        )
+        print("  ".join(aligned).rstrip(), flush=True)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown."""
+    rule = "|" + "---|" * len(head)
+    return [f"| {' | '.join(head)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
+
+
+def write_json(path: Path, content: Any, *, overwrite: bool) -> None:
+    """Write plain values as JSON, ending with a line end."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def picture(size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int) -> bytes:
+    """A PNG of what is drawn into a matplotlib figure: the same figures give the same bytes."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    stream = io.BytesIO()
+    with mpl.rc_context(mpl.rcParamsDefault):
+        figure = Figure(figsize=size_inches, layout="constrained")
+        FigureCanvasAgg(figure)
+        draw(figure)
+        figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
+    return stream.getvalue()
+
+
+@contextmanager
+def progress(label: str, total: int | None) -> Iterator[Callable[[], None]]:
+    """A bar on stderr; what it gives is called after each step."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=total)
+        yield lambda: bar.advance(task)

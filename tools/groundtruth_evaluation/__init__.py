@@ -1,1 +1,0 @@
-"""How good ground truth is: studies on real logs and on simulated sessions."""

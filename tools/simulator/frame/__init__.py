@@ -1,1 +1,0 @@
-"""One frame: rays through all pixels of the full, interlaced image."""

@@ -1,1 +1,0 @@
-"""How light spreads in the building before the first frame."""

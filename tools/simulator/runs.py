@@ -1,0 +1,506 @@
+"""Simulated runs: their plan, their frames, and their folders in the data set's layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from camera import Camera, parse_camera, write_camera
+from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
+from redetect.storage import write_whole
+from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from tools.simulator.building import EXTENT
+from tools.simulator.driving import (
+    DriveStyle,
+    drive,
+    measured_steps,
+    robot_tilt,
+    step_record,
+    tilted_camera,
+)
+from tools.simulator.furniture import DISC_RADIUS_M, lay_discs
+from tools.simulator.observation import (
+    SeenDisc,
+    SeenEdge,
+    circle_row,
+    line_row,
+    see_discs,
+    see_edges,
+)
+from tools.simulator.office import build_office, is_outside, office_route
+from tools.simulator.parallel import in_order
+from tools.simulator.renderer import Sensor, encode_jpeg, grey_values, render_light, smeared
+from tools.simulator.scene import Scene, UprightEdge, make_scene
+
+#: The published calibration of run e of the DLR Spatial Cognition data set.
+PUBLISHED_CAMERA = """\
+{ SmRadialDistortedCamera
+sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
+[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
+[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
+sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
+[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
+[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
+mountIndex: 0
+width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
+coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
+}
+"""
+
+_SUN = (0.30, -0.70, 0.50, 3.0)
+_SKY = 3.0
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What a simulated run is to be like."""
+
+    name: str = "sim"
+    frames: int = 3297
+    seed: int = 1
+    discs: int = 576
+    lookalikes: int = 140
+    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
+    skip: int = 0  # Steps of the drive that go by before the first frame.
+    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
+    camera_text: str = PUBLISHED_CAMERA
+    """Text of the calibration (.cam) through which the run is seen."""
+    style: DriveStyle = field(default_factory=DriveStyle)
+    sensor: Sensor = field(default_factory=Sensor)
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A run that needs only be rendered."""
+
+    settings: RunSettings
+    camera: Camera
+    scene: Scene
+    edges: list[UprightEdge]
+    pictures: list[tuple[float, float, float, float, float, float]]
+    disc_ids: IntArray
+    disc_xy: FloatArray
+    disc_radius_m: float
+    lookalikes: list[tuple[str, float, float]]
+    poses: FloatArray  # (frames + 1, 3) true poses: before the first step and after each.
+    tilts_rad: FloatArray  # (frames, 2) tilt (p, q) at each frame.
+    steps: FloatArray  # (frames, 3) odometry.
+    wrong_odometry: BoolArray
+    """(frames,) whether the odometry of the step is beyond its covariance."""
+    unlabelled: BoolArray  # (frames, discs) whether a row would not know the disc's ID.
+
+    def true_camera(self, frame: int) -> Camera:
+        """The camera as it is mounted at a frame, tilt included."""
+        return tilted_camera(self.camera, self.tilts_rad[frame])
+
+    def prefix(self, frame: int) -> str:
+        """Name of a frame's image, without extension."""
+        return f"{self.settings.name}.{frame:04d}"
+
+
+Purpose = Literal["building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows"]
+_PURPOSES: tuple[Purpose, ...] = (
+    "building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows",
+)  # fmt: skip
+
+
+def random_for(seed: int, purpose: Purpose) -> np.random.Generator:
+    """A stream of random numbers of its own for each purpose: changing one leaves the others."""
+    return np.random.default_rng(np.random.SeedSequence([seed, _PURPOSES.index(purpose)]))
+
+
+def random_for_frame(seed: int, frame: int) -> np.random.Generator:
+    """The random numbers of one frame, whatever was rendered before it."""
+    return np.random.default_rng(np.random.SeedSequence([seed, len(_PURPOSES), frame]))
+
+
+def plan_run(settings: RunSettings, *, lit: bool = True) -> RunPlan:
+    """Build the office, lay the discs and drive through it."""
+    seed, frames = settings.seed, settings.frames
+    camera = parse_camera(settings.camera_text, "the calibration")
+    office = build_office(random_for(seed, "building"))
+    corners = office_route(office, random_for(seed, "route"), settings.visits)
+    driven = drive(corners, settings.skip + frames, settings.style, random_for(seed, "drive"))
+    poses = driven[settings.skip :]
+    lay_discs(
+        office.building, poses, settings.discs, settings.lookalikes, random_for(seed, "marks"),
+        EXTENT,
+    )  # fmt: skip
+    scene = make_scene(
+        office.building, EXTENT, office.floor_kind, office.floorings, office.indoors, _SUN, _SKY,
+        lit=lit,
+    )  # fmt: skip
+    discs = [m for m in office.building.marks if m.disc_id >= 0]
+    wrong = is_outside(poses[1:]) | is_outside(poses[:-1])
+    chance = random_for(seed, "labels").random((frames, len(discs)))
+    return RunPlan(
+        settings=settings,
+        camera=camera,
+        scene=scene,
+        edges=office.building.distinct_edges(),
+        pictures=office.building.pictures,
+        disc_ids=np.array([m.disc_id for m in discs], dtype=np.int64),
+        disc_xy=np.array([[m.x, m.y] for m in discs]).reshape(-1, 2),
+        disc_radius_m=DISC_RADIUS_M,
+        lookalikes=[(m.label, m.x, m.y) for m in office.building.marks if m.disc_id < 0],
+        poses=poses,
+        tilts_rad=robot_tilt(frames, settings.style, random_for(seed, "tilt")),
+        steps=measured_steps(poses, random_for(seed, "odometry"), wrong),
+        wrong_odometry=wrong,
+        unlabelled=chance < settings.unlabelled,
+    )
+
+
+#: 80 frames: along a corridor, into a room with sunlit windows, back and on along the corridor.
+DEMO = RunSettings(
+    name="e",
+    frames=80,
+    seed=8,
+    discs=32,
+    lookalikes=16,
+    visits=0.8,
+    style=DriveStyle(step_m=0.25, tilt_deg=0.5),
+    sensor=Sensor(jpeg_quality=85),
+)
+
+
+SIMULATED = """\
+SIMULATED, rendered by tools/simulator ({what}): no real robot drove here.
+The real data set (runs c, d, e and g of the DLR Spatial Cognition data set, with images) is
+published on the page DlrSpatialCognitionDataSet of the University of Bremen's group AG EBV; its run
+folders have the same layout and take the place of this one unchanged.
+"""
+
+_STEP_FORMAT = """\
+The robot coordinate system is located in the robot's center with -Y pointing forward and X pointing
+left.
+STEP <image> <dX> <dY> <dPhi> <cXX> <cXY> <cYY> <cXPhi> <cYPhi> <cPhiPhi>
+A movement by odometry; the image was taken after it. Metres and radians."""
+
+_CIRCLE_FORMAT = """\
+LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>
+A disc that is truly in view, at its true place in the level robot frame. The covariance is the
+published detector's for that place in the image, the quality the published one there.
+ID -1: unknown."""
+
+_NOISY_CIRCLE_FORMAT = """\
+LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>
+A disc that is in view, at its true place in the level robot frame plus an error drawn from the
+covariance. Quality is always 1: there are no images. ID -1: unknown."""
+
+_LINE_FORMAT = """\
+LANDMARK_L <xtop> <ytop> <xbottom> <ybottom> <alpha> <beta> <quality> <sigma> <ID>
+A vertical edge that is truly in view where it crosses the horizon, and clear: its ends in
+undistorted normalised image coordinates, its true bearing, its inclination as the (level)
+calibration measures it, one pixel as standard deviation."""
+
+
+_UNLISTED_FORMAT = """\
+LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <ID>
+A disc that is at least partly in view but not listed in map.circles: nearly hidden, cut, or far."""
+
+_UNLISTED_LINES_FORMAT = """\
+LANDMARK_L <xtop> <ytop> <xbottom> <ybottom> <alpha> <beta> <quality> <sigma> <ID>
+A vertical edge that shows in the image but is not listed in map.lines: it does not cross the
+horizon, is short, faint or beside another one. Columns as there."""
+
+#: Least step across such an edge (grey values) and rows that show it: what a detector may find.
+_LEAST_STEP, _LEAST_ROWS = 4.0, 12
+
+_LOOKALIKE_FORMAT = """\
+LANDMARK_C <pX> <pY> 1 <cXX> <cXY> <cYY> <number>
+Something at least partly in view that looks like a disc but is none; truth.json says what."""
+
+#: Variance of the places in these two files, which are exact: a gate, square metres.
+_NOMINAL_VARIANCE = 0.04**2
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """What is truly in view in one frame, and the image's bytes if there is one."""
+
+    frame: int
+    jpeg: bytes | None
+    circles: tuple[CircleLandmark, ...]
+    lines: tuple[LineLandmark, ...]
+    discs: tuple[SeenDisc, ...]
+    edges: tuple[SeenEdge, ...]
+    lookalikes: tuple[SeenDisc, ...]
+
+
+def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
+    """Render one frame of a run and say what is in it."""
+    import cv2
+
+    rng = random_for_frame(plan.settings.seed, frame)
+    camera = plan.true_camera(frame)
+    pose = plan.poses[frame + 1]
+    light = render_light(plan.scene, camera, pose)
+    # The robot goes on as it came; half of the exposure lies after its middle.
+    onward = pose + 0.5 * plan.settings.sensor.exposure * (pose - plan.poses[frame])
+    radiance = smeared(light, camera, pose, onward)
+    grey = grey_values(radiance, plan.settings.sensor, rng)
+    jpeg = encode_jpeg(grey, plan.settings.sensor.jpeg_quality)
+    decoded = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    return _truth(plan, frame, jpeg, np.asarray(decoded, dtype=np.uint8))
+
+
+def _truth(plan: RunPlan, frame: int, jpeg: bytes | None, grey: ByteArray | None) -> FrameTruth:
+    camera, pose = plan.true_camera(frame), plan.poses[frame + 1]
+    discs = see_discs(
+        plan.scene, plan.camera, camera, pose, plan.disc_ids, plan.disc_xy, plan.disc_radius_m
+    )
+    edges = [] if grey is None else see_edges(plan.scene, camera, pose, plan.edges, grey)
+    unknown = {int(disc) for disc in plan.disc_ids[plan.unlabelled[frame]]}
+    return FrameTruth(
+        frame=frame,
+        jpeg=jpeg,
+        circles=tuple(
+            circle_row(d, plan.camera, grey, -1 if d.disc_id in unknown else d.disc_id)
+            for d in discs
+            if d.listed
+        ),
+        lines=tuple(line_row(e, plan.camera) for e in edges if e.listed),
+        discs=tuple(discs),
+        edges=tuple(edges),
+        lookalikes=_seen_lookalikes(plan, camera, pose),
+    )
+
+
+def _seen_lookalikes(plan: RunPlan, camera: Camera, pose: FloatArray) -> tuple[SeenDisc, ...]:
+    """What looks like a disc and is in view, by its number in the plan."""
+    if not plan.lookalikes:
+        return ()
+    xy = np.array([(x, y) for _, x, y in plan.lookalikes])
+    numbers = np.arange(len(xy))
+    return tuple(see_discs(plan.scene, plan.camera, camera, pose, numbers, xy, plan.disc_radius_m))
+
+
+def write_run(
+    settings: RunSettings,
+    folder: Path,
+    *,
+    jobs: int = 1,
+    overwrite: bool = False,
+    on_frame: Callable[[], None] | None = None,
+) -> int:
+    """Render a run and write its folder.
+
+    Parameters
+    ----------
+    settings : RunSettings
+        The run; its name should be the folder's.
+    folder : Path
+        Where it goes; made if missing.
+    jobs : int
+        Processes that render frames.
+    overwrite : bool
+        Whether existing files may be replaced.
+    on_frame : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    int
+        Number of disc rows.
+
+    Raises
+    ------
+    redetect.storage.OutputExistsError
+        If a file exists and `overwrite` is false.
+    """
+    plan = plan_run(settings)
+    name = settings.name
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    what = f"run {name}, seed {settings.seed}, {settings.frames} frames"
+    if settings.skip:
+        what += f" after {settings.skip} skipped"
+    write_camera(plan.camera, folder / f"{name}.cam", overwrite=overwrite)
+    truths: list[FrameTruth] = []
+    for truth in in_order(render_frame, plan, range(settings.frames), jobs):
+        if truth.jpeg is not None:
+            with write_whole(
+                images / f"{plan.prefix(truth.frame)}.jpg", overwrite=overwrite
+            ) as out:
+                out.write(truth.jpeg)
+        # The bytes of all images need not be kept.
+        truths.append(replace(truth, jpeg=None))
+        if on_frame is not None:
+            on_frame()
+    _write_steps(plan, folder, what, overwrite)
+    _write_landmarks(plan, folder / "map.circles", what, _CIRCLE_FORMAT,
+                     [t.circles for t in truths], overwrite)  # fmt: skip
+    _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, [t.lines for t in truths],
+                     overwrite)  # fmt: skip
+    write_beside(plan, folder, what, truths, overwrite=overwrite)
+    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
+        out.write(_truth_json(plan, truths, what).encode())
+    return sum(len(t.circles) for t in truths)
+
+
+def write_beside(
+    plan: RunPlan, folder: Path, what: str, truths: Sequence[FrameTruth], *, overwrite: bool
+) -> None:
+    """Write what is in view besides the listed discs, as `detect compare` reads it."""
+    unlisted, lookalikes = [], []
+    for truth in truths:
+        unlisted.append(tuple(_nominal_row(disc) for disc in truth.discs if not disc.listed))
+        lookalikes.append(tuple(_nominal_row(disc) for disc in truth.lookalikes))
+    for name, text, rows in (
+        ("unlisted.circles", _UNLISTED_FORMAT, unlisted),
+        ("lookalikes.circles", _LOOKALIKE_FORMAT, lookalikes),
+    ):
+        _write_landmarks(plan, folder / name, what, text, rows, overwrite)
+    edges = [
+        tuple(line_row(edge, plan.camera) for edge in truth.edges if _shows(edge))
+        for truth in truths
+    ]
+    if any(truth.edges for truth in truths):
+        place = folder / "unlisted.lines"
+        _write_landmarks(plan, place, what, _UNLISTED_LINES_FORMAT, edges, overwrite)
+
+
+def _shows(edge: SeenEdge) -> bool:
+    """Whether an edge that is not listed shows in the image."""
+    shows = abs(edge.contrast) >= _LEAST_STEP and edge.rows >= _LEAST_ROWS
+    return shows and not edge.listed
+
+
+def _nominal_row(disc: SeenDisc) -> CircleLandmark:
+    x, y = disc.robot_xy.tolist()
+    return CircleLandmark(x, y, 1.0, _NOMINAL_VARIANCE, 0.0, _NOMINAL_VARIANCE, (disc.disc_id,))
+
+
+def write_rows(
+    settings: RunSettings,
+    folder: Path,
+    *,
+    noisy: bool = True,
+    miss: float = 0.0,
+    overwrite: bool = False,
+) -> int:
+    """Write a run without images: odometry, and disc rows with or without measurement noise."""
+    plan = plan_run(settings, lit=False)
+    rng = random_for(settings.seed, "rows")
+    truths = [_truth(plan, frame, None, None) for frame in range(settings.frames)]
+    rows: list[tuple[CircleLandmark, ...]] = []
+    for truth in truths:
+        kept = [row for row in truth.circles if rng.random() >= miss]
+        rows.append(tuple(_disturbed(row, rng) for row in kept) if noisy else tuple(kept))
+    folder.mkdir(parents=True, exist_ok=True)
+    what = f"run {settings.name}, seed {settings.seed}, {settings.frames} steps, no images"
+    write_camera(plan.camera, folder / f"{settings.name}.cam", overwrite=overwrite)
+    _write_steps(plan, folder, what, overwrite)
+    text = _NOISY_CIRCLE_FORMAT if noisy else _CIRCLE_FORMAT
+    _write_landmarks(plan, folder / "map.circles", what, text, rows, overwrite)
+    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
+        out.write(_truth_json(plan, truths, what).encode())
+    return sum(len(r) for r in rows)
+
+
+def _disturbed(row: CircleLandmark, rng: np.random.Generator) -> CircleLandmark:
+    covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
+    dx, dy = np.linalg.cholesky(covariance) @ rng.standard_normal(2)
+    return CircleLandmark(
+        row.px + float(dx), row.py + float(dy), row.quality, row.cxx, row.cxy, row.cyy, row.ids
+    )
+
+
+def _write_steps(plan: RunPlan, folder: Path, what: str, overwrite: bool) -> None:
+    _write_landmarks(plan, folder / f"{plan.settings.name}.txt", what, "",
+                     [() for _ in range(plan.settings.frames)], overwrite)  # fmt: skip
+
+
+def _write_landmarks(
+    plan: RunPlan,
+    path: Path,
+    what: str,
+    row_format: str,
+    rows: Iterable[tuple[Landmark, ...]],
+    overwrite: bool,
+) -> None:
+    head = "\n".join(
+        part for part in (SIMULATED.format(what=what).rstrip(), "", _STEP_FORMAT, row_format)
+    ).rstrip()
+    frames = (
+        Frame(step_record(plan.prefix(k), plan.steps[k]), landmarks)
+        for k, landmarks in enumerate(rows)
+    )
+    write_frames(path, frames, head=head, overwrite=overwrite)
+
+
+def _truth_json(plan: RunPlan, truths: list[FrameTruth], what: str) -> str:
+    """All that is known about the run, one line per frame and object."""
+    head: dict[str, Any] = {
+        "note": SIMULATED.format(what=what).split("\n"),
+        "conventions": {
+            "world": "metres; floor plan x, y; z up; the floor is z = 0",
+            "pose": "x, y (m), heading (rad) of the robot after the frame's step; a robot at "
+            "heading h looks along (sin h, -cos h)",
+            "tilt": "(p, q) rad: a point r of the robot frame is really at exp([p, q, 0]x) r in "
+            "the level robot frame; the .cam file stays level",
+            "disc": "robot_xy: true place in the level robot frame (m); pixel: of its centre; "
+            "share: of its area in the image and not hidden; listed: has a row in map.circles",
+            "edge": "alpha: true bearing (rad); ends: pixels u, v of top and bottom of the "
+            "longest visible stretch; contrast: grey values right minus left; rows: how many "
+            "image rows show it; listed: has a row in map.lines (it crosses the horizon, 12 px "
+            "inside the image; 20 rows, a step of 12 grey values, a peak of the gradient within "
+            "1 px)",
+            "picture": "x0, y0, x1, y1, z0, z1 of posters: edges inside them are not listed",
+        },
+        "settings": {k: v for k, v in asdict(plan.settings).items() if k != "camera_text"},
+        "disc_radius_m": plan.disc_radius_m,
+        "start": _rounded(plan.poses[0], 9),
+    }
+    used = sorted({e.edge_id for t in truths for e in t.edges})
+    lists: dict[str, list[Any]] = {
+        "discs": [
+            {"id": int(i), "xy": _rounded(xy, 6)} for i, xy in zip(plan.disc_ids, plan.disc_xy)
+        ],
+        "lookalikes": [
+            {"kind": kind, "xy": _rounded([x, y], 6)} for kind, x, y in plan.lookalikes
+        ],
+        "pictures": [_rounded(picture, 4) for picture in plan.pictures],
+        "edges": [
+            {"id": k, "xy": _rounded([plan.edges[k].x, plan.edges[k].y], 6),
+             "z": _rounded([plan.edges[k].z0, plan.edges[k].z1], 4), "kind": plan.edges[k].label}
+            for k in used
+        ],
+        "frames": [_frame_json(plan, truth) for truth in truths],
+    }  # fmt: skip
+    text = json.dumps(head, indent=1)[:-2]
+    for key, items in lists.items():
+        body = ",\n".join(json.dumps(item, separators=(",", ":")) for item in items)
+        text += f',\n "{key}": [\n{body}\n ]'
+    return text + "\n}\n"
+
+
+def _frame_json(plan: RunPlan, truth: FrameTruth) -> dict[str, Any]:
+    frame = truth.frame
+    return {
+        "prefix": plan.prefix(frame),
+        "pose": _rounded(plan.poses[frame + 1], 9),
+        "tilt": _rounded(plan.tilts_rad[frame], 9),
+        "wrong_odometry": bool(plan.wrong_odometry[frame]),
+        "discs": [
+            {"id": d.disc_id, "robot_xy": _rounded(d.robot_xy, 6), "pixel": _rounded(d.pixel, 3),
+             "share": round(d.share, 3), "occluded": d.occluded, "cut": d.cut, "listed": d.listed}
+            for d in truth.discs
+        ],
+        "edges": [
+            {"id": e.edge_id, "alpha": round(e.bearing_rad, 6),
+             "ends": _rounded(e.ends.ravel(), 2), "contrast": round(e.contrast, 1),
+             "rows": e.rows, "listed": e.listed}
+            for e in truth.edges
+        ],
+    }  # fmt: skip
+
+
+def _rounded(values: Any, digits: int) -> list[float]:
+    return [round(float(v), digits) for v in values]

@@ -1,1 +1,0 @@
-"""What surfaces look like."""
