@@ -20,9 +20,9 @@ def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) 
 
 
 def commands_of(program: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    choices = re.search(r"\{(\w+(?:,\w+)*)\}", help_of(program, [], capsys))
+    choices = re.search(r"\{(\w+(?:,\s*\w+)*)\}", help_of(program, [], capsys))
     assert choices is not None
-    return choices[1].split(",")
+    return re.split(r",\s*", choices[1])
 
 
 def examples_in(text: str) -> list[list[str]]:
