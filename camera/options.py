@@ -48,8 +48,8 @@ class Calibrate:
     half : bool
         Pictures are half-height: every second line of square pixels, as the data set's.
     free_aspect : bool
-        Horizontal and vertical scale are independent of each other, unless the pictures do not tell
-        their ratio. --no-free-aspect: pixels are square (with --half, twice as high as wide).
+        Horizontal and vertical scale are independent of each other, unless the pictures leave
+        their ratio open. --no-free-aspect: pixels are square (with --half, twice as high as wide).
     coefficients : str
         Number of free radial distortion coefficients, 0 to 5; `auto`: as many as make the error in
         pictures that were held out smaller.

@@ -185,7 +185,7 @@ class LineNumbers(NamedTuple):
             "joined_equally": settings.joined == "equal",
             "level": settings.alpha == "level",
         }
-        # Compiled code tells 1 from 1.0.
+        # Compiled code distinguishes 1 from 1.0.
         for name, kind in get_type_hints(cls).items():
             if name not in given:
                 given[name] = kind(getattr(settings, name))

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 #: The grey values of a margin differ by no more than this, grey levels: noise, and what compression
 #: adds. Most of the column behind it differ from it by more.
 _MOST_RANGE, _LEAST_STEP, _LEAST_SHARE = 24, 8, 0.5
-#: Margins are of so many columns or a multiple, so that few tables are needed for images without.
+#: Widths of margins are multiples of this (columns), so that few tables are needed.
 _COLUMNS = 8
 #: Where more columns than this share of the width are blank, it is the scene that is.
 _LARGEST_SHARE = 0.05
-#: Every so many rows are enough to see a margin.
+#: One row in this many is enough to see a margin.
 _ROWS_APART = 4
 
 

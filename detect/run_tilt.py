@@ -117,7 +117,7 @@ def tilt_of_run(
     By the verticals of each frame and, optionally, by the outlines of its discs; None if fewer than
     `LEAST_FRAMES` frames have a tilt by verticals. `common_variance`, (2,) rad^2, is that of the
     error of pitch and roll that all frames share, if the calibration states it: then the lean is
-    that of the verticals. Else how far outlines and verticals agree tells.
+    that of the verticals. Without it, it follows from how far outlines and verticals agree.
     """
     if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
         return None

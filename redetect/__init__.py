@@ -20,31 +20,31 @@ if TYPE_CHECKING:
     from detect.line_settings import LineSettings
     from detect.settings import CircleSettings
     from detect.viewing_options import CompareOptions
-    from redetect.library.detection import Detection, detect
-    from redetect.library.explanation import Explanation, explain
-    from redetect.library.maps import Localization, RunMap, localize
-    from redetect.library.maps import map_landmarks as map
-    from redetect.library.recordings import Recording, compare
-    from redetect.library.recordings import open_recording as open
+    from redetect.interface.detection import Detection, detect
+    from redetect.interface.explanation import Explanation, explain
+    from redetect.interface.maps import Localization, RunMap, localize
+    from redetect.interface.maps import map_landmarks as map
+    from redetect.interface.recordings import Recording, compare
+    from redetect.interface.recordings import open_recording as open
     from redetect.storage.messages import OneLineError as Error
 
 _PLACES = {
     "Camera": ("camera", "Camera"),
     "CircleSettings": ("detect.settings", "CircleSettings"),
     "CompareOptions": ("detect.viewing_options", "CompareOptions"),
-    "Detection": ("redetect.library.detection", "Detection"),
+    "Detection": ("redetect.interface.detection", "Detection"),
     "Error": ("redetect.storage.messages", "OneLineError"),
-    "Explanation": ("redetect.library.explanation", "Explanation"),
+    "Explanation": ("redetect.interface.explanation", "Explanation"),
     "LineSettings": ("detect.line_settings", "LineSettings"),
-    "Localization": ("redetect.library.maps", "Localization"),
-    "Recording": ("redetect.library.recordings", "Recording"),
-    "RunMap": ("redetect.library.maps", "RunMap"),
-    "compare": ("redetect.library.recordings", "compare"),
-    "detect": ("redetect.library.detection", "detect"),
-    "explain": ("redetect.library.explanation", "explain"),
-    "localize": ("redetect.library.maps", "localize"),
-    "map": ("redetect.library.maps", "map_landmarks"),
-    "open": ("redetect.library.recordings", "open_recording"),
+    "Localization": ("redetect.interface.maps", "Localization"),
+    "Recording": ("redetect.interface.recordings", "Recording"),
+    "RunMap": ("redetect.interface.maps", "RunMap"),
+    "compare": ("redetect.interface.recordings", "compare"),
+    "detect": ("redetect.interface.detection", "detect"),
+    "explain": ("redetect.interface.explanation", "explain"),
+    "localize": ("redetect.interface.maps", "localize"),
+    "map": ("redetect.interface.maps", "map_landmarks"),
+    "open": ("redetect.interface.recordings", "open_recording"),
 }
 __all__ = [
     "Camera",

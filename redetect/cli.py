@@ -21,7 +21,7 @@ _QUIET = ("-q", "--quiet")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    # Wherever it stands, it is a flag of the command.
+    # In any place it is a flag of the command.
     leading = [word for word in given[:1] if word in _QUIET]
     words = [*given[len(leading) :], *leading]
     if words[:1] == ["--version"]:

@@ -25,7 +25,7 @@ _OUTLIER_FACTOR = 3.0
 # Residual, in standard deviations, beyond which a point is an outlier.
 _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
-# Pictures that leave the ratio of the scales more uncertain than this don't tell it.
+# Pictures that leave the ratio of the scales more uncertain than this leave it open.
 _ASPECT_SIGMA = 0.003
 
 
@@ -185,7 +185,7 @@ def calibrate_freely(
     size: tuple[int, int],
     settings: CalibrationSettings,
 ) -> Calibration:
-    """As `calibrate`, with scales independent of each other if the views tell their ratio.
+    """As `calibrate`, with scales independent of each other if the views determine their ratio.
 
     Else it is that of the settings, and a warning says so.
     """

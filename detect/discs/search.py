@@ -115,7 +115,7 @@ _DISC, _IN_CLEAR, _FEW_STEPS, _LOOK, _SAME, _EVIDENCE, _ELSEWHERE, _BESIDE, _RAR
 
 
 class Looks(NamedTuple):
-    """All candidates that were looked at, and what became of them.
+    """All candidates that were examined, and what became of them.
 
     Attributes
     ----------

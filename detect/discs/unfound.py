@@ -219,7 +219,7 @@ def _candidates(
     found: CircleDetections,
     quality_share: float = 1.0,
 ) -> Iterator[Candidate]:
-    """What was found, what was looked at, and what was not."""
+    """What was found, and the candidates that were rejected."""
     pixels = camera.project_floor(found.floor_xy)
     levels = _levels(image, table)
     for (u, v), (x, y), q, evidence in zip(

@@ -1,4 +1,4 @@
-"""What a run is to do and what is known before, what a worker gets of it and sends back.
+"""The plan of a run and its prior data; what a worker gets of it and sends back.
 
 Nothing heavy is imported.
 """

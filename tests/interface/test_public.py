@@ -15,8 +15,8 @@ import pytest
 
 import redetect as rd
 from detect.errors import DetectError, FrameError
+from redetect.interface.tables import FrameLibrary, ResultError
 from redetect.landmarks import read_frames, write_frames
-from redetect.library.tables import FrameLibrary, ResultError
 from redetect.storage import OutputExistsError
 
 

@@ -15,7 +15,7 @@ from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates
 from detect.run import read_image
 from detect.settings import CircleSettings, Polarity
-from redetect.library.detection import (
+from redetect.interface.detection import (
     CameraLike,
     ImageLike,
     camera_of,
@@ -23,7 +23,7 @@ from redetect.library.detection import (
     png_of,
     settings_of,
 )
-from redetect.library.tables import Table
+from redetect.interface.tables import Table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,7 +99,7 @@ def explain(
     Parameters
     ----------
     image, camera, radius_m, polarity, settings
-        As of `redetect.library.detection.detect`.
+        As of `redetect.interface.detection.detect`.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found.
 

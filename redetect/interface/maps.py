@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from redetect.interface.tables import Table, covariance_columns
 from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
@@ -19,7 +20,6 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.library.tables import Table, covariance_columns
 from redetect.slam.commands.localize import localized_run_of
 from redetect.slam.commands.map import MAP_NAME, PATH_NAME, mapped_run_of, weighting_of
 from redetect.slam.filters.frames import FilterRun

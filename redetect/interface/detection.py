@@ -21,8 +21,8 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
+from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import CircleLandmark, Frame, FrameTilt, Step
-from redetect.library.tables import Table, covariance_columns, html_table, plain
 from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 
 FloatArray = NDArray[np.float64]

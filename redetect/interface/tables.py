@@ -41,7 +41,7 @@ class Table:
 
         Raises
         ------
-        redetect.library.tables.ResultError
+        redetect.interface.tables.ResultError
             If it is not installed.
         """
         wanted = ("pandas", "polars") if library is None else (library,)

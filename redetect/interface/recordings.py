@@ -26,8 +26,8 @@ from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_calibrated, open_source
 from detect.viewing_options import Compare, CompareOptions
+from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
 from redetect.landmarks import Step, read_frames
-from redetect.library.detection import CameraLike, Detection, detect_frame, settings_of
 from redetect.slam.formats.axes import Axes
 
 PathLike = str | os.PathLike[str]
@@ -77,7 +77,7 @@ class RecordedFrame:
         settings: CircleSettings | None = None,
         line_settings: LineSettings | None = None,
     ) -> Detection:
-        """Find discs, verticals and tilt: see `redetect.library.detection.detect`."""
+        """Find discs, verticals and tilt: see `redetect.interface.detection.detect`."""
         settings = settings_of(settings, radius_m, polarity)
         return detect_frame(
             self.frame, self.camera, settings, line_settings, level=level, axes=axes
