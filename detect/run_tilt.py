@@ -93,7 +93,8 @@ class RunTilt:
     tilt: FloatArray  # (N, 2) pitch and roll of each frame (rad)
     #: (N, 2) of them (rad^2), the constant's included; the axes are assumed to be independent
     variance: FloatArray
-    height_sigma: float = 0.0  # of the camera's height, as a share of it
+    #: Of the camera's height, as a share of it, where its calibration does not state it.
+    height_sigma: float = 0.0
 
     def sentence(self) -> str:
         """The constant lean, and that it was used."""
@@ -126,27 +127,27 @@ def tilt_of_run(
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
     found = [_learned(axis) for axis in series]
-    exact = _share_exact([one.apart for one in found])
+    apart = [one.apart for one in found]
+    exact = _share_exact(apart)
+    # Of a calibration that states its covariance, verticals and height are as good as it says.
+    between = np.nan_to_num(apart) if common_variance is None else np.zeros(2)
     axes, tilts, variances = [], [], []
     for k, (axis, one) in enumerate(zip(series, found)):
         tilt, of_deviation = axis.tilt(one)
         # How far a frame's tilt follows the constant: where it is well measured, not at all.
         shifted = axis.tilt(one._replace(lean=one.lean + _UNIT_RAD))[0]
         share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
-        if common_variance is not None:
-            apart, common = 0.0, float(common_variance[k])
-        else:
-            apart = 0.0 if math.isnan(one.apart) else one.apart
-            common = COMMON_RAD**2 + apart**2 / 12.0  # the latter: uniform between the constants
+        if common_variance is None:
+            common = COMMON_RAD**2 + between[k] ** 2 / 12.0  # the latter: uniform between them
             common = exact * _EXACT_RAD**2 + (1.0 - exact) * common
-        lean = one.lean + 0.5 * apart
+        else:
+            common = float(common_variance[k])
+        lean = one.lean + 0.5 * between[k]
         axes.append(AxisModel(lean, math.sqrt(one.lean_variance + common), one.spread))
-        tilts.append(tilt + 0.5 * apart)
+        tilts.append(tilt + 0.5 * between[k])
         variances.append(of_deviation + share**2 * one.lean_variance + common)
-    apart = found[0].apart
-    height_sigma = 0.0
-    if not math.isnan(apart):
-        height_sigma = math.sqrt((1.0 - exact) * apart**2 / 12.0) / OUTLINE_PITCH_PER_HEIGHT
+    pitch_sigma = math.sqrt((1.0 - exact) * between[0] ** 2 / 12.0)
+    height_sigma = pitch_sigma / OUTLINE_PITCH_PER_HEIGHT
     return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1), height_sigma)
 
 

@@ -13,7 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.compare import beside_reference, compare_frames, compare_line_frames
+from detect.comparison.compare import (
+    beside_reference,
+    compare_frames,
+    compare_line_frames,
+    unlisted_lines,
+)
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.frame import EXTRA_COLOUR, MISSED_COLOUR, Colour, draw_curve, draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
@@ -85,6 +90,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
             [seen.reference_lines for seen in both if seen.reference_lines],
             [seen.lines for seen in both if seen.lines],
             compare,
+            unlisted=unlisted_lines(files.reference["lines"]),
             names=(files.reference["lines"].name, files.detected["lines"].name),
         )
     timing = _timing(run, files, len(names), time_frames)

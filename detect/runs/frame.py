@@ -353,10 +353,7 @@ def level_run(
     summary.tilt = tilt_of_run(
         frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines), common
     )
-    # What a calibration says of its height is in its covariance, if it states one.
-    height_sigma = 0.0
-    if summary.tilt is not None and common is None:
-        height_sigma = summary.tilt.height_sigma
+    height_sigma = 0.0 if summary.tilt is None else summary.tilt.height_sigma
     for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
         by_verticals = tilt is not None or summary.tilt is not None
         shared = np.zeros(2)

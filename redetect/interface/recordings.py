@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.compare import beside_reference, compare_frames, compare_line_frames
+from detect.comparison.compare import (
+    beside_reference,
+    compare_frames,
+    compare_line_frames,
+    unlisted_lines,
+)
 from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison
 from detect.drawing.inputs import read_head
@@ -197,7 +202,10 @@ def compare(
         )
     frames, names = [one.frame for one in found], (str(in_file), "detections")
     if lines:
-        return compare_line_frames(read_frames(in_file), frames, options, names=names)
+        unlisted = unlisted_lines(in_file)
+        return compare_line_frames(
+            read_frames(in_file), frames, options, unlisted=unlisted, names=names
+        )
     sight = Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level)
     return compare_frames(
         read_frames(in_file), frames, options, sight=sight,

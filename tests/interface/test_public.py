@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import types
@@ -181,7 +182,7 @@ def test_without_a_library_of_data_frames(
 # -- runs -----------------------------------------------------------------------------------
 
 
-def test_frames_of_a_run_and_their_comparison(demo: Path) -> None:
+def test_frames_of_a_run_and_their_comparison(demo: Path, tmp_path: Path) -> None:
     run = rd.open(demo, frames=3)
     frames = list(run)
     assert [frame.name for frame in frames] == ["e.0000", "e.0001", "e.0002"]
@@ -193,7 +194,10 @@ def test_frames_of_a_run_and_their_comparison(demo: Path) -> None:
     assert "discs of the reference are found, 0 missed, in 3 frames" in discs.sentences()[0]
     assert json.loads(discs.to_json())["matched"] == discs.matched
     verticals = rd.compare(demo, found, lines=True)
+    alone = shutil.copy(demo / "map.lines", tmp_path)  # with nothing beside it
     assert "verticals of the reference are found" in verticals._repr_html_()
+    without_unlisted = rd.compare(demo, found, alone, lines=True)
+    assert verticals.precision > without_unlisted.precision
     with pytest.raises(DetectError, match="nothing to compare"):
         rd.compare(demo, [])
 

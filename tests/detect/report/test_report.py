@@ -249,6 +249,26 @@ def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> No
     assert (tmp_path / "r.html").read_bytes() == first
 
 
+def test_unlisted_verticals_are_no_errors(project_root: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    demo = project_root / "images" / "e"
+    for name in ("e.cam", "e.txt", "map.lines"):
+        shutil.copy(demo / name, run)
+    (run / "images").symlink_to(demo / "images")
+    listed = (run / "map.lines").read_text().splitlines()
+    (run / "detected.lines").write_text("\n".join(listed) + "\n")
+    wanted = [row for k, row in enumerate(listed) if k % 3 or not row.startswith("LANDMARK")]
+    (run / "map.lines").write_text("\n".join(wanted) + "\n")
+
+    without = " ".join(reported(run, tmp_path / "without.html").words)
+    (run / "unlisted.lines").write_text("\n".join(listed) + "\n")
+    words = " ".join(reported(run, tmp_path / "with.html").words)
+
+    assert re.search(r"precision of verticals\s+0\.[67]", without)
+    assert re.search(r"precision of verticals\s+1\.000", words)
+
+
 def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Path) -> None:
     assert main(["circles", str(small_run), "--threshold", "0.4"]) == 0
     page = reported(small_run, tmp_path / "r.html")
