@@ -197,7 +197,7 @@ def test_frames_of_a_run_and_their_comparison(demo: Path, tmp_path: Path) -> Non
     alone = shutil.copy(demo / "map.lines", tmp_path)  # with nothing beside it
     assert "verticals of the reference are found" in verticals._repr_html_()
     without_unlisted = rd.compare(demo, found, alone, lines=True)
-    assert verticals.precision > without_unlisted.precision
+    assert verticals.extra < without_unlisted.extra
     with pytest.raises(DetectError, match="nothing to compare"):
         rd.compare(demo, [])
 
