@@ -12,6 +12,7 @@ be written to is no error: the next run just computes again.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import logging
@@ -162,7 +163,9 @@ def _own_content(path: Path) -> bytes | None:
     except FileNotFoundError:
         pass
     except OSError as error:
-        _log.warning("%s: %s: it is computed again", path, error.strerror)
+        # A file that somebody writes into while it is read is damaged like any other.
+        level = logging.INFO if error.errno == errno.EBUSY else logging.WARNING
+        _log.log(level, "%s: %s: it is computed again", path, error.strerror)
     return None
 
 
