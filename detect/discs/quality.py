@@ -134,26 +134,28 @@ def find_centres(
     any_left = np.empty(len(groups.samples), np.bool_)
     for g in range(_U64(len(any_left))):
         any_left[g] = _columns_left(grey, groups.samples, g, least_part) != 0
-    most = np.count_nonzero(any_left) * GROUP_COLUMNS
+    # Those that are left are collected first: the next one's samples are fetched meanwhile then.
+    group = np.flatnonzero(any_left)
+    centre = np.empty(len(group) * GROUP_COLUMNS, np.int64)
+    most = 0
+    for g in group:
+        left = _columns_left(grey, groups.samples, g, least_part) & groups.columns[g]
+        i = groups.first[g] - 1
+        for k in range(GROUP_COLUMNS):
+            i += (groups.columns[g] >> k) & 1
+            centre[most] = i
+            most += (left >> k) & 1
     found_at = np.empty((most, 2), np.int64)
     quality, contrast = np.empty(most), np.empty(most, np.float32)
     found = 0
-    for g in range(_U64(len(any_left))):
-        if not any_left[g]:
-            continue
-        left = _columns_left(grey, groups.samples, g, least_part) & groups.columns[g]
-        i = groups.first[g] - 1
-        for k in range(GROUP_COLUMNS if left else 0):
-            i += (groups.columns[g] >> k) & 1
-            if not (left >> k) & 1:
-                continue
-            of_centre, step = _quality_of(grey, samples, i, outside)
-            signed = limits.sign == 0 or limits.sign * step >= 0.0
-            strong = limits.contrast == 0.0 or abs(step) > limits.contrast
-            if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
-                found_at[found, 0], found_at[found, 1] = pixels[i, 0], pixels[i, 1]
-                quality[found], contrast[found] = of_centre, step
-                found += 1
+    for i in centre[:most]:
+        of_centre, step = _quality_of(grey, samples, i, outside)
+        signed = limits.sign == 0 or limits.sign * step >= 0.0
+        strong = limits.contrast == 0.0 or abs(step) > limits.contrast
+        if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
+            found_at[found, 0], found_at[found, 1] = pixels[i, 0], pixels[i, 1]
+            quality[found], contrast[found] = of_centre, step
+            found += 1
     return found_at[:found], quality[:found], contrast[:found]
 
 
