@@ -3,7 +3,8 @@
 With the covariance C of the calibration's parameters (`camera.uncertainty`) and the derivatives J
 of a position by them, it is J C J^T. Where positions are levelled by verticals, the tilt that the
 same camera sees in these follows its errors, too: what its mounting leans by falls out, and what
-the lens does to verticals comes in.
+the lens does to verticals comes in. A calibration that does not state C is taken to be wrong by a
+part of a pixel everywhere (`CircleSettings.calibration_px`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.calibration.model import INTRINSICS
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
 from detect.circles import CircleDetections
 from detect.seen import level_seen
@@ -23,19 +25,24 @@ from redetect.landmarks import read_frames
 
 FloatArray = NDArray[np.float64]
 
+#: The parameters that move all pixels alike.
+_OFFSETS = [INTRINSICS.index("offsetX"), INTRINSICS.index("offsetY")]
 #: Over which angle levelled positions are differenced, either way (rad).
 _STEP_RAD = 1e-6
 
 
-def common_covariance(camera: Camera, floor_xy: FloatArray, *, by_verticals: bool) -> FloatArray:
+def common_covariance(
+    camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool
+) -> FloatArray:
     """What the calibration's errors contribute to positions on the floor.
 
     Parameters
     ----------
     camera : Camera
-        Zero is returned if it does not state its covariance.
     floor_xy : (N, 2) float64
         Metres.
+    unstated_px : float
+        Standard deviation of the pixels of a camera that does not state its covariance.
     by_verticals : bool
         Whether the positions are levelled by the verticals that the camera sees.
 
@@ -44,10 +51,13 @@ def common_covariance(camera: Camera, floor_xy: FloatArray, *, by_verticals: boo
     (N, 2, 2) float64
         Square metres.
     """
-    covariance = covariance_of(camera)
-    if covariance is None or len(floor_xy) == 0:
-        return np.zeros((len(floor_xy), 2, 2))
+    if len(floor_xy) == 0:
+        return np.zeros((0, 2, 2))
     jacobian = floor_by_parameters(camera, floor_xy)
+    covariance = covariance_of(camera)
+    if covariance is None:
+        by_pixel = unstated_px * jacobian[:, :, _OFFSETS]
+        return np.asarray(by_pixel @ by_pixel.swapaxes(1, 2))
     if by_verticals:
         steps = _STEP_RAD * np.vstack([np.eye(2), -np.eye(2)])
         p, r, minus_p, minus_r = level_seen(
@@ -75,23 +85,30 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
     return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
 
 
-def with_common(found: CircleDetections, camera: Camera, *, by_verticals: bool) -> CircleDetections:
+def with_common(
+    found: CircleDetections, camera: Camera, unstated_px: float, *, by_verticals: bool
+) -> CircleDetections:
     """The same discs, their covariances with what the calibration contributes."""
-    common = common_covariance(camera, found.floor_xy, by_verticals=by_verticals)
+    common = common_covariance(camera, found.floor_xy, unstated_px, by_verticals=by_verticals)
     return replace(found, covariance=found.covariance + common)
 
 
-def sentence_of(circles: Path, camera: Camera) -> str:
+def sentence_of(circles: Path, camera: Camera, unstated_px: float) -> str:
     """How much of the variances of the rows of a file is the calibration's own."""
     shares = []
     for frame in read_frames(circles):
         rows = frame.circles
         xy = np.array([(row.px, row.py) for row in rows]).reshape(-1, 2)
         by_verticals = frame.levelled_by is not None and any(frame.levelled_by)
-        common = common_covariance(camera, xy, by_verticals=by_verticals)
+        common = common_covariance(camera, xy, unstated_px, by_verticals=by_verticals)
         shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
     share = 100.0 * float(np.median(shares)) if shares else 0.0
+    source = (
+        f"taken to be wrong by {unstated_px:g} px (--calibration-px), as its file does not say"
+        if camera.covariance is None
+        else "as its file states"
+    )
     return (
-        f"{share:.0f} % of the discs' variance (median) are the calibration's, as its file states: "
-        "the same error in all rows"
+        f"{share:.0f} % of the discs' variance (median) are the calibration's, {source}: the same "
+        "error in all rows"
     )

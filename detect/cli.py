@@ -49,7 +49,7 @@ EXPERT: dict[type, frozenset[str]] = {
     DiscIdOptions: all_but(DiscIdOptions, "ids_from"),
     CircleSettings: all_but(
         CircleSettings, "radius_m", "polarity", "threshold", "evidence", "blur_px",
-        "systematic_px", "tilt_sigma_deg",
+        "calibration_px", "tilt_sigma_deg",
     ),
     LineSettings: all_but(LineSettings, "threshold", "join_px"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),

@@ -79,6 +79,9 @@ class CircleSettings:
     refine: bool = True  #: Report the fitted position and its covariance instead of the pixel's.
     #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
+    #: Error of a calibration that does not state its covariance, pixels: added to a refined
+    #: position's covariance by the commands. Calibrations commonly fit to 0.1-0.3 px.
+    calibration_px: NotNegative = 0.15
     #: Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
     #: refined position's covariance if the frame's tilt is unknown.
     tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
@@ -127,6 +130,7 @@ PUBLISHED = CircleSettings(
     separation=2.0,
     verify=False,
     refine=False,
+    calibration_px=0.0,
 )
 
 #: The parameters in the report on the data set: other outlines, every pixel, all local maxima.
@@ -138,6 +142,7 @@ REPORT = CircleSettings(
     separation=0.0,
     verify=False,
     refine=False,
+    calibration_px=0.0,
 )
 
 PRESETS = {"default": CircleSettings(), "published": PUBLISHED, "report": REPORT}

@@ -148,12 +148,12 @@ def find_centres(
     found_at = np.empty((most, 2), np.int64)
     quality, contrast = np.empty(most), np.empty(most, np.float32)
     found = 0
-    for i in centre[:most]:
-        of_centre, step = _quality_of(grey, samples, i, outside)
+    for c in centre[:most]:
+        of_centre, step = _quality_of(grey, samples, c, outside)
         signed = limits.sign == 0 or limits.sign * step >= 0.0
         strong = limits.contrast == 0.0 or abs(step) > limits.contrast
         if of_centre >= limits.quality and of_centre > 0.0 and signed and strong:
-            found_at[found, 0], found_at[found, 1] = pixels[i, 0], pixels[i, 1]
+            found_at[found, 0], found_at[found, 1] = pixels[c, 0], pixels[c, 1]
             quality[found], contrast[found] = of_centre, step
             found += 1
     return found_at[:found], quality[:found], contrast[:found]

@@ -194,10 +194,11 @@ def _print_results(job: Job, summary: RunSummary) -> None:
         if kind in places:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
     camera, circles = job.plan.camera, job.plan.circles
-    if camera and camera.covariance is not None and circles and circles.refine:
+    is_exact = camera is None or (camera.covariance is not None and not any(camera.covariance))
+    if circles and circles.refine and camera and not is_exact:
         from detect.calibration_error import sentence_of  # loads the compiler
 
-        print(sentence_of(places["circles"], camera))
+        print(sentence_of(places["circles"], camera, circles.calibration_px))
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

@@ -138,7 +138,9 @@ def _path(
                 found.discs = levelled(found.seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
                 by_verticals = by_frame is not None
-                found.discs = with_common(found.discs, camera, by_verticals=by_verticals)
+                found.discs = with_common(
+                    found.discs, camera, settings.calibration_px, by_verticals=by_verticals
+                )
             if plan.levelling == "run":
                 tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
                 found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
@@ -332,17 +334,17 @@ def _drawn(
 
 def level_run(
     camera: Camera,
-    tilt_sigma_deg: float,
+    settings: CircleSettings,
     read: Callable[[], Iterable[Mapping[str, str]]],
     summary: RunSummary,
 ) -> Iterator[Mapping[str, str]]:
     """The rows of each frame with levelled discs, and `RUN_TILT`.
 
     Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
-    levelled by its own; `tilt_sigma_deg` is the standard deviation of an unknown one. The summary
+    levelled by its own; an unknown one has the standard deviation of the settings. The summary
     is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
     """
-    unknown_variance = math.radians(tilt_sigma_deg) ** 2
+    unknown_variance = math.radians(settings.tilt_sigma_deg) ** 2
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for rows in read():
@@ -362,13 +364,15 @@ def level_run(
             cpp, crr = summary.tilt.variance[k].tolist()
             tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
             shared = shared if common is None else common
-        elif tilt is None and (unknown_variance > 0.0 or common is not None):
+        elif tilt is None and (unknown_variance or settings.calibration_px or common is not None):
             tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
         circles = rows["circles"]
         if tilt is not None:
             # The part that is the calibration's comes with the calibration's other errors.
             alone: FrameTilt = replace(tilt, cpp=tilt.cpp - shared[0], crr=tilt.crr - shared[1])
-            circles = _levelled(circles, alone, camera, height_sigma, by_verticals=by_verticals)
+            circles = _levelled(
+                circles, alone, camera, height_sigma, settings.calibration_px, by_verticals
+            )
         yield {
             **rows,
             "circles": circles,
@@ -377,7 +381,12 @@ def level_run(
 
 
 def _levelled(
-    circles: str, tilt: FrameTilt, camera: Camera, height_sigma: float, *, by_verticals: bool
+    circles: str,
+    tilt: FrameTilt,
+    camera: Camera,
+    height_sigma: float,
+    calibration_px: float,
+    by_verticals: bool,
 ) -> str:
     """A frame's rows, its STEP first; `height_sigma` is of the camera, as a share of its height."""
     step, *rows = _lines(circles)
@@ -390,7 +399,9 @@ def _levelled(
     floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
     from_camera = floor_xy - camera.centre[:2]
     level_covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
-    level_covariance += common_covariance(camera, numbers[:, :2], by_verticals=by_verticals)
+    level_covariance += common_covariance(
+        camera, numbers[:, :2], calibration_px, by_verticals=by_verticals
+    )
     level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
     ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
     return head + landmark_rows("LANDMARK_C", level, ids)

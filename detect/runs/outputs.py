@@ -14,10 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from camera import Camera
 from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.run import ImageRun
 from detect.runs.plan import FramePlan, Job, RunSummary
+from detect.settings import CircleSettings
 from detect.sources.interface import TIMES_HEAD
 from redetect.landmarks import format_head
 
@@ -38,7 +40,7 @@ _TILT_ROWS = (
 )
 
 
-_COMMON = "  covariances include the calibration's (key covariance): its errors are the same in all"
+_COMMON = "  covariances include the calibration's ({}): its errors are the same in all"
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,17 @@ def _circles_text(job: Job) -> list[str]:
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([level] if levelled else []),
-        *([_COMMON] if plan.camera and plan.camera.covariance and plan.circles.refine else []),
+        *_calibration_text(plan.camera, plan.circles),
         *_made_with(plan, plan.circles),
     ]
+
+
+def _calibration_text(camera: Camera | None, circles: CircleSettings) -> list[str]:
+    if camera is None or not circles.refine:
+        return []
+    if camera.covariance is not None:
+        return [_COMMON.format("key covariance")] if any(camera.covariance) else []
+    return [_COMMON.format(f"{circles.calibration_px:g} px")] if circles.calibration_px else []
 
 
 def _lines_text(run: ImageRun, plan: FramePlan) -> list[str]:

@@ -89,7 +89,7 @@ def detect_run(
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
             from detect.runs.frame import level_run  # loads the compiler
 
-            written = level_run(plan.camera, plan.circles.tilt_sigma_deg, files.rows, summary)
+            written = level_run(plan.camera, plan.circles, files.rows, summary)
         files.finish(written, summary)
     return summary
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from camera import Camera, read_camera, write_camera
 from camera.model import PARAMETERS
-from camera.uncertainty import with_covariance
+from camera.uncertainty import exact, with_covariance
 from detect.calibration_error import common_covariance
 from detect.cli import main
 from detect.seen import level_seen
@@ -51,7 +52,7 @@ def test_errors_are_as_large_as_stated(published_camera: Camera, by_verticals: b
             assert tilt is not None
             found = level_seen(wrong, found, (tilt.pitch_rad, tilt.roll_rad))
         stated = common_covariance(
-            with_covariance(wrong, COVARIANCE), FLOOR, by_verticals=by_verticals
+            with_covariance(wrong, COVARIANCE), FLOOR, 0.0, by_verticals=by_verticals
         )
         error = found - FLOOR
         squared.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(stated), error) / 2.0)
@@ -69,6 +70,7 @@ def test_rows_state_it_and_the_command_says_its_share(
     small_run: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (calibration,) = small_run.glob("*.cam")
+    write_camera(exact(read_camera(calibration)), calibration, overwrite=True)
     assert main([command, str(small_run)]) == 0
     before = rows(small_run / "detected.circles")
     camera = with_covariance(read_camera(calibration), COVARIANCE)
@@ -79,7 +81,7 @@ def test_rows_state_it_and_the_command_says_its_share(
     after = rows(small_run / "detected.circles")
 
     by_verticals = command == "all" and _has_tilt(small_run)
-    common = common_covariance(camera, before[:, :2], by_verticals=by_verticals)
+    common = common_covariance(camera, before[:, :2], 0.0, by_verticals=by_verticals)
     np.testing.assert_allclose(after[:, :2], before[:, :2], atol=1e-5)
     added = after[:, 2:] - before[:, 2:]
     # Levelled rows have moved a little since their derivatives were taken.
@@ -91,6 +93,40 @@ def test_rows_state_it_and_the_command_says_its_share(
     assert int(said[1]) == pytest.approx(100.0 * share, rel=0.3)
     head = (small_run / "detected.circles").read_text().split("STEP e", 1)[0]
     assert "covariances include the calibration's" in head
+
+
+def test_what_a_calibration_does_not_state_is_assumed(
+    published_camera: Camera,
+) -> None:
+    """Positions of pixels that are wrong by so much have this covariance."""
+    pixels = published_camera.project_floor(FLOOR)
+    rng = np.random.default_rng(4)
+    found = published_camera.floor_from_pixel(pixels + 0.15 * rng.standard_normal((4000, 3, 2)))
+    stated = common_covariance(published_camera, FLOOR, 0.15, by_verticals=False)
+    for k, place in enumerate(FLOOR):
+        error = found[:, k] - place
+        observed = error.T @ error / len(error)
+        np.testing.assert_allclose(observed, stated[k], rtol=0.1, atol=0.05 * stated[k].max())
+    assert not common_covariance(exact(published_camera), FLOOR, 0.15, by_verticals=False).any()
+
+
+@pytest.mark.parametrize("command", ["circles", "all"])
+def test_rows_state_what_is_assumed(
+    small_run: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (calibration,) = small_run.glob("*.cam")
+    unstated = replace(read_camera(calibration), covariance=None)
+    write_camera(unstated, calibration, overwrite=True)
+    assert main([command, str(small_run)]) == 0
+    told, after = capsys.readouterr().out, rows(small_run / "detected.circles")
+    write_camera(exact(unstated), calibration, overwrite=True)
+    assert main([command, str(small_run), "--force"]) == 0
+    assert "calibration's" not in capsys.readouterr().out
+    before = rows(small_run / "detected.circles")
+    added = after[:, 2] + after[:, 4] - before[:, 2] - before[:, 4]
+    common = common_covariance(unstated, before[:, :2], 0.15, by_verticals=False)
+    np.testing.assert_allclose(added, np.trace(common, axis1=1, axis2=2), rtol=0.3, atol=1e-9)
+    assert "taken to be wrong by 0.15 px (--calibration-px)" in told
 
 
 def _has_tilt(run: Path) -> bool:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera, read_camera, write_camera
+from camera.uncertainty import exact
 from redetect.landmarks import Frame, read_frames, write_frames
 from redetect.storage import write_whole
 from tools.arrays import BoolArray, ByteArray, FloatArray
@@ -137,7 +138,7 @@ def write_reenactment(
     name = folder.resolve().name
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
-    write_camera(run.camera, folder / f"{name}.cam", overwrite=overwrite)
+    write_camera(exact(run.camera), folder / f"{name}.cam", overwrite=overwrite)
     indices = range(0, len(run.frames), every)
     truth: list[str] = []
     qualities: list[tuple[float, float, float]] = []

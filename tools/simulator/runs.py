@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
+from camera.uncertainty import exact
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from redetect.storage import write_whole
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
@@ -321,7 +322,7 @@ def write_run(
     what = f"run {name}, seed {settings.seed}, {settings.frames} frames"
     if settings.skip:
         what += f" after {settings.skip} skipped"
-    write_camera(plan.camera, folder / f"{name}.cam", overwrite=overwrite)
+    write_camera(exact(plan.camera), folder / f"{name}.cam", overwrite=overwrite)
     truths: list[FrameTruth] = []
     for truth in in_order(render_frame, plan, range(settings.frames), jobs):
         if truth.jpeg is not None:
@@ -395,7 +396,7 @@ def write_rows(
         rows.append(tuple(_disturbed(row, rng) for row in kept) if noisy else tuple(kept))
     folder.mkdir(parents=True, exist_ok=True)
     what = f"run {settings.name}, seed {settings.seed}, {settings.frames} steps, no images"
-    write_camera(plan.camera, folder / f"{settings.name}.cam", overwrite=overwrite)
+    write_camera(exact(plan.camera), folder / f"{settings.name}.cam", overwrite=overwrite)
     _write_steps(plan, folder, what, overwrite)
     text = _NOISY_CIRCLE_FORMAT if noisy else _CIRCLE_FORMAT
     _write_landmarks(plan, folder / "map.circles", what, text, rows, overwrite)

@@ -16,11 +16,15 @@ from detect.run_tilt import LEAST_FRAMES
 from detect.runs.frame import level_run
 from detect.runs.plan import RunSummary
 from detect.seen import level_seen
+from detect.settings import CircleSettings
 from redetect.landmarks.reading import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
 STEP = "STEP {} 0.0 0.0 0.0 1e-6 0.0 1e-6 0.0 0.0 1e-6\n"
 DISC = "LANDMARK_C 0.5 -2.5 0.9 1e-06 0 1e-06 7\n"
+
+
+NO_ERRORS = CircleSettings(calibration_px=0.0, tilt_sigma_deg=0.0)
 
 
 def level(camera: Camera, frames: int) -> dict[str, bytes]:
@@ -30,7 +34,7 @@ def level(camera: Camera, frames: int) -> dict[str, bytes]:
         pitch, roll = np.array(LEAN) + 1e-4 * rng.standard_normal(2)
         tilt = f"TILT {k} {pitch:.6f} {roll:.6f} 1e-8 0 1e-8 9\n" if k else "NOTILT 0 2\n"
         seen.append({"tilt": tilt, "circles": STEP.format(k) + DISC})
-    written = list(level_run(camera, 0.0, lambda: seen, RunSummary()))
+    written = list(level_run(camera, NO_ERRORS, lambda: seen, RunSummary()))
     return {
         kind: "".join(rows[kind] for rows in written).encode() for kind in ("run tilt", "circles")
     }
