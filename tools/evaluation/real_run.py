@@ -18,13 +18,13 @@ from tyro.conf import Positional
 
 #: How the rows of each line of the table are made; the camera's true spread of tilt and the lens
 #: are stated for the honest ones (`docs/slam/real-run.md`).
-_SPREAD = ("--tilt-sigma-deg", "0.6", "--systematic-px", "0.3")
+_SPREAD = ("--tilt-sigma-deg", "0.6", "--calibration-px", "0.3")
 WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("--preset published", "circles", ("--preset", "published")),
     ("default", "circles", ()),
     ("default, tilt and lens stated", "circles", _SPREAD),
     ("detect all", "all", ()),
-    ("detect all, lens stated", "all", ("--circles.systematic-px", "0.3")),
+    ("detect all, lens stated", "all", ("--circles.calibration-px", "0.3")),
 )
 
 
