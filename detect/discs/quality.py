@@ -138,11 +138,11 @@ def find_centres(
     group = np.flatnonzero(any_left)
     centre = np.empty(len(group) * GROUP_COLUMNS, np.int64)
     most = 0
-    for g in group:
-        left = _columns_left(grey, groups.samples, g, least_part) & groups.columns[g]
-        i = groups.first[g] - 1
+    for h in group:
+        left = _columns_left(grey, groups.samples, int(h), least_part) & groups.columns[h]
+        i = int(groups.first[h]) - 1
         for k in range(GROUP_COLUMNS):
-            i += (groups.columns[g] >> k) & 1
+            i += (groups.columns[h] >> k) & 1
             centre[most] = i
             most += (left >> k) & 1
     found_at = np.empty((most, 2), np.int64)
