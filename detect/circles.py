@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.distortion import inverse_table
-from camera.kernels import camera_numbers, lens_numbers
+from camera.kernels import camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
@@ -329,40 +327,23 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
         (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
         (`Camera.floor_jacobian_published`).
     """
-    kernel = _kernel_camera(camera)
-    return pixel_positions(
-        pixels, kernel.lens, kernel.pose, kernel.distorted, kernel.undistorted,
-        kernel.rigid, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE,
-    )  # fmt: skip
+    jacobian = camera.floor_jacobian_published(pixels)
+    covariance = PUBLISHED_PIXEL_VARIANCE * jacobian @ jacobian.swapaxes(1, 2)
+    return camera.floor_from_pixel(pixels), covariance + PUBLISHED_FLOOR_M**2 * np.eye(2)
 
 
 class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 
     numbers: FloatArray
-    rigid: FloatArray
-    lens: FloatArray
-    pose: FloatArray
-    distorted: FloatArray
-    undistorted: FloatArray
     centre: FloatArray
     blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
-    pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]
-    rigid = camera_numbers(camera)
-    rigid[10:19] = camera.rotation.T.ravel()
-    return _KernelCamera(
-        camera_numbers(camera),
-        rigid,
-        np.array([*pinhole, *lens_numbers(camera)]),
-        np.array(camera.robot_from_camera),
-        *inverse_table(camera.coef),
-        np.array(camera.centre, np.float64),
-        blur_ratio_of(camera),
-    )
+    centre = np.array(camera.centre, np.float64)
+    return _KernelCamera(camera_numbers(camera), centre, blur_ratio_of(camera))
 
 
 def refined_covariance(

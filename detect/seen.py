@@ -48,9 +48,8 @@ def level_seen(
 ) -> FloatArray:
     """Level positions (m) of discs that the calibrated camera sees on the floor.
 
-    Of positions (N, 2) or (M, N, 2) that were computed without knowledge of the tilt, levelled by
-    (2,) or (M, 2) pitch and roll (rad); the rest as in `image_positions`. NaN where the levelled
-    ray does not meet the floor.
+    Of positions (N, 2) or (M, N, 2) that were computed without the tilt, levelled by (2,) or (M, 2)
+    pitch and roll (rad). NaN where the levelled ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)

@@ -79,14 +79,13 @@ class CentreGroups(NamedTuple):
     A group's centres are in one row, within `GROUP_COLUMNS` of each other.
     """
 
-    first: NDArray[np.int32]
-    """(G,) the first centre of each."""
+    first: NDArray[np.int32]  # (G,) the first centre of each
+    #: (G,) the columns of its centres, counted from the first: a bit each.
     columns: NDArray[np.int32]
-    """(G,) the columns of its centres, counted from the first: a bit each."""
+    #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
+    #: the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre
+    #: that sees fewer.
     samples: NDArray[np.uint32]
-    """(G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
-    the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre that
-    sees fewer."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,11 +164,6 @@ def explain_discs(
         With `verify` and `refine`: the plain detectors drop nothing after the quality.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found: candidates near it alone.
-
-    Raises
-    ------
-    FrameError
-        If the image has not the camera's size.
     """
     table = cached_disc_table(camera, disc_shape(settings))
     found = detect_circles(image, camera, table, settings)
