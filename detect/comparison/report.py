@@ -13,12 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, read_camera
-from detect.comparison.compare import (
-    beside_reference,
-    compare_line_frames,
-    compare_runs,
-    unlisted_lines,
-)
+from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
 from detect.comparison.result import (
     CommonLean,
     Comparison,
@@ -75,7 +70,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
             read_frames(reference),
             read_frames(detected),
             command.matching,
-            unlisted=unlisted_lines(reference, command.unlisted),
+            unlisted=rows_beside(reference, "unlisted.lines", command.unlisted),
             names=(str(reference), str(detected)),
         )
     if camera is None:
@@ -84,13 +79,14 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     if camera is not None:
         radius_m = read_head(detected).circle_settings.radius_m
         sight = Sight(camera, radius_m, read_head(reference).level)
-    return compare_runs(
-        command.run,
-        reference=reference,
-        detected=detected,
-        options=command.matching,
+    return compare_frames(
+        read_frames(reference),
+        read_frames(detected),
+        command.matching,
         sight=sight,
-        beside=beside_reference(reference, command.unlisted, command.lookalikes),
+        unlisted=rows_beside(reference, "unlisted.circles", command.unlisted),
+        lookalikes=rows_beside(reference, "lookalikes.circles", command.lookalikes),
+        names=(str(reference), str(detected)),
     )
 
 
@@ -249,7 +245,9 @@ def summary_rows(c: Comparison) -> dict[str, str]:
 def _disc_rows(c: DiscComparison) -> dict[str, str]:
     rows = {}
     if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        rows["levelled"] = _levelling_text(c)
+        sides = ("reference", c.reference_levelling), ("detected", c.detected_levelling)
+        how = "at the pixels where they were seen" if c.in_image else "on the floor"
+        rows["levelled"] = f"{'; '.join(_levelled_side(*s) for s in sides)}: compared {how}"
     if c.in_image:
         same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
@@ -273,14 +271,6 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         text = f"median {number(matched, 3)} matched, {number(alone, 3)} {fate}"
         rows[f"{side} quality"] = text
     return rows
-
-
-def _levelling_text(c: DiscComparison) -> str:
-    """One sentence on which side's rows are levelled."""
-    reference = _levelled_side("reference", c.reference_levelling)
-    detected = _levelled_side("detected", c.detected_levelling)
-    held = "compared at the pixels where they were seen" if c.in_image else "compared on the floor"
-    return f"{reference}; {detected}: {held}"
 
 
 def _levelled_side(name: str, side: Levelling) -> str:

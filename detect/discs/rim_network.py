@@ -83,11 +83,11 @@ def network_inputs(
 ) -> tuple[_Weights, _Weights]:
     """What a network sees of (K, M) grey values in K directions at M distances.
 
-    These are NaN outside the image. The sign is -1 for a dark disc, which is seen as a light one. Inputs (M + OTHERS, K + 2) are
-    deviations from the mean relative to their root mean square, 0 outside; logarithm of the pixels
-    per radius; share outside. The last direction is before the first, and the first behind the
-    last. Scales are logarithms of the pixels per radius and of the root mean square, less usual
-    ones.
+    These are NaN outside the image. The sign is -1 for a dark disc, which is seen as a light one.
+    Inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean square, 0
+    outside; logarithm of the pixels per radius; share outside. The last direction is before the
+    first, and the first behind the last. Scales are logarithms of the pixels per radius and of the
+    root mean square, less usual ones.
     """
     directions, distances = grey.shape
     inputs = np.zeros((distances + OTHERS, directions + 2), np.float32)

@@ -34,6 +34,7 @@ from detect.report.figures import (
     disc_rates,
     distance_figure,
     floor_figure,
+    floor_map,
     knee,
     line_rates,
     rates_figure,
@@ -41,7 +42,6 @@ from detect.report.figures import (
     whitened,
     whitened_figure,
 )
-from detect.report.floor_map import floor_map
 from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source

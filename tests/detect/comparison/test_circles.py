@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.compare import Beside, compare_frames, compare_runs
+from detect.comparison.compare import compare_frames, compare_runs
 from detect.comparison.report import format_json
 from detect.comparison.result import DiscComparison, unmet_demands
 from detect.errors import CompareError
@@ -68,7 +68,7 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
         frame("e.0000", *DETECTED[0].circles, disc(1.5, 1.5, 0.5)),
         frame("e.0001", *DETECTED[1].circles, disc(-0.6, 1.92, 0.9)),
     ]
-    found = compare_frames(REFERENCE, detected, STANDARD, beside=Beside(unlisted, lookalikes))
+    found = compare_frames(REFERENCE, detected, STANDARD, unlisted=unlisted, lookalikes=lookalikes)
     assert (found.matched, found.missed, found.extra) == (4, 1, 2)
     assert (found.set_aside, found.on_lookalikes) == (1, 1)
     assert found.precision == pytest.approx(4 / 6)
@@ -87,7 +87,7 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
 def test_a_reference_row_comes_before_an_unlisted_one() -> None:
     """An unlisted disc beside a listed one must not take its row."""
     unlisted = (frame("e.0000", disc(0.03, 1.04, 1.0)),)
-    found = compare_frames(REFERENCE, DETECTED, STANDARD, beside=Beside(unlisted))
+    found = compare_frames(REFERENCE, DETECTED, STANDARD, unlisted=unlisted)
     assert (found.matched, found.set_aside) == (4, 0)
 
 
