@@ -19,7 +19,7 @@ from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import read_image
 from detect.seen import circle_on_floor, image_positions, summed_steps
-from detect.sources.opening import demand_recording, open_calibrated
+from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
 from redetect.landmarks import Step, circle_arrays
@@ -39,7 +39,7 @@ def perform(options: View) -> int:
     """Carry the command out; returns the exit code."""
     rr = _rerun()
     demand_recording(options.run)
-    run = open_calibrated(options.run, options.camera, options.source)
+    run = open_run(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
         raise OutputExistsError(options.output)

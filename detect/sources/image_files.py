@@ -49,10 +49,7 @@ def last_part(prefix: str) -> str:
 
 
 class ImageNames:
-    """Names of a folder's image files that match a pattern, in natural order: numbers by value.
-
-    The folder is listed once; `has_links` says whether any of them is a symbolic link.
-    """
+    """Names of a folder's image files that match a pattern, in natural order: numbers by value."""
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
@@ -61,13 +58,11 @@ class ImageNames:
         self._homes = (own, own.parent) if own.name == "images" else (own,)
         matches = re.compile(fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:
-            found = [
-                entry
+            names = sorted(
+                entry.name
                 for entry in entries
                 if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
-            ]
-        self.has_links = any(entry.is_symlink() for entry in found)
-        names = sorted(entry.name for entry in found)
+            )
         names.sort(key=_natural_order)
         encoded = [os.fsencode(name) for name in names]
         self._names: NDArray[np.bytes_] = np.array(encoded, dtype=np.bytes_)

@@ -7,16 +7,27 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from camera import read_camera
-from detect.errors import DetectError
+from detect.errors import DetectError, FrameError
 from detect.options import SourceOptions
-from detect.run import ImageRun, Run, open_images, open_run
-from detect.sources.image_files import IMAGE_SUFFIXES
+from detect.run import ImageRun, Run, camera_in
+from detect.sources.image_files import (
+    IMAGE_SUFFIXES,
+    WILDCARDS,
+    ImageFiles,
+    RunFrames,
+    bits_of_images,
+    images_of_folder,
+)
 from detect.sources.interface import Frames
+from redetect.landmarks import read_steps
 
 if TYPE_CHECKING:
     from detect.sources.interface import Source
@@ -24,7 +35,7 @@ if TYPE_CHECKING:
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
 
-def open_calibrated(
+def open_run(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> Run:
     """Open what holds a run's images, with a calibration.
@@ -34,13 +45,15 @@ def open_calibrated(
     name : path
         A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
     camera_path : path, optional
-        The calibration; by default the one beside the images.
+        The calibration; by default the one beside the images (of several in a run folder
+        ``<run>.cam``).
     options : SourceOptions, optional
 
     Raises
     ------
     DetectError
-        If there is no such thing, it cannot be read, or there is no calibration.
+        If there is no such thing, it cannot be read, or there is no calibration, or more than one
+        to choose from.
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
@@ -49,14 +62,14 @@ def open_calibrated(
         return run
     raise DetectError(
         f"{name}: no calibration: expected a .cam file beside the images, or one named by "
-        "--camera; `camera calibrate` makes one"
+        "--camera; `camera calibrate` makes one, `camera convert` brings one over"
     )
 
 
 def open_source(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> ImageRun:
-    """As `open_calibrated`; a `Run` if there is a calibration."""
+    """Open it with or without a calibration; without one it is no `Run`."""
     return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
@@ -72,9 +85,9 @@ def demand_recording(name: Path) -> None:
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
     if name.is_dir() and not _is_ros2_bag(name) and options.plain:
-        # A run folder as the data set has them, with its own odometry.
-        opened = open_run if posed else open_images
-        return _shortened(opened(name, camera_path, bits=options.bits or None), options.frames)
+        camera = camera_in(name) if camera_path is None else read_camera(camera_path)
+        run = _shortened(_folder_run(name, options.bits or None), options.frames)
+        return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames, odometry = _frames(source, options)
@@ -92,9 +105,33 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     return run.calibrated(camera)
 
 
+def _folder_run(folder: Path, bits: int | None) -> ImageRun:
+    """A run folder as the data set has them, with its own odometry, or any folder of images.
+
+    The odometry is read once to see which images it names, and that there is no error in it.
+    """
+    images = images_of_folder(folder)
+    bits = bits_of_images(images) if bits is None else bits
+    usual = folder / f"{folder.resolve().name}.txt", folder / "map.circles"
+    odometry = next((path for path in usual if path.is_file()), None)
+    count, left_out = len(images), 0
+    if odometry is not None:
+        named = np.zeros(len(images), bool)
+        count = 0
+        for step in read_steps(odometry):
+            count += 1
+            with suppress(FrameError):  # reported when the frame is processed
+                found = images.place_of(step.prefix)
+                if found is not None:
+                    images.checked(found)
+                    named[found] = True
+        left_out = int(np.count_nonzero(~named))
+    frames = RunFrames(images, odometry, count, left_out, bits)
+    return ImageRun(folder, frames, odometry, folder / "detected")
+
+
 def _source(name: Path, options: SourceOptions) -> Source:
     from detect.sources.bag import BAG_SUFFIXES, Bag
-    from detect.sources.image_files import WILDCARDS, ImageFiles
     from detect.sources.video import LiveCamera, VideoFile
 
     bits = options.bits or None

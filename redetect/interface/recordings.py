@@ -24,7 +24,7 @@ from detect.run import Run, read_image
 from detect.seen import Sight
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
-from detect.sources.opening import open_calibrated, open_source
+from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
 from redetect.landmarks import Step, read_frames
@@ -137,7 +137,7 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
     if isinstance(camera, Camera):
         return Recording(open_source(Path(name), None, options).calibrated(camera))
     path = None if camera is None else Path(camera)
-    return Recording(open_calibrated(Path(name), path, options))
+    return Recording(open_run(Path(name), path, options))
 
 
 def compare(
