@@ -159,10 +159,10 @@ def test_malformed_step_is_named_by_file_and_line(run_folder: Path) -> None:
 
 def test_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(DetectError, match="expected a run folder, a folder of images") as e:
+    with pytest.raises(DetectError, match=r"expected a run folder, a folder of images") as e:
         open_run(tmp_path / "nowhere")
     assert "nowhere" in str(e.value)
-    with pytest.raises(DetectError, match="file: no video .*: expected a run folder, images"):
+    with pytest.raises(DetectError, match=r"file: no video .*: expected a run folder, images"):
         open_run(tmp_path / "file")
 
 
