@@ -55,14 +55,6 @@ class Networks(NamedTuple):
     glance: RimNetwork
     look: RimNetwork
 
-    def by_name(self) -> dict[str, _Weights]:
-        """All weights, as `WEIGHTS_FILE` has them."""
-        return {
-            f"{sort}_{name}": weights
-            for sort, network in zip(self._fields, self, strict=True)
-            for name, weights in zip(network._fields, network, strict=True)
-        }
-
 
 @cache
 def trained_networks() -> Networks:
