@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from detect.comparison.floor import floor_bins, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
-    Comparison,
     DiscComparison,
     DistanceBin,
     FrameMatch,
@@ -132,7 +131,7 @@ def compare_frames(
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("circles", wanted, found, options, names, sight, unlisted)
-    matches = common.frames
+    matches: Sequence[FrameMatch] = common["frames"]
     first, second, missed, extra = sides = (
         circle_arrays([row for m in matches for row in m.paired[0]]),
         circle_arrays([row for m in matches for row in m.paired[1]]),
@@ -158,7 +157,7 @@ def compare_frames(
     true = sight is not None and sight.reference_level
     ranges = list(pairwise(_EDGES_M))
     return DiscComparison(
-        **vars(common),
+        **common,
         on_lookalikes=_on_lookalikes(matches, lookalikes, options),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
@@ -191,7 +190,7 @@ def compare_line_frames(
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("lines", *sides, options, names, unlisted=unlisted)
-    first, second = ([row for m in common.frames for row in m.paired[side]] for side in (0, 1))
+    first, second = ([row for m in common["frames"] for row in m.paired[side]] for side in (0, 1))
 
     def difference(name: str) -> FloatArray:
         return numbers(second, name) - numbers(first, name)
@@ -205,7 +204,7 @@ def compare_line_frames(
         for x, y in (("xtop", "ytop"), ("xbottom", "ybottom"))
     ]
     return LineComparison(
-        **vars(common),
+        **common,
         bearing_median_deg=quantile(error_deg),
         bearing_95_deg=quantile(error_deg, 0.95),
         normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
@@ -290,8 +289,8 @@ def match_runs(
     names: tuple[str, str],
     sight: Sight | None = None,
     unlisted: Iterable[Frame] | None = None,
-) -> Comparison:
-    """Match the rows of two runs, image by image.
+) -> dict[str, Any]:
+    """Match the rows of two runs, image by image: the fields of a `Comparison`.
 
     Images are in the order of the reference, then those of `detected` alone, if they count.
     """
@@ -311,19 +310,20 @@ def match_runs(
     }
     found, detected_rows = counts["matched"] + counts["joined"], counts["matched"] + counts["extra"]
     wanted = found + counts["missed"]
-    return Comparison(
-        *names,
-        options,
-        reference=wanted,
-        detected=detected_rows,
-        found=found,
+    return {
+        "reference_name": names[0],
+        "detected_name": names[1],
+        "options": options,
+        "reference": wanted,
+        "detected": detected_rows,
+        "found": found,
         **counts,
-        recall=found / wanted if wanted else None,
-        precision=counts["matched"] / detected_rows if detected_rows else None,
-        frames=tuple(matches),
-        frames_only_in_reference=tuple(name for name in reference if name not in detected),
-        frames_only_in_detected=tuple(name for name in detected if name not in reference),
-    )
+        "recall": found / wanted if wanted else None,
+        "precision": counts["matched"] / detected_rows if detected_rows else None,
+        "frames": tuple(matches),
+        "frames_only_in_reference": tuple(name for name in reference if name not in detected),
+        "frames_only_in_detected": tuple(name for name in detected if name not in reference),
+    }
 
 
 def pair_of(

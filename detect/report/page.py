@@ -16,11 +16,10 @@ from jinja2 import Environment, StrictUndefined
 from detect import __version__
 from detect.comparison.report import (
     floor_table,
-    number,
     summary_rows,
     worst_frames_table,
 )
-from detect.comparison.result import Comparison, DiscComparison, LineComparison
+from detect.comparison.result import Comparison, DiscComparison, LineComparison, number
 from detect.drawing.inputs import picture_name
 from detect.errors import DetectError
 from detect.line_settings import LineSettings

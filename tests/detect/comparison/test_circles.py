@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detect.comparison.compare import compare_frames, compare_runs
-from detect.comparison.report import format_json
 from detect.comparison.result import DiscComparison, unmet_demands
 from detect.errors import CompareError
 from detect.sources.image_files import image_name
@@ -296,7 +295,7 @@ def test_no_matches_give_clear_results(
     assert found.normalised_error.per_dof is None
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
-    assert json.loads(format_json(found))["error_95_m"] is None
+    assert json.loads(found.to_json())["error_95_m"] is None
     assert "position error     median - m, 95 % - m" in format_text(found)
 
 
@@ -314,8 +313,8 @@ def test_demands_are_met_or_named() -> None:
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
-    found = json.loads(format_json(compare(REFERENCE, DETECTED)))
-    empty = json.loads(format_json(compare([], [])))
+    found = json.loads(compare(REFERENCE, DETECTED).to_json())
+    empty = json.loads(compare([], []).to_json())
     assert list(found) == list(empty)
     assert found["matched"] == 4
     assert found["missed"] == found["extra"] == 1
@@ -401,7 +400,7 @@ def test_rows_are_accounted_for_whatever_they_are(
     assert found.detected + found.set_aside == len(detected)
     assert 0 <= found.matched <= min(found.reference, found.detected)
     assert sum(part.reference for part in found.bins) == found.reference
-    json.loads(format_json(found))
+    json.loads(found.to_json())
 
 
 def test_the_shipped_file_agrees_with_itself(shared_data: Path) -> None:
