@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from camera import read_camera
-from detect.errors import DetectError, FrameError
+from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.run import ImageRun, Run, camera_in
 from detect.sources.image_files import (
@@ -27,7 +24,6 @@ from detect.sources.image_files import (
     images_of_folder,
 )
 from detect.sources.interface import Frames
-from redetect.landmarks import read_steps
 
 if TYPE_CHECKING:
     from detect.sources.interface import Source
@@ -84,9 +80,12 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
-    if name.is_dir() and not _is_ros2_bag(name) and options.plain:
+    own = _own_odometry(name) if name.is_dir() else None
+    if own is not None and options.plain and not _is_ros2_bag(name):
         camera = camera_in(name) if camera_path is None else read_camera(camera_path)
-        run = _shortened(_folder_run(name, options.bits or None), options.frames)
+        images = images_of_folder(name)
+        frames: Frames = RunFrames(images, own, options.bits or bits_of_images(images))
+        run = _shortened(ImageRun(name, frames, own, name / "detected"), options.frames)
         return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
@@ -105,29 +104,10 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     return run.calibrated(camera)
 
 
-def _folder_run(folder: Path, bits: int | None) -> ImageRun:
-    """A run folder as the data set has them, with its own odometry, or any folder of images.
-
-    The odometry is read once to see which images it names, and that there is no error in it.
-    """
-    images = images_of_folder(folder)
-    bits = bits_of_images(images) if bits is None else bits
+def _own_odometry(folder: Path) -> Path | None:
+    """The odometry of a run folder as the data set has them."""
     usual = folder / f"{folder.resolve().name}.txt", folder / "map.circles"
-    odometry = next((path for path in usual if path.is_file()), None)
-    count, left_out = len(images), 0
-    if odometry is not None:
-        named = np.zeros(len(images), bool)
-        count = 0
-        for step in read_steps(odometry):
-            count += 1
-            with suppress(FrameError):  # reported when the frame is processed
-                found = images.place_of(step.prefix)
-                if found is not None:
-                    images.checked(found)
-                    named[found] = True
-        left_out = int(np.count_nonzero(~named))
-    frames = RunFrames(images, odometry, count, left_out, bits)
-    return ImageRun(folder, frames, odometry, folder / "detected")
+    return next((path for path in usual if path.is_file()), None)
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
