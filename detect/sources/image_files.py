@@ -207,6 +207,8 @@ class ImageFiles(Source):
             self._names, self._home = _matching_images(name), name.parent
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
+        # A pattern names its links; a folder may be somebody else's.
+        self._path = self._names.checked if name.is_dir() else self._names.path
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names)
@@ -220,8 +222,7 @@ class ImageFiles(Source):
             stem = self._names.path(place).stem
             step, time_s = still(frame_prefix(stem)), self._times.get(stem)
             try:
-                path = self._names.checked(place)
-                yield RunFrame(step, path, time_s=time_s, bits=self._bits)
+                yield RunFrame(step, self._path(place), time_s=time_s, bits=self._bits)
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
