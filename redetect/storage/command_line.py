@@ -206,7 +206,7 @@ class Program:
         short, hidden = _without(kind, self.expert)
         if hidden:
             text, section, parameters = (kind.__doc__ or "").partition("\n\n    Parameters\n")
-            short.__doc__ = f"{text}\n\n    {hidden} more flags are shown by {_HELP_ALL}."
+            short.__doc__ = f"{text.rstrip()}\n\n    {hidden} more flags are shown by {_HELP_ALL}."
             short.__doc__ += section + parameters
         return short
 
