@@ -34,6 +34,7 @@ from detect.margins import blank_margins
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable, cached_disc_table
+from lut.outlines import floor_positions
 
 FloatArray = NDArray[np.float64]
 
@@ -327,23 +328,29 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
         (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
         (`Camera.floor_jacobian_published`).
     """
-    jacobian = camera.floor_jacobian_published(pixels)
-    covariance = PUBLISHED_PIXEL_VARIANCE * jacobian @ jacobian.swapaxes(1, 2)
-    return camera.floor_from_pixel(pixels), covariance + PUBLISHED_FLOOR_M**2 * np.eye(2)
+    kernel, floor_xy = _kernel_camera(camera), floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
+    floor_variance = np.tile(PUBLISHED_FLOOR_M**2 * np.eye(2), (len(pixels), 1, 1))
+    covariance = refined_covariances(
+        kernel.published, kernel.centre, floor_xy, floor_variance, PUBLISHED_PIXEL_VARIANCE, 0.0
+    )
+    return floor_xy, np.asarray(covariance)
 
 
 class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 
     numbers: FloatArray
+    published: FloatArray  # the same with the transpose of the rotation for its inverse
     centre: FloatArray
     blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
+    published = camera_numbers(camera)
+    published[10:19] = camera.rotation.T.ravel()
     centre = np.array(camera.centre, np.float64)
-    return _KernelCamera(camera_numbers(camera), centre, blur_ratio_of(camera))
+    return _KernelCamera(camera_numbers(camera), published, centre, blur_ratio_of(camera))
 
 
 def refined_covariance(

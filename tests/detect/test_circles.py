@@ -285,6 +285,22 @@ def test_published_rows_are_pixels(
     np.testing.assert_array_equal(order, expected)
 
 
+def test_published_positions_are_the_cameras(published_camera: Camera) -> None:
+    """The kernel against the definition, all over the image and past the horizon."""
+    rows, columns = np.mgrid[0 : published_camera.height : 7, 0 : published_camera.width : 5]
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
+    floor_xy, covariance = published_positions(published_camera, pixels)
+    seen = published_camera.floor_from_pixel(pixels)
+    jacobian = published_camera.floor_jacobian_published(pixels)
+    expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.swapaxes(-1, -2)
+    assert np.isnan(seen).any(axis=-1).sum() > 100
+    np.testing.assert_allclose(floor_xy, seen, rtol=1e-9)
+    near = np.hypot(*seen.T) < 10.0
+    assert near.sum() > 3000
+    np.testing.assert_allclose(floor_xy[near], seen[near], rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-7, atol=1e-10)
+
+
 def test_published_covariance_is_the_formula(published_camera: Camera) -> None:
     """(0.04 m)^2 I + 2 px^2 J J^T."""
     pixels = np.array([[384, 270], [100, 120], [700, 90], [50, 200], [384, 60]])

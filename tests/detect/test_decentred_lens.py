@@ -11,6 +11,7 @@ from camera import Camera
 from detect.circles import (
     detect_circles,
     disc_shape,
+    published_positions,
     refined_covariance,
 )
 from detect.lines import detect_lines
@@ -111,6 +112,27 @@ def look_through(radial: Camera, lens: Camera) -> None:
     assert errors[0][1] < 0.08
     assert errors[1][1] < 0.08
     assert errors[2][0] > 6e-4
+
+
+@pytest.mark.parametrize("polynomial", [(0.0, 0.0, 0.0), (-0.05, 0.02, -0.004)])
+@pytest.mark.parametrize("tangential", [(0.0, 0.0), TANGENTIAL])
+def test_published_positions_are_the_cameras(
+    published_camera: Camera,
+    tangential: tuple[float, float],
+    polynomial: tuple[float, float, float],
+) -> None:
+    decentred = replace(published_camera, tangential=tangential, polynomial=polynomial)
+    rows, columns = np.mgrid[0 : decentred.height : 7, 0 : decentred.width : 5]
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
+    floor_xy, covariance = published_positions(decentred, pixels)
+    seen = decentred.floor_from_pixel(pixels)
+    jacobian = decentred.floor_jacobian_published(pixels)
+    expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.swapaxes(-1, -2)
+    np.testing.assert_allclose(floor_xy, seen, rtol=1e-9)
+    near = np.hypot(*seen.T) < 10.0
+    assert near.sum() > 3000
+    np.testing.assert_allclose(floor_xy[near], seen[near], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-7, atol=1e-10)
 
 
 def test_a_covariance_of_pixels_is_that_of_the_cameras_jacobian(decentred: Camera) -> None:
