@@ -34,22 +34,10 @@ _STEP_RAD = 1e-6
 def common_covariance(
     camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool
 ) -> FloatArray:
-    """What the calibration's errors contribute to positions on the floor.
+    """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
 
-    Parameters
-    ----------
-    camera : Camera
-    floor_xy : (N, 2) float64
-        Metres.
-    unstated_px : float
-        Standard deviation of the pixels of a camera that does not state its covariance.
-    by_verticals : bool
-        Whether the positions are levelled by the verticals that the camera sees.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        Square metres.
+    `unstated_px` is the standard deviation of the pixels of a camera that doesn't state its
+    covariance; `by_verticals`: the positions are levelled by the verticals that the camera sees.
     """
     if len(floor_xy) == 0:
         return np.zeros((0, 2, 2))

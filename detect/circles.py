@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.distortion import inverse_table
-from camera.kernels import camera_numbers, lens_numbers
+from camera.kernels import camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.positions import published_positions as pixel_positions
 from detect.discs.positions import refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
@@ -36,6 +34,7 @@ from detect.margins import blank_margins
 from detect.noise import estimate_noise
 from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable, cached_disc_table
+from lut.outlines import floor_positions
 
 FloatArray = NDArray[np.float64]
 
@@ -329,40 +328,29 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
         (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
         (`Camera.floor_jacobian_published`).
     """
-    kernel = _kernel_camera(camera)
-    return pixel_positions(
-        pixels, kernel.lens, kernel.pose, kernel.distorted, kernel.undistorted,
-        kernel.rigid, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE,
-    )  # fmt: skip
+    kernel, floor_xy = _kernel_camera(camera), floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
+    floor_variance = np.tile(PUBLISHED_FLOOR_M**2 * np.eye(2), (len(pixels), 1, 1))
+    covariance = refined_covariances(
+        kernel.published, kernel.centre, floor_xy, floor_variance, PUBLISHED_PIXEL_VARIANCE, 0.0
+    )
+    return floor_xy, np.asarray(covariance)
 
 
 class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 
     numbers: FloatArray
-    rigid: FloatArray
-    lens: FloatArray
-    pose: FloatArray
-    distorted: FloatArray
-    undistorted: FloatArray
+    published: FloatArray  # the same with the transpose of the rotation for its inverse
     centre: FloatArray
     blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
-    pinhole = [camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y]
-    rigid = camera_numbers(camera)
-    rigid[10:19] = camera.rotation.T.ravel()
-    return _KernelCamera(
-        camera_numbers(camera),
-        rigid,
-        np.array([*pinhole, *lens_numbers(camera)]),
-        np.array(camera.robot_from_camera),
-        *inverse_table(camera.coef),
-        np.array(camera.centre, np.float64),
-        blur_ratio_of(camera),
-    )
+    published = camera_numbers(camera)
+    published[10:19] = camera.rotation.T.ravel()
+    centre = np.array(camera.centre, np.float64)
+    return _KernelCamera(camera_numbers(camera), published, centre, blur_ratio_of(camera))
 
 
 def refined_covariance(

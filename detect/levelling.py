@@ -47,27 +47,11 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 def level_discs(
     camera: Camera, floor_xy: FloatArray, covariance: FloatArray, tilt: FrameTilt
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Positions on the floor and their covariances, corrected for a tilt.
+    """Positions (N, 2) on the floor (m) and their covariances, corrected for a tilt.
 
-    Parameters
-    ----------
-    camera : Camera
-        The camera as calibrated on the level robot.
-    floor_xy : (N, 2) float64
-        Positions computed without knowledge of the tilt, metres.
-    covariance : (N, 2, 2) float64
-        Of these, square metres.
-    tilt : FrameTilt
-        With its covariance.
-
-    Returns
-    -------
-    level_xy : (N, 2) float64
-        In the level robot frame, metres; NaN where the levelled ray does not meet the floor.
-    level_covariance : (N, 2, 2) float64
-        Their own covariance, carried along, and that due to the tilt's; NaN as above.
-    down : (N,) bool
-        Whether it does.
+    Positions are those that the calibrated camera sees on a level robot. The covariances returned
+    are their own, carried along, and that due to the tilt's. Where the levelled ray does not meet
+    the floor, numbers are NaN and the mask is false.
     """
     steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])
     tilts = steps[:, 2:] + (tilt.pitch, tilt.roll)

@@ -26,7 +26,7 @@ from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, t
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
-from detect.sources.opening import open_calibrated
+from detect.sources.opening import open_run
 from detect.terminal import progress_bar
 from redetect.storage.parts import demand_place
 
@@ -43,7 +43,7 @@ _TOGETHER = 5.0
 def perform(options: Level) -> int:
     """Carry the command out; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
-    run = open_calibrated(options.run, options.camera)
+    run = open_run(options.run, options.camera)
     camera, height_m = run.camera, float(run.camera.centre[2])
     plan = FramePlan(
         camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"

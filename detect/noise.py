@@ -15,23 +15,11 @@ _MOST_RESPONSE = 16 * 255
 
 
 def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> float:
-    """Standard deviation of an image's noise, grey levels.
+    """Standard deviation of an image's noise, grey levels; 0 for less than 3 rows or columns.
 
-    The median absolute response to the second difference in both directions, which sees neither
-    planes nor straight edges (after Immerkaer, "Fast noise variance estimation", 1996); black and
-    saturated pixels do not count.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The image.
-    most_rows : int, optional
-        Use at most this many rows, evenly spread; by default all.
-
-    Returns
-    -------
-    float
-        0 for images of less than 3 rows or columns.
+    The median absolute response, in at most `most_rows` rows, to the second difference in both
+    directions, which sees neither planes nor straight edges (after Immerkaer, "Fast noise variance
+    estimation", 1996); black and saturated pixels do not count.
     """
     height, width = image.shape
     if min(height, width) < 3:

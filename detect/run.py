@@ -1,30 +1,22 @@
-"""A run on disk: its camera, its frames, its odometry.
+"""A run: its frames, its odometry, and, if it has one, its calibration.
 
-Either a run folder of the data set (``images/``, ``<run>.cam``, ``<run>.txt``, ``map.circles``),
-or any folder of images with a ``.cam`` in it. A frame is a STEP row with its image; without
-odometry, an image with a STEP row of zeros.
-
-A run may be long. Only the names of its images are kept in memory, some 20 bytes each. The odometry
-is read along with the frames, and once before, so that errors in it are reported before any work is
-done.
+A frame is a STEP row with its image; without odometry, an image with a STEP row of zeros. A run may
+be long: frames are made on demand.
 """
 
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera, read_camera
-from detect.errors import DetectError, FrameError
+from camera import Camera
+from detect.errors import FrameError
 from detect.sources.gray import bounded_content, decode_gray, wrong_size
-from detect.sources.image_files import RunFrames, bits_of_images, images_of_folder
 from detect.sources.interface import Frames, RunFrame, only_calibration
-from redetect.landmarks import read_steps
 
 
 @dataclass(frozen=True)
@@ -64,89 +56,14 @@ class Run(ImageRun):
     camera: Camera = field(kw_only=True)
 
 
-def open_run(folder: Path, camera_path: Path | None = None, *, bits: int | None = None) -> Run:
-    """Read a run folder.
-
-    Parameters
-    ----------
-    folder : path
-        A run folder of the data set's layout, or a folder of images.
-    camera_path : path, optional
-        The calibration; by default the one ``.cam`` in the folder (``<run>.cam`` if there are
-        several).
-    bits : int, optional
-        Significant bits of 16-bit images; by default what some of them need.
-
-    Raises
-    ------
-    DetectError
-        If there is no such folder, no image, no calibration, or more than one to choose from.
-    camera.CameraError, redetect.landmarks.LandmarkFileError
-        If the calibration or the odometry cannot be read.
-    """
-    run = open_images(folder, camera_path, bits=bits)
-    if isinstance(run, Run):
-        return run
-    raise DetectError(
-        f"{folder}: no calibration: expected a .cam file in it, or one named by --camera; "
-        "`camera calibrate` makes one, `camera convert` brings one over from other programs"
-    )
-
-
-def open_images(
-    folder: Path, camera_path: Path | None = None, *, bits: int | None = None
-) -> ImageRun:
-    """Read a run folder as `open_run` does; without a calibration it is no `Run`."""
-    if not folder.is_dir():
-        raise DetectError(f"{folder}: no such folder: expected a run folder or a folder of images")
-    camera = camera_in(folder) if camera_path is None else read_camera(camera_path)
-    run = _image_run(folder, bits)
-    return run if camera is None else run.calibrated(camera)
-
-
-def _image_run(folder: Path, bits: int | None) -> ImageRun:
-    images = images_of_folder(folder)
-    odometry = _odometry(folder)
-    bits = bits_of_images(images) if bits is None else bits
-    count, left_out = len(images), 0
-    if odometry is not None:
-        named = np.zeros(len(images), bool)
-        count = 0
-        for step in read_steps(odometry):
-            count += 1
-            with suppress(FrameError):  # reported when the frame is processed
-                found = images.place_of(step.prefix)
-                if found is not None:
-                    if images.has_links:
-                        images.checked(found)
-                    named[found] = True
-        left_out = int(np.count_nonzero(~named))
-    frames = RunFrames(images, odometry, count, left_out, bits)
-    return ImageRun(folder, frames, odometry, folder / "detected")
-
-
 def read_image(
     frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
 ) -> NDArray[np.uint8]:
-    """The grey image of a frame.
+    """The grey image of a frame (H, W); 16 bits are brought to 8 (see `detect.sources.gray`).
 
-    Parameters
-    ----------
-    frame : RunFrame
-    camera : Camera or None
-        Whose size the image must have, if any.
-    working_folder : path, optional
-        Folder that relative paths start from, if not the process's own working folder.
-
-    Returns
-    -------
-    (H, W) uint8 array
-        Brightness; 16 bits are brought to 8 (see `detect.sources.gray`).
-
-    Raises
-    ------
-    FrameError
-        If there is no image, it cannot be read, or has another size than the calibration.
+    It must have the size of the camera, if any. Relative paths start from `working_folder`, by
+    default the process's own. Raises FrameError if there is no image, it cannot be read, or has
+    another size.
     """
     name: object = frame.image or frame.step.prefix
     size = None if camera is None else (camera.width, camera.height)
@@ -169,10 +86,3 @@ def read_image(
 def camera_in(folder: Path) -> Camera | None:
     """The calibration in a run folder; None where there is none."""
     return only_calibration(folder, folder.resolve().name)
-
-
-def _odometry(folder: Path) -> Path | None:
-    for candidate in (folder / f"{folder.resolve().name}.txt", folder / "map.circles"):
-        if candidate.is_file():
-            return candidate
-    return None

@@ -60,10 +60,8 @@ _LEAST_RAD = math.radians(0.01)
 class FrameTilts(NamedTuple):
     """Pitch and roll of frames (rad), NaN where there are none, and their variances (rad^2)."""
 
-    tilt: FloatArray
-    """(N, 2)"""
-    variance: FloatArray
-    """(N, 2)"""
+    tilt: FloatArray  # (N, 2)
+    variance: FloatArray  # (N, 2)
 
 
 def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
@@ -163,8 +161,7 @@ class _Axis(NamedTuple):
     spread: float
     verticals_scale: float
     outlines_scale: float
-    apart: float = math.nan
-    """By how much the outlines' constant differs from the verticals'."""
+    apart: float = math.nan  # by how much the outlines' constant differs from the verticals'
     lean_variance: float = math.nan
 
 

@@ -5,13 +5,15 @@ Plain numpy: comparing files takes no compiler.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from redetect.landmarks import Frame
+from redetect.landmarks import Frame, Step
 
 FloatArray = NDArray[np.float64]
 Tilt = tuple[float, float]
@@ -22,18 +24,10 @@ _POINTS = 64
 def image_positions(
     camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt | None = None, raised_m: float = 0.0
 ) -> FloatArray:
-    """(..., 2) pixels where the camera saw places on the floor; NaN where not seen.
+    """(..., 2) pixels where the camera saw places (..., 2) on the floor (m); NaN where not seen.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated on the level robot.
-    floor_xy : (..., 2) array_like
-        Robot X and Y, metres.
-    levelled_by : (float, float), optional
-        Pitch and roll (rad) that turned the positions level.
-    raised_m : float
-        How much higher the camera is than calibrated, metres.
+    `levelled_by` are pitch and roll (rad) that turned the positions level, and the camera is
+    `raised_m` higher than calibrated.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
@@ -48,9 +42,8 @@ def level_seen(
 ) -> FloatArray:
     """Level positions (m) of discs that the calibrated camera sees on the floor.
 
-    Of positions (N, 2) or (M, N, 2) that were computed without knowledge of the tilt, levelled by
-    (2,) or (M, 2) pitch and roll (rad); the rest as in `image_positions`. NaN where the levelled
-    ray does not meet the floor.
+    Of positions (N, 2) or (M, N, 2) that were computed without the tilt, levelled by (2,) or (M, 2)
+    pitch and roll (rad). NaN where the levelled ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)
@@ -63,14 +56,10 @@ def level_seen(
 
 def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
-    pitch, roll = np.moveaxis(np.asarray(levelled_by, dtype=np.float64), -1, 0)
-    angle = np.hypot(pitch, roll)[..., None, None]
-    cross = np.zeros((*pitch.shape, 3, 3))
-    cross[..., 0, 2], cross[..., 2, 0] = roll, -roll
-    cross[..., 1, 2], cross[..., 2, 1] = -pitch, pitch
-    # sin(x) / x and (1 - cos(x)) / x^2.
-    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+    tilt = np.asarray(levelled_by, dtype=np.float64)
+    vectors = np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
+    turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(turns.reshape(*tilt.shape[:-1], 3, 3))
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:
@@ -78,6 +67,16 @@ def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS
     angle = 2.0 * np.pi * np.arange(points) / points
     ring = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.asarray(np.asarray(centre_xy, dtype=np.float64)[..., None, :] + ring)
+
+
+def summed_steps(steps: Iterable[Step]) -> FloatArray:
+    """(N + 1, 3) poses along N steps, the start first: x, y (m), heading (rad) in its frame."""
+    dx, dy, dphi = np.array([(0.0, 0.0, 0.0), *((s.dx, s.dy, s.dphi) for s in steps)]).T
+    heading = np.cumsum(dphi)
+    before = heading - dphi
+    x = np.cumsum(np.cos(before) * dx - np.sin(before) * dy)
+    y = np.cumsum(np.sin(before) * dx + np.cos(before) * dy)
+    return np.column_stack([x, y, heading])
 
 
 @dataclass(frozen=True)

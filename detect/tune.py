@@ -29,7 +29,7 @@ from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Know
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import PUBLISHED, CircleSettings, parameter_value
 from detect.sources.interface import RunFrame
-from detect.sources.opening import demand_recording, open_calibrated
+from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Tune
 from redetect.landmarks import (
@@ -55,7 +55,7 @@ def perform(options: Tune) -> int:
         raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
 
     demand_recording(options.run)
-    run = open_calibrated(options.run, options.camera, options.source)
+    run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
     outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}
     for path in outputs.values():

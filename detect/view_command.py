@@ -18,8 +18,8 @@ from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
 from detect.run import read_image
-from detect.seen import circle_on_floor, image_positions
-from detect.sources.opening import demand_recording, open_calibrated
+from detect.seen import circle_on_floor, image_positions, summed_steps
+from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
 from redetect.landmarks import Step, circle_arrays
@@ -39,7 +39,7 @@ def perform(options: View) -> int:
     """Carry the command out; returns the exit code."""
     rr = _rerun()
     demand_recording(options.run)
-    run = open_calibrated(options.run, options.camera, options.source)
+    run = open_run(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
     if options.output is not None and options.output.exists() and not options.force:
         raise OutputExistsError(options.output)
@@ -87,16 +87,6 @@ def perform(options: View) -> int:
             print(f"{options.output}: open it by: rerun {options.output}")
     print_failures(len(failures), failures)
     return EXIT_FRAMES_FAILED if failures else 0
-
-
-def summed_steps(steps: Iterable[Step]) -> FloatArray:
-    """(N + 1, 3) poses along N steps, the start first: x, y (m), heading (rad) in its frame."""
-    dx, dy, dphi = np.array([(0.0, 0.0, 0.0), *((s.dx, s.dy, s.dphi) for s in steps)]).T
-    heading = np.cumsum(dphi)
-    before = heading - dphi
-    x = np.cumsum(np.cos(before) * dx - np.sin(before) * dy)
-    y = np.cumsum(np.sin(before) * dx + np.cos(before) * dy)
-    return np.column_stack([x, y, heading])
 
 
 def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:

@@ -192,29 +192,17 @@ class Explain:
     """Why discs of an image are found, or not: each candidate, and the number that dropped it.
 
     Example: detect explain images/e/images/e.0000.jpg --at 377 85 -o /tmp/why.png
-
-    Parameters
-    ----------
-    image : Path
-        The image.
-    at : two floats
-        Pixel (u, v) of something that should have been found: only what is near it is explained.
-    camera : Path
-        Calibration; by default the one in the image's folder, or in the folder of that.
-    output : Path
-        PNG file for a picture of the candidates, numbered as in the table.
-    json : Path
-        Write the candidates as JSON.
-    force : bool
-        Replace existing files.
     """
 
-    image: Positional[Path]
+    image: Positional[Path]  #: The image.
+    #: Pixel (u, v) of something that should have been found: only what is near it is explained.
     at: MaybePixel = None
+    #: Calibration; by default the one in the image's folder, or in the folder of that.
     camera: MaybePath = None
+    #: PNG file for a picture of the candidates, numbered as in the table.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    json: MaybePath = None
-    force: bool = False
+    json: MaybePath = None  #: Write the candidates as JSON.
+    force: bool = False  #: Replace existing files.
     settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
@@ -225,21 +213,14 @@ class Demo:
     Example: detect demo -o /tmp/demo
 
     The run is rendered: a robot's camera drives along a corridor, and where everything is is known.
-
-    Parameters
-    ----------
-    run : Path
-        Another run to use, with map.circles as the truth; by default images that come with the
-        program.
-    output : Path
-        Folder for the rows and the page; by default redetect-demo in the working folder.
-    force : bool
-        Replace existing files.
     """
 
+    #: Another run to use, with map.circles as the truth; by default images that come with the
+    #: program.
     run: MaybePath = None
+    #: Folder for the rows and the page; by default redetect-demo in the working folder.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("redetect-demo")
-    force: bool = False
+    force: bool = False  #: Replace existing files.
 
 
 if TYPE_CHECKING:

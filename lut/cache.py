@@ -58,22 +58,29 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     Equal to that of `lut.build_disc_table`, whose parameters and errors these are; `folder` is the
     cache, by default `cache_folder`.
     """
-    path = (folder or cache_folder()) / f"discs-{_key(camera, shape)}.table"
-    table = _read(path, DiscTable, lambda table: disc_table_fits(table, camera, shape))
-    if table is None:
-        _log.info("computing the table of discs, once for this calibration")
-        table = build_disc_table(camera, shape)
-        _keep(path, table)
-    return table
+    return _cached(DiscTable, "discs", (camera, shape), build_disc_table, disc_table_fits, folder)
 
 
 def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
     """The table of verticals of a camera, equal to `lut.build_vertical_table`'s; as above."""
-    path = (folder or cache_folder()) / f"verticals-{_key(camera)}.table"
-    table = _read(path, VerticalTable, lambda table: vertical_table_fits(table, camera))
+    return _cached(
+        VerticalTable, "verticals", (camera,), build_vertical_table, vertical_table_fits, folder
+    )
+
+
+def _cached(
+    kind: type[Table],
+    name: str,
+    of: tuple[Any, ...],
+    build: Callable[..., Table],
+    fits: Callable[..., bool],
+    folder: Path | None,
+) -> Table:
+    path = (folder or cache_folder()) / f"{name}-{_key(*of)}.table"
+    table = _read(path, kind, lambda found: fits(found, *of))
     if table is None:
-        _log.info("computing the table of verticals, once for this calibration")
-        table = build_vertical_table(camera)
+        _log.info("computing the table of %s, once for this calibration", name)
+        table = build(*of)
         _keep(path, table)
     return table
 

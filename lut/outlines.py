@@ -44,23 +44,21 @@ class DiscShape:
     outer_radius_m: Positive = 0.14  #: Radius of the outer one.
     #: Equally spaced samples on each outline; the first lies in the robot's +X direction.
     samples: Annotated[int, whole(3, 128)] = 16
-    #: Near limit: centres keep this distance from the image's border, pixels.
-    border_px: Annotated[int, whole(0)] = 12
-    #: Far limit: the floor moves at most this far from one image row to the next, metres; infinite:
-    #: however far.
+    border_px: Annotated[int, whole(0)] = 12  #: Least distance from the image's border.
+    #: The floor moves at most this far from one image row to the next; infinite: however far.
     far_limit_m_per_px: Limit = 0.05
     #: Samples are counted in pairs, an inner and an outer one, at least this many of which must be
     #: inside the image; 0: samples are counted singly.
     least_pairs: Annotated[int, whole(0)] = 0
-    #: How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-    #: outwards: the length on the floor of this many pixels down the image.
+    #: Samples of a pair that fall on the same pixel are moved inwards and outwards by the length on
+    #: the floor of this many pixels down the image.
     apart_px: NotNegative = 0.0
     #: Centres along a row are left out as long as none is farther than half of this from one that
-    #: is tested, metres. If samples are counted in pairs, those are left out that are nearer than
-    #: this to a usable one, in pixels as long as one down the image, rounded up. 0: none is.
+    #: is tested. If samples are counted in pairs, those are left out that are nearer than this to a
+    #: usable one, in pixels as long as one down the image, rounded up. 0: none is.
     stride_m: NotNegative = 0.0
     #: Rows are left out as long as no centre in them is farther than this from a row that is
-    #: tested, metres on the floor across the row; 0: none is left out.
+    #: tested, on the floor across the row; 0: none is.
     rows_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:
@@ -79,14 +77,13 @@ class CentreGroups(NamedTuple):
     A group's centres are in one row, within `GROUP_COLUMNS` of each other.
     """
 
-    first: NDArray[np.int32]
-    """(G,) the first centre of each."""
+    first: NDArray[np.int32]  # (G,) the first centre of each
+    #: (G,) the columns of its centres, counted from the first: a bit each.
     columns: NDArray[np.int32]
-    """(G,) the columns of its centres, counted from the first: a bit each."""
+    #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
+    #: the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre
+    #: that sees fewer.
     samples: NDArray[np.uint32]
-    """(G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
-    the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre that
-    sees fewer."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,13 @@ from itertools import pairwise
 from math import inf, isfinite
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detect.comparison.floor import floor_bins, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
-    Comparison,
     DiscComparison,
     DistanceBin,
     FrameMatch,
@@ -62,28 +61,12 @@ _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
 LEAST_SIGMA_RAD = 1e-12
 
 
-class Beside(NamedTuple):
-    """What else than the reference rows is in view.
-
-    Detected rows on `unlisted` discs are neither right nor wrong, those on `lookalikes` are extra
-    and counted apart.
-    """
-
-    unlisted: tuple[Frame, ...] = ()
-    lookalikes: tuple[Frame, ...] | None = None
-
-
-def beside_reference(
-    reference: str | os.PathLike[str],
-    unlisted: Path | None = None,
-    lookalikes: Path | None = None,
-) -> Beside:
-    """Read ``unlisted.circles`` and ``lookalikes.circles`` beside a reference file, or others."""
-    usual = Path(reference).parent / "unlisted.circles"
-    known = tuple(read_frames(unlisted or usual)) if unlisted or usual.is_file() else ()
-    usual = Path(reference).parent / "lookalikes.circles"
-    alike = tuple(read_frames(lookalikes or usual)) if lookalikes or usual.is_file() else None
-    return Beside(known, alike)
+def rows_beside(
+    reference: str | os.PathLike[str], name: str, path: Path | None = None
+) -> list[Frame] | None:
+    """Rows of a file, by default that of a name beside a reference file; None without one."""
+    usual = Path(reference).parent / name
+    return list(read_frames(path or usual)) if path or usual.is_file() else None
 
 
 def compare_runs(
@@ -93,28 +76,11 @@ def compare_runs(
     detected: str | os.PathLike[str] | None = None,
     options: CompareOptions | None = None,
     sight: Sight | None = None,
-    beside: Beside | None = None,
 ) -> DiscComparison:
-    """Compare a run's detected discs with its reference rows.
+    """Compare the discs of two files, by default ``detected`` and ``map.circles`` in a run folder.
 
-    Parameters
-    ----------
-    run : path
-        The run's folder.
-    reference, detected : path, optional
-        By default ``map.circles`` and ``detected.circles`` in that folder.
-    options : CompareOptions, optional
-    sight : Sight, optional
-        How rows come back into the images; without it, they are compared on the floor.
-    beside : Beside, optional
-        What else is in view; by default as the reference's folder has it.
-
-    Raises
-    ------
-    redetect.landmarks.LandmarkFileError
-        If a file cannot be read.
-    CompareError
-        If an image has two frames in a file, or a covariance is needed and not positive definite.
+    The rest as in `compare_frames`; unlisted discs and look-alikes are taken from the reference's
+    folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
     reference = Path(run) / "map.circles" if reference is None else reference
     detected = Path(run) / "detected.circles" if detected is None else detected
@@ -123,7 +89,8 @@ def compare_runs(
         read_frames(detected),
         options,
         sight=sight,
-        beside=beside_reference(reference) if beside is None else beside,
+        unlisted=rows_beside(reference, "unlisted.circles"),
+        lookalikes=rows_beside(reference, "lookalikes.circles"),
         names=(os.fspath(reference), os.fspath(detected)),
     )
 
@@ -134,18 +101,37 @@ def compare_frames(
     options: CompareOptions | None = None,
     *,
     sight: Sight | None = None,
-    beside: Beside | None = None,
+    unlisted: Iterable[Frame] | None = None,
+    lookalikes: Iterable[Frame] | None = None,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> DiscComparison:
-    """Compare the discs of two sets of frames, called `names` in messages, as `compare_runs`."""
-    options, beside = options or CompareOptions(), beside or Beside()
+    """Compare the discs of two sets of frames.
+
+    Parameters
+    ----------
+    reference, detected : iterable of Frame
+    options : CompareOptions, optional
+    sight : Sight, optional
+        How rows come back into the images; without it, they are compared on the floor.
+    unlisted : iterable of Frame, optional
+        Discs that may be detected but need not be: rows on them are neither right nor wrong.
+    lookalikes : iterable of Frame, optional
+        Rows on what looks like a disc are extra, and counted apart.
+    names : (str, str)
+        What messages call the two sets.
+
+    Raises
+    ------
+    CompareError
+        If an image has two frames, or a covariance is needed and not positive definite.
+    """
+    options = options or CompareOptions()
     in_image = sight is not None and not options.on_floor
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    unlisted = {image_name(frame.step.prefix): frame for frame in beside.unlisted}
     common = match_runs("circles", wanted, found, options, names, sight, unlisted)
-    matches = common.frames
+    matches: Sequence[FrameMatch] = common["frames"]
     first, second, missed, extra = sides = (
         circle_arrays([row for m in matches for row in m.paired[0]]),
         circle_arrays([row for m in matches for row in m.paired[1]]),
@@ -171,8 +157,8 @@ def compare_frames(
     true = sight is not None and sight.reference_level
     ranges = list(pairwise(_EDGES_M))
     return DiscComparison(
-        **vars(common),
-        on_lookalikes=_on_lookalikes(matches, beside, options),
+        **common,
+        on_lookalikes=_on_lookalikes(matches, lookalikes, options),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
         normalised_error=normalised_error(pairs.offset, covariance),
@@ -192,29 +178,19 @@ def compare_frames(
     )
 
 
-def unlisted_lines(reference: str | os.PathLike[str], unlisted: Path | None = None) -> list[Frame]:
-    """Read ``unlisted.lines`` beside a reference file, or another file."""
-    usual = Path(reference).parent / "unlisted.lines"
-    return list(read_frames(unlisted or usual)) if unlisted or usual.is_file() else []
-
-
 def compare_line_frames(
     reference: Iterable[Frame],
     detected: Iterable[Frame],
     options: CompareOptions | None = None,
     *,
-    unlisted: Iterable[Frame] = (),
+    unlisted: Iterable[Frame] | None = None,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> LineComparison:
-    """Compare the lines of two sets of frames, called `names` in messages.
-
-    Detected rows on `unlisted` lines are neither right nor wrong. Errors as of `compare_runs`.
-    """
+    """Compare the lines of two sets of frames, as `compare_frames`."""
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    known = {image_name(frame.step.prefix): frame for frame in unlisted}
-    common = match_runs("lines", *sides, options, names, unlisted=known)
-    first, second = ([row for m in common.frames for row in m.paired[side]] for side in (0, 1))
+    common = match_runs("lines", *sides, options, names, unlisted=unlisted)
+    first, second = ([row for m in common["frames"] for row in m.paired[side]] for side in (0, 1))
 
     def difference(name: str) -> FloatArray:
         return numbers(second, name) - numbers(first, name)
@@ -228,7 +204,7 @@ def compare_line_frames(
         for x, y in (("xtop", "ytop"), ("xbottom", "ybottom"))
     ]
     return LineComparison(
-        **vars(common),
+        **common,
         bearing_median_deg=quantile(error_deg),
         bearing_95_deg=quantile(error_deg, 0.95),
         normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
@@ -265,12 +241,12 @@ def _distance_bin(
 
 
 def _on_lookalikes(
-    matches: Sequence[FrameMatch], beside: Beside, options: CompareOptions
+    matches: Sequence[FrameMatch], lookalikes: Iterable[Frame] | None, options: CompareOptions
 ) -> int | None:
     """How many extra rows are on look-alikes; None where these are not known."""
-    if beside.lookalikes is None:
+    if lookalikes is None:
         return None
-    known = {image_name(frame.step.prefix): frame.circles for frame in beside.lookalikes}
+    known = {image_name(frame.step.prefix): frame.circles for frame in lookalikes}
     return sum(
         len(pair_discs(known[m.frame.name], m.extra, options, m.frame.view).first)
         for m in matches
@@ -312,20 +288,21 @@ def match_runs(
     options: CompareOptions,
     names: tuple[str, str],
     sight: Sight | None = None,
-    unlisted: Mapping[str, Frame] | None = None,
-) -> Comparison:
-    """Match the rows of two runs, image by image.
+    unlisted: Iterable[Frame] | None = None,
+) -> dict[str, Any]:
+    """Match the rows of two runs, image by image: the fields of a `Comparison`.
 
     Images are in the order of the reference, then those of `detected` alone, if they count.
     """
     images = [name for name in reference if options.all_frames or name in detected]
     if options.all_frames:
         images += [name for name in detected if name not in reference]
+    known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
     for name in images:
         frames = reference.get(name), detected.get(name)
         view = None if sight is None else sight.of(*frames)
-        pair = pair_of(kind, name, *frames, (unlisted or {}).get(name), view)
+        pair = pair_of(kind, name, *frames, known.get(name), view)
         matches.append(match_frame(pair, options))
     counts: dict[str, Any] = {
         name: sum(len(getattr(match, name)) for match in matches)
@@ -333,19 +310,20 @@ def match_runs(
     }
     found, detected_rows = counts["matched"] + counts["joined"], counts["matched"] + counts["extra"]
     wanted = found + counts["missed"]
-    return Comparison(
-        *names,
-        options,
-        reference=wanted,
-        detected=detected_rows,
-        found=found,
+    return {
+        "reference_name": names[0],
+        "detected_name": names[1],
+        "options": options,
+        "reference": wanted,
+        "detected": detected_rows,
+        "found": found,
         **counts,
-        recall=found / wanted if wanted else None,
-        precision=counts["matched"] / detected_rows if detected_rows else None,
-        frames=tuple(matches),
-        frames_only_in_reference=tuple(name for name in reference if name not in detected),
-        frames_only_in_detected=tuple(name for name in detected if name not in reference),
-    )
+        "recall": found / wanted if wanted else None,
+        "precision": counts["matched"] / detected_rows if detected_rows else None,
+        "frames": tuple(matches),
+        "frames_only_in_reference": tuple(name for name in reference if name not in detected),
+        "frames_only_in_detected": tuple(name for name in detected if name not in reference),
+    }
 
 
 def pair_of(

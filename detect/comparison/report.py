@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from dataclasses import asdict, astuple, fields
+from dataclasses import astuple
 from typing import NamedTuple
 
 from rich import box
@@ -13,13 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, read_camera
-from detect.comparison.compare import (
-    beside_reference,
-    compare_line_frames,
-    compare_runs,
-    unlisted_lines,
-)
+from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
 from detect.comparison.result import (
+    WORST_FRAMES,
     CommonLean,
     Comparison,
     DiscComparison,
@@ -28,6 +23,7 @@ from detect.comparison.result import (
     Levelling,
     LineComparison,
     NormalisedError,
+    number,
     unmet_demands,
 )
 from detect.drawing.inputs import read_head
@@ -48,7 +44,7 @@ def perform(command: Compare) -> int:
     Console().print(comparison_tables(result))
     if command.json is not None:
         with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(format_json(result).encode())
+            stream.write(result.to_json().encode())
     unmet = unmet_demands(
         result, min_recall=command.min_recall, min_precision=command.min_precision
     )
@@ -75,7 +71,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
             read_frames(reference),
             read_frames(detected),
             command.matching,
-            unlisted=unlisted_lines(reference, command.unlisted),
+            unlisted=rows_beside(reference, "unlisted.lines", command.unlisted),
             names=(str(reference), str(detected)),
         )
     if camera is None:
@@ -84,17 +80,15 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     if camera is not None:
         radius_m = read_head(detected).circle_settings.radius_m
         sight = Sight(camera, radius_m, read_head(reference).level)
-    return compare_runs(
-        command.run,
-        reference=reference,
-        detected=detected,
-        options=command.matching,
+    return compare_frames(
+        read_frames(reference),
+        read_frames(detected),
+        command.matching,
         sight=sight,
-        beside=beside_reference(reference, command.unlisted, command.lookalikes),
+        unlisted=rows_beside(reference, "unlisted.circles", command.unlisted),
+        lookalikes=rows_beside(reference, "lookalikes.circles", command.lookalikes),
+        names=(str(reference), str(detected)),
     )
-
-
-_WORST_FRAMES = 10
 
 
 class FigureTable(NamedTuple):
@@ -122,91 +116,14 @@ def comparison_tables(comparison: Comparison) -> Group:
             tables.append(_rich_table(_over_distance(comparison)))
             if comparison.lean is not None:
                 tables.append(_rich_table(floor_table(comparison)))
-        tables.append(_rich_table(worst_frames_table(comparison, _WORST_FRAMES)))
+        tables.append(_rich_table(worst_frames_table(comparison, WORST_FRAMES)))
     return Group(*tables)
-
-
-def format_json(comparison: Comparison) -> str:
-    """Write a comparison as JSON: same keys in the same order, numbers finite or null.
-
-    Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those that
-    only one file has.
-    """
-    figures = {f.name: getattr(comparison, f.name) for f in fields(comparison)}
-    figures |= {
-        "frames": len(comparison.frames),
-        "pairs": comparison.matched,
-        "worst_frames": [
-            {
-                "name": match.frame.name,
-                **{count: len(getattr(match, count)) for count in _counts(comparison)},
-                f"largest_error_{_unit(comparison)}": match.largest_error,
-            }
-            for match in comparison.worst_frames(_WORST_FRAMES)
-        ],
-    }
-    return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
-
-
-def sentences(c: Comparison) -> tuple[str, ...]:
-    """A comparison in four sentences: found and missed, what else is there, errors, covariances."""
-    what = "discs" if isinstance(c, DiscComparison) else "verticals"
-    found = (
-        f"{c.found} of {c.reference} {what} of the reference are found, {c.missed} missed, in "
-        f"{len(c.frames)} frames."
-    )
-    on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
-    extra = f"{c.matched} of {c.detected} detected rows are {what} of the reference; "
-    if on_lookalikes is None:
-        extra += f"{c.extra} are on nothing that it has (look-alikes are not known)."
-    else:
-        extra += (
-            f"{on_lookalikes} are on things known to look like a disc, and "
-            f"{c.extra - on_lookalikes or 'none'} on nothing known."
-        )
-    if isinstance(c, DiscComparison):
-        error = (
-            f"Positions on the floor err by {number(_thousand(c.error_median_m), 1)} mm (median), "
-            f"95 % of them by less than {number(_thousand(c.error_95_m), 1)} mm."
-        )
-    else:
-        assert isinstance(c, LineComparison)
-        error = (
-            f"Bearings err by {number(c.bearing_median_deg, 3)} degrees (median), 95 % of them by "
-            f"less than {number(c.bearing_95_deg, 3)}."
-        )
-    return found, extra, error, _agreement(c.normalised_error)
-
-
-def _thousand(value: float | None) -> float | None:
-    return None if value is None else 1000.0 * value
-
-
-def _agreement(error: NormalisedError) -> str:
-    """Whether errors are as large as covariances say."""
-    if error.per_dof is None or error.band is None:
-        return "There are no errors to hold against the stated covariances."
-    figure = f"the squared error is {error.per_dof:.2f} of what they state"
-    if error.per_dof > 1.5:
-        return f"The stated covariances are too small: {figure}."
-    if error.per_dof < 0.67:
-        return f"The stated covariances are too large: {figure}."
-    return f"The errors agree with the stated covariances: {figure}."
-
-
-def _unit(c: Comparison) -> str:
-    return "m" if isinstance(c, DiscComparison) else "deg"
-
-
-def _counts(c: Comparison) -> tuple[str, ...]:
-    joined = ("joined",) if isinstance(c, LineComparison) else ()
-    return ("matched", *joined, "missed", "extra")
 
 
 def summary_rows(c: Comparison) -> dict[str, str]:
     """Names and words: what was found first, then how it was compared and how large errors are."""
     only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
-    on_lookalikes = c.on_lookalikes if isinstance(c, DiscComparison) else None
+    on_lookalikes = c.lookalikes_found
     joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
     rows = {
         "found": f"{c.found} of {c.reference} reference rows{joined}",
@@ -249,7 +166,9 @@ def summary_rows(c: Comparison) -> dict[str, str]:
 def _disc_rows(c: DiscComparison) -> dict[str, str]:
     rows = {}
     if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        rows["levelled"] = _levelling_text(c)
+        sides = ("reference", c.reference_levelling), ("detected", c.detected_levelling)
+        how = "at the pixels where they were seen" if c.in_image else "on the floor"
+        rows["levelled"] = f"{'; '.join(_levelled_side(*s) for s in sides)}: compared {how}"
     if c.in_image:
         same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
@@ -273,14 +192,6 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         text = f"median {number(matched, 3)} matched, {number(alone, 3)} {fate}"
         rows[f"{side} quality"] = text
     return rows
-
-
-def _levelling_text(c: DiscComparison) -> str:
-    """One sentence on which side's rows are levelled."""
-    reference = _levelled_side("reference", c.reference_levelling)
-    detected = _levelled_side("detected", c.detected_levelling)
-    held = "compared at the pixels where they were seen" if c.in_image else "compared on the floor"
-    return f"{reference}; {detected}: {held}"
 
 
 def _levelled_side(name: str, side: Levelling) -> str:
@@ -362,12 +273,12 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     rows = tuple(
         (
             match.frame.name,
-            *(str(len(getattr(match, count))) for count in _counts(c)),
+            *(str(len(getattr(match, count))) for count in c.counts),
             number(match.largest_error, 3),
         )
         for match in c.worst_frames(most)
     )
-    head = ("image", *_counts(c), f"largest error {_unit(c)}")
+    head = ("image", *c.counts, f"largest error {c.unit}")
     return FigureTable("Worst frames", head, rows)
 
 
@@ -385,13 +296,6 @@ def _rich_table(figures: FigureTable) -> Table:
     for row in figures.rows:
         table.add_row(*(Text(printable(word)) for word in row))
     return table
-
-
-def number(value: float | None, decimals: int) -> str:
-    """A figure, or a dash where there is none."""
-    if value is None:
-        return "-"
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
 
 
 def printable(name: str) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from dataclasses import asdict, dataclass, field, fields
+from html import escape
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
+
+#: How many of the worst frames are listed.
+WORST_FRAMES = 10
 
 
 class FramePair(NamedTuple):
@@ -150,13 +156,17 @@ class LinePairs:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(ABC):
     """How a run's detected rows compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Rows are counted as in
     `FrameMatch`; `found` ones were matched or joined. Recall and precision are the shares of the
     reference rows that were found, and of the detected rows that were matched.
     """
+
+    what: ClassVar[str]  # that is compared
+    unit: ClassVar[str]  # of `FrameMatch.errors`
+    counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
 
     reference_name: str
     detected_name: str
@@ -176,20 +186,53 @@ class Comparison:
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
     def sentences(self) -> tuple[str, ...]:
-        """What came out, in words: see `detect.comparison.report.sentences`."""
-        from detect.comparison.report import sentences
+        """Four of them: found and missed, what else is there, errors, covariances."""
+        found = (
+            f"{self.found} of {self.reference} {self.what} of the reference are found, "
+            f"{self.missed} missed, in {len(self.frames)} frames."
+        )
+        extra = f"{self.matched} of {self.detected} detected rows are {self.what} of the reference;"
+        alike = self.lookalikes_found
+        if alike is None:
+            extra += f" {self.extra} are on nothing that it has (look-alikes are not known)."
+        else:
+            extra += (
+                f" {alike} are on things known to look like a disc, and "
+                f"{self.extra - alike or 'none'} on nothing known."
+            )
+        return found, extra, *self._error_sentences()
 
-        return sentences(self)
+    @property
+    def lookalikes_found(self) -> int | None:
+        """Extra rows on what is known to look like a landmark; None if nothing is known to."""
+        return None
+
+    @abstractmethod
+    def _error_sentences(self) -> tuple[str, str]:
+        """How large errors are, and whether covariances say so."""
 
     def to_json(self) -> str:
-        """All figures: see `detect.comparison.report.format_json`."""
-        from detect.comparison.report import format_json
+        """All figures as JSON: same keys in the same order, numbers finite or null.
 
-        return format_json(self)
+        Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those
+        that only one file has.
+        """
+        figures = {f.name: getattr(self, f.name) for f in fields(self)}
+        figures |= {
+            "frames": len(self.frames),
+            "pairs": self.matched,
+            "worst_frames": [
+                {
+                    "name": match.frame.name,
+                    **{count: len(getattr(match, count)) for count in self.counts},
+                    f"largest_error_{self.unit}": match.largest_error,
+                }
+                for match in self.worst_frames(WORST_FRAMES)
+            ],
+        }
+        return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
 
     def _repr_html_(self) -> str:
-        from html import escape
-
         return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
 
     def worst_frames(self, count: int) -> list[FrameMatch]:
@@ -205,6 +248,8 @@ class Comparison:
 @dataclass(frozen=True)
 class DiscComparison(Comparison):
     """How a run's detected discs compare with reference rows; qualities are medians."""
+
+    what, unit = "discs", "m"
 
     on_lookalikes: int | None  # extra rows on what resembles a disc
     error_median_m: float | None
@@ -224,10 +269,29 @@ class DiscComparison(Comparison):
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
 
+    @property
+    def lookalikes_found(self) -> int | None:
+        """As `on_lookalikes`."""
+        return self.on_lookalikes
+
+    def _error_sentences(self) -> tuple[str, str]:
+        median, most = (
+            None if value is None else 1000.0 * value
+            for value in (self.error_median_m, self.error_95_m)
+        )
+        errors = (
+            f"Positions on the floor err by {number(median, 1)} mm (median), "
+            f"95 % of them by less than {number(most, 1)} mm."
+        )
+        return errors, _agreement(self.normalised_error)
+
 
 @dataclass(frozen=True)
 class LineComparison(Comparison):
     """How a run's detected lines compare with reference rows: differences without sign."""
+
+    what, unit = "verticals", "deg"
+    counts = ("matched", "joined", "missed", "extra")
 
     bearing_median_deg: float | None
     bearing_95_deg: float | None
@@ -235,6 +299,31 @@ class LineComparison(Comparison):
     ends_median: float | None  # normalised image coordinates, top and bottom alike
     beta_median_deg: float | None
     pairs: LinePairs = field(repr=False)
+
+    def _error_sentences(self) -> tuple[str, str]:
+        errors = (
+            f"Bearings err by {number(self.bearing_median_deg, 3)} degrees (median), 95 % of them "
+            f"by less than {number(self.bearing_95_deg, 3)}."
+        )
+        return errors, _agreement(self.normalised_error)
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A figure, or a dash where there is none."""
+    if value is None:
+        return "-"
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
+
+
+def _agreement(error: NormalisedError) -> str:
+    """Whether errors are as large as covariances say."""
+    if error.per_dof is None:
+        return "There are no errors to hold against the stated covariances."
+    figure = f"the squared error is {error.per_dof:.2f} of what they state"
+    if 0.67 <= error.per_dof <= 1.5:
+        return f"The errors agree with the stated covariances: {figure}."
+    size = "small" if error.per_dof > 1.5 else "large"
+    return f"The stated covariances are too {size}: {figure}."
 
 
 def unmet_demands(

@@ -82,12 +82,9 @@ WORK = np.dtype(
 class Hope(NamedTuple):
     """When a fit is given up: as soon as a step promises less than this."""
 
-    least_share: float
-    """Share of the variance that the disc explains."""
-    least_evidence: float
-    """Evidence, as far as it is known by then: for an even outline."""
-    optics_px: float
-    """Blur of the camera's optics, for the evidence."""
+    least_share: float  # share of the variance that the disc explains
+    least_evidence: float  # evidence, as far as it is known by then: for an even outline
+    optics_px: float  # blur of the camera's optics, for the evidence
 
 
 #: Never give up.
@@ -100,8 +97,7 @@ class Descent(NamedTuple):
     arrived: bool
     best: Disc
     contrast: float
-    variance: float
-    """Of the residuals, grey levels squared."""
+    variance: float  # of the residuals, grey levels squared
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

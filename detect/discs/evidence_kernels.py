@@ -75,25 +75,13 @@ def evidence_with_rim(
 ) -> float:
     """Log-odds that a candidate is a disc, from its fit and its rim together.
 
-    The fit of a disc that something hides or touches explains little; then the rim decides. The
-    weights are a logistic regression on some 5,000 candidates that the fit alone leaves in doubt,
-    of real images, renders and photographs; those of the quality and of corners were then chosen on
-    the first 1,000 frames of run e and on a rendered hall with square tiles. They are constants:
-    that fitting is not part of the project.
-
-    Parameters
-    ----------
-    fitted : float
-        Log-odds by the fit alone (`evidence_of`), possibly minus infinity.
-    explained, contrast : float
-        Share of the variance that the fitted disc explains, and its contrast, grey levels: what is
-        faint is more often a reflection.
-    quality : float
-        Otsu's quality of the candidate.
-    rim : Rim
-        See `detect.discs.rim.follow_rim`.
-    radius : float
-        Nominal radius, metres.
+    `fitted` are the log-odds by the fit alone, of which `explained` and `contrast` (grey levels)
+    are results, `quality` is Otsu's, `radius` the nominal one (m). The fit of a disc that something
+    hides or touches explains little; then the rim decides. The weights are a logistic regression on
+    some 5,000 candidates that the fit alone leaves in doubt, of real images, renders and
+    photographs; those of the quality and of corners were then chosen on the first 1,000 frames of
+    run e and on a rendered hall with square tiles. They are constants: that fitting is not part of
+    the project.
     """
     relative = rim.radius / radius
     if fitted == -math.inf and not (

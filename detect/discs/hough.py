@@ -50,57 +50,30 @@ _SOBEL_GAIN = 8.0
 
 
 class Grid(NamedTuple):
-    """Which pixels vote, and the cells in which their votes are counted.
+    """Which pixels vote, and the cells in which their votes are counted; lengths in metres."""
 
-    Attributes
-    ----------
-    paired : bool
-        Columns of the image are added in pairs.
-    image_row : (R,) int64
-        Rows of the image that vote.
-    pixel : (R, W, 6) float32
-        Of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r) by rows;
-        all 0 where no floor is seen.
-    row_of_step : (S,) int64
-        Row of cells at each step ahead.
-    ahead : (M,) float64
-        Middle of each row of cells, metres.
-    first, last : (M,) int64
-        Columns of cells between which each row is in view.
-    columns : int
-    cell, step, left : float
-        Width of cells, of steps ahead, and where column 0 begins, metres.
-    foot, turn : (2,), (2, 2) float64
-        Foot of the camera, metres, and the directions across and ahead.
-    """
-
-    paired: bool
-    image_row: NDArray[np.int64]
+    paired: bool  # columns of the image are added in pairs
+    image_row: NDArray[np.int64]  # (R,) rows of the image that vote
+    #: (R, W, 6) of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r)
+    #: by rows; all 0 where no floor is seen
     pixel: NDArray[np.float32]
-    row_of_step: NDArray[np.int64]
-    ahead: FloatArray
-    first: NDArray[np.int64]
+    row_of_step: NDArray[np.int64]  # (S,) row of cells at each step ahead
+    ahead: FloatArray  # (M,) middle of each row of cells
+    first: NDArray[np.int64]  # (M,) columns of cells between which each row is in view
     last: NDArray[np.int64]
     columns: int
-    cell: float
-    step: float
-    left: float
-    foot: FloatArray
-    turn: FloatArray
+    cell: float  # width of cells,
+    step: float  # of steps ahead,
+    left: float  # and where column 0 begins
+    foot: FloatArray  # (2,) of the camera
+    turn: FloatArray  # (2, 2) the directions across and ahead
 
 
 class HoughCandidates(NamedTuple):
-    """Places that may be centres of discs, the best first.
+    """Places that may be centres of discs, the best first."""
 
-    Attributes
-    ----------
-    floor_xy : (N, 2) float64
-        Metres.
-    score : (N,) float64
-    """
-
-    floor_xy: FloatArray
-    score: FloatArray
+    floor_xy: FloatArray  # (N, 2) metres
+    score: FloatArray  # (N,)
 
 
 def hough_candidates(
@@ -111,20 +84,10 @@ def hough_candidates(
     sign: float,
     least_step: float,
 ) -> HoughCandidates:
-    """Centres of discs of one radius by the votes of the edges.
+    """Centres of discs of one radius (m) by the votes of the edges, the best first.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    camera : Camera
-    table : DiscTable
-        The camera's: where its pixels see the floor.
-    radius : float
-        Metres.
-    sign : float
-        1 for light discs, -1 for dark ones.
-    least_step : float
-        Least gradient of an edge, grey levels per pixel.
+    The sign is 1 for light discs, -1 for dark ones; edges have gradients of at least `least_step`
+    grey levels per pixel.
     """
     grid = grid_of(camera, table, radius)
     if grid is None:
@@ -140,17 +103,7 @@ def hough_candidates(
 def count_votes(
     image: NDArray[np.uint8], grid: Grid, radius: float, least_step: float
 ) -> NDArray[np.float32]:
-    """Votes for each cell, (M, columns) float32: shares of a rim.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-    grid : Grid
-    radius : float
-        Metres, negative for dark discs.
-    least_step : float
-        Least gradient of an edge, grey levels per pixel.
-    """
+    """(M, columns) votes for each cell, shares of a rim; the radius is negative for dark discs."""
     votes = np.zeros((len(grid.ahead), grid.columns), np.float32)
     width = grid.pixel.shape[1]
     across, ahead = np.float32(radius / grid.cell), np.float32(radius / grid.step)
@@ -235,15 +188,7 @@ def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArr
 
 @lru_cache(maxsize=4)
 def grid_of(camera: Camera, table: DiscTable, radius: float) -> Grid | None:
-    """From the nearest to the farthest centre of the table; None where it has none.
-
-    Parameters
-    ----------
-    camera : Camera
-    table : DiscTable
-    radius : float
-        Metres.
-    """
+    """The grid from the nearest to the farthest centre of the table; None where it has none."""
     foot = np.array(camera.centre[:2])
     offset = table.floor_xy.astype(np.float64) - foot
     usable = table.usable & np.isfinite(offset).all(axis=-1)

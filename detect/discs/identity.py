@@ -22,16 +22,7 @@ _GATE = 2.0 * math.log(1000.0)
 
 
 class MappedDisc(NamedTuple):
-    """A disc of a map, where a frame should see it.
-
-    Attributes
-    ----------
-    id : int
-    x, y : float
-        In the frame's robot frame, metres.
-    cxx, cxy, cyy : float
-        Covariance, square metres.
-    """
+    """A disc of a map in the robot frame of a frame (m), with its covariance (m^2)."""
 
     id: int
     x: float
@@ -42,20 +33,10 @@ class MappedDisc(NamedTuple):
 
 
 def ids_of_rows(seen_xy: FloatArray, rows: Sequence[CircleLandmark]) -> list[tuple[int, ...]]:
-    """The IDs of the rows of the same discs in the same frame.
+    """The IDs of the rows of the same discs in the same frame; () for discs without a row.
 
-    Parameters
-    ----------
-    seen_xy : (N, 2) float64
-        Detected discs, metres: without a correction for the tilt if the rows are without one. Then
-        both are the same pixels, whatever the tilt.
-    rows : sequence of CircleLandmark
-        Rows with IDs, and with covariances by which their distance is judged.
-
-    Returns
-    -------
-    list of N tuples of int
-        Of each disc, the IDs of the row that is its; () where none is.
+    Discs (N, 2) are compared without a correction for the tilt if the rows are without one: then
+    both are the same pixels, whatever the tilt.
     """
     known = circle_arrays(rows)
     found = matched(seen_xy, np.zeros((len(seen_xy), 2, 2)), known.xy, known.covariance)
@@ -65,21 +46,9 @@ def ids_of_rows(seen_xy: FloatArray, rows: Sequence[CircleLandmark]) -> list[tup
 def ids_of_map(
     floor_xy: FloatArray, covariance: FloatArray, discs: Sequence[MappedDisc], slack_m: float
 ) -> NDArray[np.int64]:
-    """The IDs of the mapped discs that detected ones fall on.
+    """(N,) IDs of the mapped discs that detected ones fall on; -1 where there is none.
 
-    Parameters
-    ----------
-    floor_xy, covariance : (N, 2), (N, 2, 2) float64
-        Detected discs, metres and square metres.
-    discs : sequence of MappedDisc
-        Where the map and the frame's pose let discs be expected.
-    slack_m : float
-        Standard deviation of what neither covariance knows of, in every direction, metres.
-
-    Returns
-    -------
-    (N,) int64
-        -1 where no disc is.
+    `slack_m` is the standard deviation of what neither covariance includes, in every direction.
     """
     if not discs:
         return np.full(len(floor_xy), -1)
@@ -93,17 +62,9 @@ def ids_of_map(
 def matched(
     xy: FloatArray, covariance: FloatArray, known_xy: FloatArray, known_covariance: FloatArray
 ) -> NDArray[np.int64]:
-    """Which known place each of some places is: one at most, and the nearest pairs first.
+    """(N,) which of M known places each of N places is; -1 where none is within the gate.
 
-    Parameters
-    ----------
-    xy, covariance : (N, 2), (N, 2, 2) float64
-    known_xy, known_covariance : (M, 2), (M, 2, 2) float64
-
-    Returns
-    -------
-    (N,) int64
-        Indices; -1 where none is within the gate, 99.9 % of chi-squared.
+    Of places (N, 2), (M, 2) with covariances, each is used once at most, the nearest pairs first.
     """
     found = np.full(len(xy), -1)
     if not len(xy) or not len(known_xy):

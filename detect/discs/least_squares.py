@@ -134,22 +134,10 @@ def solution(factor: FloatArray, begin: int, end: int, values: FloatArray) -> No
 def residuals(
     patch: Any, n: int, values: NDArray[np.float64], bare: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Residuals of a fit, into the patch.
+    """Residuals of a fit of n pixels with (10,) `values`, into the patch.
 
-    Parameters
-    ----------
-    patch, n
-        The patch, and its pixels.
-    values : (10,) float64
-        The unknowns.
-    bare : (5,) float64
-        The terms of the background where there is no disc.
-
-    Returns
-    -------
-    residual, near_residual, near_total : float
-        Sums of squares: of the residuals, of those near the disc, and of what a background alone
-        leaves there.
+    `bare` (5,) is the background where there is no disc. Returns sums of squares: of the residuals,
+    of those near the disc, and of what a background alone leaves there.
     """
     design, residual, without = patch.design, patch.residual, patch.row
     for i in range(n):
@@ -216,13 +204,12 @@ def blur_width(patch: Any, n: int, disc: Disc, blur: Blur) -> float:
 class Outline(NamedTuple):
     """How evenly the edge of a fitted disc goes round."""
 
-    good: float
-    """Share of sectors whose step has the sign, and 0.4 of the size, of the disc's."""
+    good: float  # share of sectors whose step has the sign, and 0.4 of the size, of the disc's
+    #: Root mean square over the sectors of how far the edge is from the circle, in radii.
     deviation: float
-    """Root mean square over the sectors of how far the edge is from the circle, in radii."""
+    #: Step of the middle (the inner 0.3 of the radius) from the background, relative to the
+    #: contrast: 1 where it has not two pixels.
     middle: float
-    """Step of the middle (the inner 0.3 of the radius) from the background, relative to the
-    contrast: 1 where it has not two pixels."""
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)

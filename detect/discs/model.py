@@ -59,8 +59,7 @@ class Disc(NamedTuple):
     x: float
     y: float
     radius: float
-    log_blur: float
-    """Of the optics' standard deviation along u, pixels."""
+    log_blur: float  # of the optics' standard deviation along u, pixels
 
 
 class Blur(NamedTuple):
@@ -208,18 +207,12 @@ _SMALLEST = F32(1e-6)
 class _Pixel(NamedTuple):
     """A pixel among the chords."""
 
-    along: float
-    """Its place, in steps of the first axis from the disc's centre along the chords,"""
-    across: float
-    """and in radii across them."""
-    slant: float
-    """How far it moves along them while it moves across by one radius."""
-    reach: float
-    """Of the kernel across, radii."""
-    per_length: float
-    """Steps of the first axis for one radius,"""
-    growth: float
-    """and by what share each is longer than the one before."""
+    along: float  # its place, in steps of the first axis from the disc's centre along the chords,
+    across: float  # and in radii across them
+    slant: float  # how far it moves along them while it moves across by one radius
+    reach: float  # of the kernel across, radii
+    per_length: float  # steps of the first axis for one radius,
+    growth: float  # and by what share each is longer than the one before
 
 
 @njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)

@@ -106,28 +106,12 @@ def fit_outline(
     y: float,
     radius: float,
 ) -> tuple[bool, NDArray[np.float64], NDArray[np.float64]]:
-    """The tilt of one disc by points of its outline.
+    """The tilt of one disc of about the middle (x, y) by (N, 2) points of its outline.
 
-    Parameters
-    ----------
-    point_xy : (N, 2) float64
-        Points of the outline on the calibrated floor, relative to (x, y), metres; NaN where it
-        is not seen.
-    px_per_m : (N,) float64
-        Scale of the image along each point's direction.
-    centre : (3,) float64
-        Of the camera, robot frame, metres.
-    x, y, radius : float
-        About the middle of the disc, and its radius, metres.
-
-    Returns
-    -------
-    found : bool
-        Whether enough of the outline is on the ellipse.
-    tilt : (2,) float64
-        Pitch and roll (rad).
-    covariance : (2, 2) float64
-        From the points alone (rad^2).
+    Points are on the calibrated floor, relative to (x, y), metres; NaN where the outline is not
+    seen. Each has the scale of the image along its direction; `centre` is the camera's. Returns
+    whether enough of the outline is on the ellipse, pitch and roll (rad), and their covariance by
+    the points alone.
     """
     count = len(point_xy)
     unknowns = np.zeros(4)  # of the centre, metres; pitch, roll
@@ -191,17 +175,7 @@ def fit_outline(
 
 
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of discs' tilts by Student's density, and its covariance.
-
-    Parameters
-    ----------
-    tilt, covariance : (N, 2), (N, 2, 2) float64
-        Pitch and roll (rad), and their covariance (rad^2).
-
-    Returns
-    -------
-    mean, covariance : (2,), (2, 2) float64
-    """
+    """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
     mean = np.median(tilt, axis=0)
     information = np.linalg.inv(covariance)
     for _ in range(_ITERATIONS):
@@ -260,25 +234,10 @@ def tilt_of_outlines(
     radius_m: float,
     raised_m: float = 0.0,
 ) -> OutlineTilt | None:
-    """The tilt that the outlines of the discs in an image show.
+    """The tilt that the outlines of the discs in an image show; None if no rim is in view.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The image.
-    camera : Camera
-        The camera as calibrated.
-    floor_xy : (N, 2) float64
-        Where discs were seen, nothing levelled, metres.
-    radius_m : float
-        Their radius.
-    raised_m : float
-        How much higher the camera is than calibrated.
-
-    Returns
-    -------
-    OutlineTilt or None
-        None where no disc's rim is in view.
+    Discs were seen at `floor_xy` (N, 2), nothing levelled; the camera is higher than calibrated by
+    `raised_m`.
     """
     height_ratio = 1.0 + raised_m / float(camera.centre[2])
     tilts, covariances = _tilts_of_discs(

@@ -38,20 +38,9 @@ class RadiusEstimate(NamedTuple):
 def find_radius(
     images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings
 ) -> RadiusEstimate | None:
-    """Find the radius of the discs in some images.
+    """Find the radius of the discs in some images, whatever that in the settings is.
 
-    Parameters
-    ----------
-    images : sequence of (H, W) uint8
-    camera : Camera
-        The calibrated camera.
-    settings : CircleSettings
-        What to look for; its radius does not matter.
-
-    Returns
-    -------
-    RadiusEstimate or None
-        None where fewer than `LEAST_DISCS` discs are found at any radius.
+    None where fewer than `LEAST_DISCS` discs are found at any radius.
     """
     count = math.ceil(math.log(LARGEST_M / SMALLEST_M) / math.log(FACTOR))
     radii = SMALLEST_M * FACTOR ** np.arange(count + 1)

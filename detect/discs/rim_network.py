@@ -37,32 +37,16 @@ _Weights = NDArray[np.float32]
 
 
 class RimNetwork(NamedTuple):
-    """Weights of N networks of I inputs for each direction, C channels and D dense units.
+    """Weights of N networks of I inputs for each direction, C channels and D dense units."""
 
-    Attributes
-    ----------
-    around : (N, 3, I, C) float32
-        First convolution: of the direction before, the same and the next one.
-    around_bias : (N, C) float32
-    again : (N, 3, C, C) float32
-        Second convolution.
-    again_bias : (N, C) float32
-    dense : (N, 3 C + SCALES, D) float32
-        Of the means, greatest and least of the channels, and the scales.
-    dense_bias : (N, D) float32
-    out : (N, D + F) float32
-        Of the dense units and F features of the rim.
-    out_bias : (N,) float32
-    """
-
-    around: _Weights
-    around_bias: _Weights
-    again: _Weights
-    again_bias: _Weights
-    dense: _Weights
-    dense_bias: _Weights
-    out: _Weights
-    out_bias: _Weights
+    around: _Weights  # (N, 3, I, C) first convolution: the direction before, the same, the next one
+    around_bias: _Weights  # (N, C)
+    again: _Weights  # (N, 3, C, C) second convolution
+    again_bias: _Weights  # (N, C)
+    dense: _Weights  # (N, 3 C + SCALES, D) of means, greatest and least of channels, and scales
+    dense_bias: _Weights  # (N, D)
+    out: _Weights  # (N, D + F) of the dense units and F features of the rim
+    out_bias: _Weights  # (N,)
 
 
 class Networks(NamedTuple):
@@ -70,14 +54,6 @@ class Networks(NamedTuple):
 
     glance: RimNetwork
     look: RimNetwork
-
-    def by_name(self) -> dict[str, _Weights]:
-        """All weights, as `WEIGHTS_FILE` has them."""
-        return {
-            f"{sort}_{name}": weights
-            for sort, network in zip(self._fields, self, strict=True)
-            for name, weights in zip(network._fields, network, strict=True)
-        }
 
 
 @cache
@@ -97,24 +73,13 @@ def trained_networks() -> Networks:
 def network_inputs(
     grey: NDArray[np.float64], pixels_per_radius: NDArray[np.float64], sign: float
 ) -> tuple[_Weights, _Weights]:
-    """What a network sees of the grey values about a rim.
+    """What a network sees of (K, M) grey values in K directions at M distances.
 
-    Parameters
-    ----------
-    grey : (K, M) float64
-        In K directions at M distances; NaN outside the image.
-    pixels_per_radius : (K,) float64
-    sign : float
-        1 for a light disc, -1 for a dark one, which is seen as a light one.
-
-    Returns
-    -------
-    inputs : (M + OTHERS, K + 2) float32
-        Deviations from the mean grey value relative to their root mean square, 0 outside the image;
-        logarithm of the pixels per radius; share outside the image. The last direction stands
-        before the first, and the first behind the last.
-    scales : (SCALES,) float32
-        Logarithms of the pixels per radius and of the root mean square, less usual ones.
+    These are NaN outside the image. The sign is -1 for a dark disc, which is seen as a light one.
+    Inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean square, 0
+    outside; logarithm of the pixels per radius; share outside. The last direction is before the
+    first, and the first behind the last. Scales are logarithms of the pixels per radius and of the
+    root mean square, less usual ones.
     """
     directions, distances = grey.shape
     inputs = np.zeros((distances + OTHERS, directions + 2), np.float32)
@@ -173,16 +138,7 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: NDArray[np.float64], network: RimNetwork
 ) -> float:
-    """Log-odds that a rim is a disc's: the mean of the networks.
-
-    Parameters
-    ----------
-    inputs, scales : (I, K + 2), (SCALES,) float32
-        Of `network_inputs`.
-    features : (F,) float64
-        Of the rim.
-    network : RimNetwork
-    """
+    """Log-odds that a rim is a disc's, the mean of the networks; (F,) features are the rim's."""
     members, channels = network.around_bias.shape
     units = network.dense_bias.shape[1]
     directions = inputs.shape[1] - 2

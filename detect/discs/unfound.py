@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import (
     CircleDetections,
+    FirstLook,
     detect_circles,
     disc_shape,
     first_look,
@@ -30,7 +32,7 @@ from detect.circles import (
 )
 from detect.discs.candidates import strong_and_alone
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, RADIUS_RANGE
-from detect.discs.quality import Limits, centres_of
+from detect.discs.quality import Centres, Limits, centres_of
 from detect.discs.radius import FACTOR, find_radius
 from detect.discs.search import FATES, LEAST_STEPS, share_of_steps
 from detect.settings import CircleSettings
@@ -56,31 +58,17 @@ _FEWEST_FITS = 5
 
 
 class Candidate(NamedTuple):
-    """A candidate for a disc.
+    """A candidate for a disc."""
 
-    Attributes
-    ----------
-    u, v : float
-        Pixel.
-    x_m, y_m : float
-        On the floor as the camera is calibrated, metres.
-    quality, contrast : float
-        Otsu's quality, and grey levels inside minus outside.
-    stage : str
-        What dropped it; "disc" if it was found.
-    value, limit : float
-        The number that decided, and what it should have been at least; NaN where there is none.
-    """
-
-    u: float
+    u: float  # pixel
     v: float
-    x_m: float
+    x_m: float  # on the floor as the camera is calibrated, metres
     y_m: float
-    quality: float
-    contrast: float
-    stage: Stage
-    value: float
-    limit: float
+    quality: float  # Otsu's
+    contrast: float  # grey levels inside minus outside
+    stage: Stage  # what dropped it; "disc" if it was found
+    value: float  # the number that decided,
+    limit: float  # and what it should have been at least; NaN where there is none
 
     @property
     def is_disc(self) -> bool:
@@ -111,21 +99,11 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True)
 class DiscExplanation:
-    """What became of the candidates of an image.
+    """What became of the candidates of an image."""
 
-    Attributes
-    ----------
-    candidates : tuple of Candidate
-        Those that were found first, then by falling quality.
-    place : str
-        Of the place that was pointed at; empty without one.
-    suggestions : tuple of str
-        What to try, and what that would find.
-    """
-
-    candidates: tuple[Candidate, ...]
-    place: str
-    suggestions: tuple[str, ...]
+    candidates: tuple[Candidate, ...]  # those that were found first, then by falling quality
+    place: str  # of the place that was pointed at; empty without one
+    suggestions: tuple[str, ...]  # what to try, and what that would find
 
     def to_json(self) -> str:
         """All of it, the candidates numbered from 1; what is not finite is null."""
@@ -164,34 +142,24 @@ def explain_discs(
         With `verify` and `refine`: the plain detectors drop nothing after the quality.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found: candidates near it alone.
-
-    Raises
-    ------
-    FrameError
-        If the image has not the camera's size.
     """
-    table = cached_disc_table(camera, disc_shape(settings))
-    found = detect_circles(image, camera, table, settings)
+    scene = _Scene(image, camera, settings)
     share = _QUALITY_SHARE if at is None else _QUALITY_SHARE_NEAR
-    candidates = list(_candidates(image, camera, table, settings, found, share))
+    candidates = list(_candidates(scene, share))
     place = ""
     if at is not None:
-        place = _place(at, image, camera, table, settings)
+        place = _place(at, scene)
         x, y = camera.floor_from_pixel(at).tolist()
         near = _NEAR * settings.radius_m
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
     candidates.sort(key=lambda c: (not c.is_disc, -c.quality))
-    suggestions = tuple(_suggestions(image, camera, settings, found, at))
-    return DiscExplanation(tuple(candidates), place, suggestions)
+    return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
 
 
 def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings) -> str:
     """A sentence on the candidates for discs in images (H, W) without any, and what they fail."""
-    table = cached_disc_table(camera, disc_shape(settings))
-    stages: Counter[Stage] = Counter()
-    for image in images:
-        found = detect_circles(image, camera, table, settings)
-        stages.update(c.stage for c in _candidates(image, camera, table, settings, found))
+    scenes = (_Scene(image, camera, settings) for image in images)
+    stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
     if not stages:
         return (
@@ -211,27 +179,57 @@ def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: Circ
     return f"Of {count} candidates in {len(images)} of the images {failed}."
 
 
-def _candidates(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    table: DiscTable,
-    settings: CircleSettings,
-    found: CircleDetections,
-    quality_share: float = 1.0,
-) -> Iterator[Candidate]:
+@dataclass(frozen=True)
+class _Scene:
+    """An image, and what is found in it."""
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    settings: CircleSettings
+
+    @cached_property
+    def table(self) -> DiscTable:
+        return cached_disc_table(self.camera, disc_shape(self.settings))
+
+    @cached_property
+    def found(self) -> CircleDetections:
+        return detect_circles(self.image, self.camera, self.table, self.settings)
+
+    @cached_property
+    def first(self) -> FirstLook:
+        return first_look(self.image, self.camera, self.table, self.settings)
+
+    def centres(self, least_quality: float) -> Centres:
+        return centres_of(self.image, self.table, Limits(least_quality))
+
+    def count(self, at: tuple[float, float] | None) -> int:
+        """Discs that were found, near a pixel if one is given."""
+        if at is None:
+            return len(self.found)
+        here = self.camera.floor_from_pixel(at)
+        return int((np.hypot(*(self.found.floor_xy - here).T) < self.settings.radius_m).sum())
+
+
+def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate]:
     """What was found, and the candidates that were rejected."""
+    image, camera, settings = scene.image, scene.camera, scene.settings
+    table, found = scene.table, scene.found
     pixels = camera.project_floor(found.floor_xy)
-    levels = _levels(image, table)
+    every = scene.centres(0.0)
+    levels = np.zeros(image.shape, np.float32)
+    levels[every.pixels[:, 1], every.pixels[:, 0]] = every.contrast
+    last = np.array(image.shape)[::-1] - 1
     for (u, v), (x, y), q, evidence in zip(
         pixels.tolist(), found.floor_xy.tolist(), found.quality.tolist(), found.evidence.tolist()
     ):
-        contrast = float(levels[_inside(v, image.shape[0]), _inside(u, image.shape[1])])
+        column, row = np.clip(np.rint((u, v)), 0, last).astype(int)
+        contrast = float(levels[row, column])
         yield Candidate(u, v, x, y, q, contrast, "disc", evidence, settings.evidence)
     near = 0.5 * settings.separation_m
     taken = [found.floor_xy]
     noise, weakest = 0.0, settings.least_contrast
     if settings.verify or settings.refine:
-        noise, weakest, centres, by_fit = first_look(image, camera, table, settings)
+        noise, weakest, centres, by_fit = scene.first
         looks, least = by_fit.looks, first_search(settings).least_evidence
         best = strong_and_alone(centres, table.floor_xy, weakest, near)
         at = looks.pixels
@@ -267,7 +265,7 @@ def _candidates(
             if not _near(np.concatenate(taken), xy, near):
                 (u, v), (x, y) = camera.project_floor(xy).tolist(), xy.tolist()
                 yield Candidate(u, v, x, y, float(q), math.nan, "second look", odds, 0.0)
-    wider = centres_of(image, table, Limits(quality_share * settings.threshold))
+    wider = scene.centres(quality_share * settings.threshold)
     others = np.concatenate(taken)
     for k in strong_and_alone(wider, table.floor_xy, 0.0, settings.separation_m).tolist():
         u, v = wider.pixels[k].tolist()
@@ -284,31 +282,13 @@ def _candidates(
             yield Candidate(u, v, x, y, q, contrast, "contrast", abs(contrast), weakest)
 
 
-def _levels(image: NDArray[np.uint8], table: DiscTable) -> NDArray[np.float32]:
-    """(H, W) contrast of every centre of a table."""
-    centres = centres_of(image, table, Limits(0.0))
-    levels = np.zeros(image.shape, np.float32)
-    levels[centres.pixels[:, 1], centres.pixels[:, 0]] = centres.contrast
-    return levels
-
-
-def _inside(place: float, size: int) -> int:
-    return min(max(round(place), 0), size - 1)
-
-
 def _near(places: FloatArray, xy: FloatArray, within_m: float) -> bool:
     return bool((np.hypot(*(places - xy).T) < within_m).any())
 
 
-def _place(
-    at: tuple[float, float],
-    image: NDArray[np.uint8],
-    camera: Camera,
-    table: DiscTable,
-    settings: CircleSettings,
-) -> str:
+def _place(at: tuple[float, float], scene: _Scene) -> str:
     """What the detector sees at a pixel, in words."""
-    u, v = at
+    camera, settings, (u, v) = scene.camera, scene.settings, at
     if not (0.0 <= u <= camera.width - 1 and 0.0 <= v <= camera.height - 1):
         return f"({u:g}, {v:g}) is outside the image, {camera.width}x{camera.height} px."
     x, y = camera.floor_from_pixel(at).tolist()
@@ -322,8 +302,8 @@ def _place(
             f"{words}, where the floor moves {per_row:.3f} m per image row: too far for discs of "
             f"{settings.radius_m:g} m, {settings.far_limit_m_per_px:.3f} m at most (--far-limit)."
         )
-    centres = centres_of(image, table, Limits(0.0))
-    floor = table.floor_xy[centres.pixels[:, 1], centres.pixels[:, 0]].astype(np.float64)
+    centres = scene.centres(0.0)
+    floor = scene.table.floor_xy[centres.pixels[:, 1], centres.pixels[:, 0]].astype(np.float64)
     away = np.hypot(floor[:, 0] - x, floor[:, 1] - y)
     near = np.flatnonzero(away < settings.radius_m)
     at_border = min(u, v, camera.width - 1 - u, camera.height - 1 - v) < settings.border_px
@@ -336,36 +316,27 @@ def _place(
     )
 
 
-def _suggestions(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    settings: CircleSettings,
-    found: CircleDetections,
-    at: tuple[float, float] | None,
-) -> Iterator[str]:
+def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]:
     """What to change, where it finds more (at the place that was pointed at)."""
-
-    def gained(changed: CircleSettings) -> int:
-        table = cached_disc_table(camera, disc_shape(changed))
-        return _count(detect_circles(image, camera, table, changed), camera, changed, at) - here
-
-    here = _count(found, camera, settings, at)
+    settings, here = scene.settings, scene.count(at)
     if at is not None and here:
         return
+
+    def gained(changed: CircleSettings) -> int:
+        return replace(scene, settings=changed).count(at) - here
+
     where = "there" if at is not None else "more"
     if settings.polarity != "any" and (more := gained(replace(settings, polarity="any"))) > 0:
         yield f"--polarity any finds {more} {where}."
-    radius_m = _radius_at(image, camera, settings, at) if at is not None else None
-    if at is None and not len(found):
-        estimate = find_radius([image], camera, replace(settings, polarity="any"))
+    radius_m = _radius_at(scene, at) if at is not None else None
+    if at is None and not here:
+        estimate = find_radius([scene.image], scene.camera, replace(settings, polarity="any"))
         radius_m = None if estimate is None else estimate.radius_m
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
         yield f"--radius-m {radius_m:.3f} finds a disc {'there' if at is not None else 'here'}."
     if not settings.verify:
         return
-    looks = first_look(
-        image, camera, cached_disc_table(camera, disc_shape(settings)), settings
-    ).found.looks
+    looks = scene.first.found.looks
     results = looks.results[looks.results["explained"] >= LEAST_EXPLAINED]
     if len(results):
         blur_px = round(float(np.median(results["blur"])), 1)
@@ -388,23 +359,9 @@ def _suggestions(
         yield f"--evidence {lower.evidence:.1f} finds {more} {where}: look whether they are discs."
 
 
-def _count(
-    found: CircleDetections,
-    camera: Camera,
-    settings: CircleSettings,
-    at: tuple[float, float] | None,
-) -> int:
-    """Discs that were found, near a pixel if one is given."""
-    if at is None:
-        return len(found)
-    here = camera.floor_from_pixel(at)
-    return int((np.hypot(*(found.floor_xy - here).T) < settings.radius_m).sum())
-
-
-def _radius_at(
-    image: NDArray[np.uint8], camera: Camera, settings: CircleSettings, at: tuple[float, float]
-) -> float | None:
+def _radius_at(scene: _Scene, at: tuple[float, float]) -> float | None:
     """The radius at which a disc of the highest evidence is found at a pixel."""
+    camera, settings = scene.camera, scene.settings
     here = camera.floor_from_pixel(at)
     if not np.isfinite(here).all():
         return None
@@ -412,7 +369,8 @@ def _radius_at(
     best, of_best = -math.inf, None
     for radius_m in (settings.radius_m * FACTOR ** np.arange(-count, count + 1)).tolist():
         tried = replace(settings, radius_m=radius_m, polarity="any")
-        found = detect_circles(image, camera, build_disc_table(camera, disc_shape(tried)), tried)
+        table = build_disc_table(camera, disc_shape(tried))
+        found = detect_circles(scene.image, camera, table, tried)
         near = np.hypot(*(found.floor_xy - here).T) < radius_m
         if near.any() and found.evidence[near].max() > best:
             best, of_best = float(found.evidence[near].max()), radius_m

@@ -125,16 +125,15 @@ def detect_markers(
     settings: MarkerSettings,
     camera: Camera | None = None,
 ) -> MarkerDetections:
-    """Find the square markers in one image.
+    """Find the square markers in one grey image (RAWSEEDS deliverable D2.1 part 2).
 
     Parameters
     ----------
     image : (H, W) uint8
-        Grey image.
     settings : MarkerSettings
     camera : Camera, optional
-        The calibration, whose distortion bends the markers' edges; without one they are taken to
-        be straight in the image.
+        The calibration, whose distortion bends the markers' edges; without one they are taken to be
+        straight in the image.
 
     Raises
     ------
@@ -142,10 +141,6 @@ def detect_markers(
         If there is no such dictionary, or it lacks an ID that is expected.
     FrameError
         If the image has not the camera's size.
-
-    References
-    ----------
-    RAWSEEDS deliverable D2.1 part 2: ground truth from cameras.
     """
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)

@@ -13,12 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.compare import (
-    beside_reference,
-    compare_frames,
-    compare_line_frames,
-    unlisted_lines,
-)
+from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.frame import EXTRA_COLOUR, MISSED_COLOUR, Colour, draw_curve, draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
@@ -82,7 +77,8 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
             [seen.circles for seen in both if seen.circles],
             compare,
             sight=sight,
-            beside=beside_reference(path),
+            unlisted=rows_beside(path, "unlisted.circles"),
+            lookalikes=rows_beside(path, "lookalikes.circles"),
             names=(path.name, files.detected["circles"].name),
         )
     if both := [seen for seen in rows if seen.lines and seen.reference_lines]:
@@ -90,7 +86,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
             [seen.reference_lines for seen in both if seen.reference_lines],
             [seen.lines for seen in both if seen.lines],
             compare,
-            unlisted=unlisted_lines(files.reference["lines"]),
+            unlisted=rows_beside(files.reference["lines"], "unlisted.lines"),
             names=(files.reference["lines"].name, files.detected["lines"].name),
         )
     timing = _timing(run, files, len(names), time_frames)

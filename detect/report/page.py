@@ -16,11 +16,10 @@ from jinja2 import Environment, StrictUndefined
 from detect import __version__
 from detect.comparison.report import (
     floor_table,
-    number,
     summary_rows,
     worst_frames_table,
 )
-from detect.comparison.result import Comparison, DiscComparison, LineComparison
+from detect.comparison.result import Comparison, DiscComparison, LineComparison, number
 from detect.drawing.inputs import picture_name
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
@@ -34,6 +33,7 @@ from detect.report.figures import (
     disc_rates,
     distance_figure,
     floor_figure,
+    floor_map,
     knee,
     line_rates,
     rates_figure,
@@ -41,7 +41,6 @@ from detect.report.figures import (
     whitened,
     whitened_figure,
 )
-from detect.report.floor_map import floor_map
 from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source

@@ -22,7 +22,7 @@ from detect.runs.plan import Drawing, FramePlan, FramesByImage, Job, Known, MapB
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
-from detect.sources.opening import open_calibrated, open_source
+from detect.sources.opening import open_run, open_source
 from detect.terminal import print_failures, progress_bar
 from redetect.landmarks import read_tilts
 
@@ -58,7 +58,7 @@ def perform(command: DetectorFlags) -> int:
 def _job_of(command: DetectorFlags) -> Job:
     if isinstance(command, Markers):
         return _markers(command)
-    run = open_calibrated(command.run, command.camera, command.source)
+    run = open_run(command.run, command.camera, command.source)
     if isinstance(command, Circles):
         return _circles(command, run)
     if isinstance(command, Lines):

@@ -52,7 +52,12 @@ from detect.verticals.response import line_response
 from detect.viewing_options import CompareOptions
 from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
 from redetect.landmarks import (
+    CircleLandmark,
+    Frame,
     FrameTilt,
+    Landmark,
+    LandmarkError,
+    circle_landmarks,
     format_levelling,
     format_no_tilt,
     format_outline_tilt,
@@ -64,7 +69,7 @@ from redetect.landmarks import (
 )
 
 #: Errors of one frame, not of the run.
-COSTS_THE_FRAME = (FrameError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
+COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass
@@ -223,7 +228,10 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
     head = f"{format_record(step)}\n"
     rows = {"times": time_row(task)}
     if found.lines is not None:
-        rows["lines"] = head + _line_rows(found.lines, task.known)
+        lines = found.lines.landmarks()
+        if task.known.lines:
+            lines = carry_ids(lines, task.known.lines)
+        rows["lines"] = head + _text(lines)
         tilt = found.tilt
         own = format_no_tilt(step.prefix, len(found.lines)) if tilt is None else format_tilt(tilt)
         rows["tilt"] = f"{own}\n"
@@ -232,46 +240,25 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
     if found.discs is not None and found.seen is not None:
         level = found.discs.levelled_by
         note = "" if level is None else f"{format_levelling(level)}\n"
-        rows["circles"] = head + note + _disc_rows(found.discs, found.seen, task.known)
+        discs = _disc_rows(found.discs, found.seen, task.known)
+        rows["circles"] = head + note + _text(discs)
         if plan.json:
-            rows["json"] = json_record({"frame": step.prefix, "discs": _disc_records(found.discs)})
+            records = _disc_records(found.discs, discs)
+            rows["json"] = json_record({"frame": step.prefix, "discs": records})
     if found.markers is not None:
-        rows["markers"] = head + "".join(
-            f"{format_record(marker)}\n" for marker in found.markers.landmarks()
-        )
+        rows["markers"] = head + _text(found.markers.landmarks())
     return rows
 
 
-def landmark_rows(
-    keyword: str, numbers: NDArray[np.float64], ids: Sequence[tuple[int, ...]]
-) -> str:
-    """Rows of landmarks, as `landmarks.format_record` formats them, of (N, K) numbers and N IDs."""
-    if not np.isfinite(numbers).all():
-        raise FrameError(f"{keyword}: a number of it is not finite")
-    row = keyword + " %g" * numbers.shape[1]
-    rows = "".join(" ".join([row, *map(str, own)]) + "\n" for own in ids)
-    return rows % tuple(numbers.ravel().tolist())
+def _text(rows: Iterable[Landmark]) -> str:
+    return "".join(f"{format_record(row)}\n" for row in rows)
 
 
-def disc_numbers(
-    floor_xy: NDArray[np.float64], quality: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The (N, 6) numbers of rows of discs: x, y, quality, cxx, cxy, cyy."""
-    return np.column_stack([floor_xy, quality, covariance[:, 0], covariance[:, 1, 1]])
-
-
-def _line_rows(found: LineDetections, known: KnownOfFrame) -> str:
-    ids: list[tuple[int, ...]] = [(-1,)] * len(found)
-    if known.lines:
-        ids = [row.ids for row in carry_ids(found.landmarks(), known.lines)]
-    no_quality = np.zeros(len(found))
-    columns = [found.ends, found.alpha_rad, found.beta_rad, no_quality, found.sigma_rad]
-    return landmark_rows("LANDMARK_L", np.column_stack(columns), ids)
-
-
-def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame) -> str:
+def _disc_rows(
+    discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
+) -> list[CircleLandmark]:
     """The rows, with the IDs of a known row of the same disc, or of a map's, or -1."""
-    numbers = disc_numbers(discs.floor_xy, discs.quality, discs.covariance)
+    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance)
     ids: list[tuple[int, ...]] = [(-1,)] * len(discs)
     if known.discs:
         alike = discs if known.discs_level else seen
@@ -281,27 +268,26 @@ def _disc_rows(discs: CircleDetections, seen: CircleDetections, known: KnownOfFr
     if known.mapped:
         taken = {number for own in ids for number in own}
         left = [disc for disc in known.mapped if disc.id not in taken]
-        rows = [k for k, own in enumerate(ids) if own == (-1,)]
-        found = ids_of_map(discs.floor_xy[rows], discs.covariance[rows], left, known.slack_m)
-        for k, number in zip(rows, found.tolist()):
+        without = [k for k, own in enumerate(ids) if own == (-1,)]
+        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, known.slack_m)
+        for k, number in zip(without, found.tolist()):
             ids[k] = (number,)
-    return landmark_rows("LANDMARK_C", numbers, ids)
+    return [replace(row, ids=own) for row, own in zip(rows, ids)]
 
 
-def _disc_records(found: CircleDetections) -> list[dict[str, object]]:
-    rows = disc_numbers(found.floor_xy, found.quality, found.covariance).tolist()
+def _disc_records(
+    found: CircleDetections, rows: Sequence[CircleLandmark]
+) -> list[dict[str, object]]:
     return [
         {
             "pixel": pixel,
-            "x_m": x,
-            "y_m": y,
-            "quality": quality,
+            "x_m": row.px,
+            "y_m": row.py,
+            "quality": row.quality,
             "evidence": evidence if math.isfinite(evidence) else None,
-            "covariance_m2": covariance,
+            "covariance_m2": [row.cxx, row.cxy, row.cyy],
         }
-        for pixel, (x, y, quality, *covariance), evidence in zip(
-            found.pixels.tolist(), rows, found.evidence.tolist()
-        )
+        for pixel, evidence, row in zip(found.pixels.tolist(), found.evidence.tolist(), rows)
     ]
 
 
@@ -314,8 +300,7 @@ def _drawn(
         return
     table = tables_of(plan).verticals
     kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
-    content = io.BytesIO(rows[kind].encode("utf-8", "surrogateescape"))
-    (frame,) = frames_of_rows(parse_rows(content))
+    frame = _frame_of(rows[kind])
     if plan.drawing == "tracks" and found.lines is not None and table:
         yield ".png", draw_tracks(image, table, found.lines)
     elif plan.drawing is not None:
@@ -390,21 +375,23 @@ def _levelled(
 ) -> str:
     """A frame's rows, its STEP first; `height_sigma` is of the camera, as a share of its height."""
     step, *rows = _lines(circles)
-    head = f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n"
-    if not rows:
-        return head
     words = [row.split() for row in rows]
-    numbers = np.array([word[1:7] for word in words], np.float64)
-    covariance = numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
-    floor_xy, level_covariance, down = level_discs(camera, numbers[:, :2], covariance, tilt)
+    numbers = np.array([word[1:7] for word in words], np.float64).reshape(-1, 6)
+    xy, covariance = numbers[:, :2], numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
+    floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt)
     from_camera = floor_xy - camera.centre[:2]
-    level_covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
-    level_covariance += common_covariance(
-        camera, numbers[:, :2], calibration_px, by_verticals=by_verticals
-    )
-    level = disc_numbers(floor_xy[down], numbers[down, 2], level_covariance[down])
-    ids = [tuple(map(int, words[k][7:])) for k in np.flatnonzero(down)]
-    return head + landmark_rows("LANDMARK_C", level, ids)
+    covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
+    covariance += common_covariance(camera, xy, calibration_px, by_verticals=by_verticals)
+    level = circle_landmarks(floor_xy[down], numbers[down, 2], covariance[down])
+    ids = [" ".join(words[k][7:]) for k in np.flatnonzero(down)]
+    discs = "".join(f"{format_record(row)} {own}\n" for row, own in zip(level, ids))
+    return f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n{discs}"
+
+
+def _frame_of(text: str) -> Frame:
+    """A frame from its rows."""
+    (frame,) = frames_of_rows(parse_rows(io.BytesIO(text.encode("utf-8", "surrogateescape"))))
+    return frame
 
 
 def _lines(text: str) -> list[str]:

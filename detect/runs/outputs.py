@@ -38,8 +38,20 @@ _TILT_ROWS = (
     "  rotation vector (pitch, roll, 0) about the robot's X (left) and Y (backward), radians:",
     "  it turns directions measured with the calibrated mounting level; its covariance;",
 )
-
-
+_TILT_TEXT = (
+    f"Pitch and roll of each frame from the building's verticals, by redetect {__version__}.",
+    *_TILT_ROWS,
+    "  and the number of verticals that agree with it",
+    "NOTILT <image> <lines>: too few lines agree",
+)
+_OUTLINES_TEXT = "TILT_D <image> ... <discs>: the same by the outlines of the frame's discs"
+_RUN_TILT_TEXT = (
+    f"Pitch and roll that the discs of each frame were levelled by, by redetect {__version__}:",
+    "  the constant lean of the run and the frame's estimated deviation from it",
+    *_TILT_ROWS,
+    "  and the number of verticals that agree with the tilt of the frame by itself",
+    "NOTILT <image> <lines>: its discs are as they were seen",
+)
 _COMMON = "  covariances include the calibration's ({}): its errors are the same in all"
 
 
@@ -74,11 +86,11 @@ def outputs_of(job: Job) -> list[Output]:
         outputs.append(_json_file(places["json"], plan))
     if "tilt" in places:
         path = frames_tilt_place(places["tilt"]) if by_run else places["tilt"]
-        add(path, "tilt", *_tilt_text(by_run=by_run))
+        add(path, "tilt", *_TILT_TEXT, *([_OUTLINES_TEXT] if by_run else []))
     if "lines" in places:
         add(places["lines"], "lines", *_lines_text(run, plan), crlf=job.crlf)
     if "tilt" in places and "circles" in places and by_run:
-        add(places["tilt"], RUN_TILT, *_run_tilt_text())
+        add(places["tilt"], RUN_TILT, *_RUN_TILT_TEXT)
     if "circles" in places:
         add(places["circles"], "circles", *_circles_text(job), crlf=job.crlf)
     if "markers" in places:
@@ -143,27 +155,6 @@ def _markers_text(run: ImageRun, plan: FramePlan) -> list[str]:
         "  corners top left, top right, bottom right, bottom left of the marker as printed;",
         "  pixels of the original image, the top left pixel's centre is 0 0; quality: 1 is perfect",
         *_made_with(plan, plan.markers),
-    ]
-
-
-def _tilt_text(*, by_run: bool) -> list[str]:
-    outlines = "TILT_D <image> ... <discs>: the same by the outlines of the frame's discs"
-    return [
-        f"Pitch and roll of each frame from the building's verticals, by redetect {__version__}.",
-        *_TILT_ROWS,
-        "  and the number of verticals that agree with it",
-        "NOTILT <image> <lines>: too few lines agree",
-        *([outlines] if by_run else []),
-    ]
-
-
-def _run_tilt_text() -> list[str]:
-    return [
-        f"Pitch and roll that the discs of each frame were levelled by, by redetect {__version__}:",
-        "  the constant lean of the run and the frame's estimated deviation from it",
-        *_TILT_ROWS,
-        "  and the number of verticals that agree with the tilt of the frame by itself",
-        "NOTILT <image> <lines>: its discs are as they were seen",
     ]
 
 

@@ -43,23 +43,12 @@ def detect_run(
 
     Each image is decoded once. Levelled by the run, the tilt file has the tilts that the discs were
     levelled by, and those of single frames are in another one (`outputs.frames_tilt_place`).
+    Workers are by default this process; `on_progress` is called once after every frame.
 
-    Parameters
-    ----------
-    job : Job
-    workers : Workers, optional
-        By default this process (see `detect.runs.workers`).
-    on_progress : callable, optional
-        Called once after every frame.
-
-    Raises
-    ------
-    DetectError
-        If another run is writing the same files, a frame fails where every frame is demanded, or
-        there is no such dictionary of markers.
-    lut.TableError, redetect.storage.OutputExistsError, WorkerError
-        If there can be no table for the camera, an output exists and must not be replaced, or there
-        are no workers.
+    Raises ------ DetectError If another run is writing the same files, a frame fails where every
+    frame is demanded, or there is no such dictionary of markers. lut.TableError,
+    redetect.storage.OutputExistsError, WorkerError If there can be no table for the camera, an
+    output exists and must not be replaced, or there are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
     if job.pictures is None:

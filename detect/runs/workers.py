@@ -261,8 +261,8 @@ class _ProcessPool(ProcessPoolExecutor):
     def __exit__(self, *_: object) -> None:
         """End them, whatever they are doing; a further interrupt waits for that.
 
-        The thread that manages them is joined: an interrupted program leaves threads behind, and
-        this one could be stopped after it has removed a semaphore and before it has recorded that.
+        Of an interrupted program the thread that manages them could be stopped after it has removed
+        a semaphore and before it has recorded that: it is joined.
         """
         with interrupts_deferred():
             processes = list((self._processes or {}).values())

@@ -32,12 +32,11 @@ _BYTES_BESIDE = 1 << 23
 def decode_gray(
     content: bytes, name: object, bits: int = 16, size: tuple[int, int] | None = None
 ) -> NDArray[np.uint8]:
-    """Decode the content of an image file to (H, W) uint8 grey values.
+    """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
     Parameters
     ----------
     content : bytes
-        JPEG, PNG, PNM, BMP or TIFF.
     name : object
         The image's name in messages.
     bits : int

@@ -1,6 +1,6 @@
 """Image files as a source, and which of them belongs to a step: never one outside the run.
 
-A run may have a million frames: the memory per frame is the name of its image, twice, and 4 bytes.
+A run may have a million frames: the memory per frame is the name of its image and 12 bytes.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 from collections.abc import Generator, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,11 @@ from detect.sources.interface import (
     read_image_times,
     still,
 )
-from redetect.landmarks import Step, read_steps
+from redetect.landmarks import read_steps
 from redetect.storage.bounded import leads_out, link_out
 from redetect.storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
-
-#: Longer names are known by their digest, bytes.
-_LONGEST = 64
 
 
 def image_name(prefix: str) -> str:
@@ -49,10 +47,7 @@ def last_part(prefix: str) -> str:
 
 
 class ImageNames:
-    """Names of a folder's image files that match a pattern, in natural order: numbers by value.
-
-    The folder is listed once; `has_links` says whether any of them is a symbolic link.
-    """
+    """Names of a folder's image files that match a pattern, in natural order: numbers by value."""
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
@@ -61,13 +56,11 @@ class ImageNames:
         self._homes = (own, own.parent) if own.name == "images" else (own,)
         matches = re.compile(fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:
-            found = [
-                entry
+            names = sorted(
+                entry.name
                 for entry in entries
                 if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
-            ]
-        self.has_links = any(entry.is_symlink() for entry in found)
-        names = sorted(entry.name for entry in found)
+            )
         names.sort(key=_natural_order)
         encoded = [os.fsencode(name) for name in names]
         self._names: NDArray[np.bytes_] = np.array(encoded, dtype=np.bytes_)
@@ -124,13 +117,10 @@ def images_of_folder(folder: Path) -> ImageNames:
 
 
 class NameIndex:
-    """Finds the place of a name in a sequence; of equal names, which have no NUL, the last one.
-
-    It costs the width of the longest name and 4 bytes per name.
-    """
+    """Finds the place of a name in a sequence; of equal names the last one. 12 bytes per name."""
 
     def __init__(self, names: Iterable[bytes]) -> None:
-        keys: NDArray[np.bytes_] = np.array([_key(name) for name in names], dtype=np.bytes_)
+        keys = np.array([_key(name) for name in names], dtype=np.uint64)
         self._places = np.argsort(keys, kind="stable").astype(np.uint32)
         self._keys = keys[self._places]
 
@@ -140,16 +130,12 @@ class NameIndex:
     def find(self, name: bytes) -> int | None:
         """The place of a name in the sequence; None if it is not there."""
         key = _key(name)
-        if len(key) > self._keys.itemsize:  # numpy would copy all keys to this width
-            return None
-        after = int(self._keys.searchsorted(np.bytes_(key), side="right"))
-        if not after or self._keys[after - 1] != key:
-            return None
-        return int(self._places[after - 1])
+        after = int(self._keys.searchsorted(key, side="right"))
+        return int(self._places[after - 1]) if after and self._keys[after - 1] == key else None
 
 
-def _key(name: bytes) -> bytes:
-    return name if len(name) < _LONGEST else hashlib.sha256(name).hexdigest().encode()
+def _key(name: bytes) -> np.uint64:
+    return np.uint64(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest()))
 
 
 def _suffix(name: str) -> str:
@@ -173,37 +159,33 @@ _SAMPLES = 5
 
 
 class RunFrames(Frames):
-    """The frames of a run folder: in the order of the odometry, or of names."""
+    """The frames of a run folder in the order of its odometry."""
 
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
 
-    def __init__(
-        self, images: ImageNames, odometry: Path | None, expected: int, left_out: int, bits: int
-    ) -> None:
+    def __init__(self, images: ImageNames, odometry: Path, bits: int) -> None:
         self._images, self._odometry, self._bits = images, odometry, bits
-        self.expected, self.left_out = expected, left_out
+        # Errors in the odometry are raised here, before any work is done.
+        named = np.zeros(len(images), bool)
+        self.expected = 0
+        for step in read_steps(odometry):
+            self.expected += 1
+            with suppress(FrameError):  # reported when the frame is processed
+                found = images.place_of(step.prefix)
+                if found is not None:
+                    images.checked(found)
+                    named[found] = True
+        self.left_out = int(np.count_nonzero(~named))
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        if self._odometry is None:
-            for place in range(len(self._images)):
-                yield self._frame(_standing_still(self._images.path(place).stem), place)
-        else:
-            for step in read_steps(self._odometry):
-                yield self._frame(step)
-
-    def _frame(self, step: Step, place: int | None = None) -> RunFrame:
-        try:
-            found = self._images.place_of(step.prefix) if place is None else place
-            image = None if found is None else self._images.checked(found)
-            return RunFrame(step, image, bits=self._bits)
-        except FrameError as error:
-            return RunFrame(step, None, failure=str(error))
-
-
-def _standing_still(prefix: str) -> Step:
-    # What would part the word, begin a comment or continue the row.
-    return still(re.sub(r"\s|\A#|\\\Z", "_", prefix))
+        for step in read_steps(self._odometry):
+            try:
+                found = self._images.place_of(step.prefix)
+                image = None if found is None else self._images.checked(found)
+                yield RunFrame(step, image, bits=self._bits)
+            except FrameError as error:
+                yield RunFrame(step, None, failure=str(error))
 
 
 class ImageFiles(Source):
@@ -225,6 +207,8 @@ class ImageFiles(Source):
             self._names, self._home = _matching_images(name), name.parent
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
+        # A pattern names its links; a folder may be somebody else's.
+        self._path = self._names.checked if name.is_dir() else self._names.path
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names)
@@ -235,9 +219,12 @@ class ImageFiles(Source):
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         for place in range(len(self._names)):
-            path = self._names.path(place)
-            step = still(frame_prefix(path.stem))
-            yield RunFrame(step, path, time_s=self._times.get(path.stem), bits=self._bits)
+            stem = self._names.path(place).stem
+            step, time_s = still(frame_prefix(stem)), self._times.get(stem)
+            try:
+                yield RunFrame(step, self._path(place), time_s=time_s, bits=self._bits)
+            except FrameError as error:
+                yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
 
 def bits_of_images(names: ImageNames) -> int:

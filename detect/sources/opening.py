@@ -14,8 +14,15 @@ from typing import TYPE_CHECKING
 from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import ImageRun, Run, open_images, open_run
-from detect.sources.image_files import IMAGE_SUFFIXES
+from detect.run import ImageRun, Run, camera_in
+from detect.sources.image_files import (
+    IMAGE_SUFFIXES,
+    WILDCARDS,
+    ImageFiles,
+    RunFrames,
+    bits_of_images,
+    images_of_folder,
+)
 from detect.sources.interface import Frames
 
 if TYPE_CHECKING:
@@ -24,7 +31,7 @@ if TYPE_CHECKING:
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
 
-def open_calibrated(
+def open_run(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> Run:
     """Open what holds a run's images, with a calibration.
@@ -34,13 +41,15 @@ def open_calibrated(
     name : path
         A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
     camera_path : path, optional
-        The calibration; by default the one beside the images.
+        The calibration; by default the one beside the images (of several in a run folder
+        ``<run>.cam``).
     options : SourceOptions, optional
 
     Raises
     ------
     DetectError
-        If there is no such thing, it cannot be read, or there is no calibration.
+        If there is no such thing, it cannot be read, or there is no calibration, or more than one
+        to choose from.
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
@@ -49,14 +58,14 @@ def open_calibrated(
         return run
     raise DetectError(
         f"{name}: no calibration: expected a .cam file beside the images, or one named by "
-        "--camera; `camera calibrate` makes one"
+        "--camera; `camera calibrate` makes one, `camera convert` brings one over"
     )
 
 
 def open_source(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> ImageRun:
-    """As `open_calibrated`; a `Run` if there is a calibration."""
+    """Open it with or without a calibration; without one it is no `Run`."""
     return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
@@ -71,10 +80,13 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
-    if name.is_dir() and not _is_ros2_bag(name) and options.plain:
-        # A run folder as the data set has them, with its own odometry.
-        opened = open_run if posed else open_images
-        return _shortened(opened(name, camera_path, bits=options.bits or None), options.frames)
+    own = _own_odometry(name) if name.is_dir() else None
+    if own is not None and options.plain and not _is_ros2_bag(name):
+        camera = camera_in(name) if camera_path is None else read_camera(camera_path)
+        images = images_of_folder(name)
+        frames: Frames = RunFrames(images, own, options.bits or bits_of_images(images))
+        run = _shortened(ImageRun(name, frames, own, name / "detected"), options.frames)
+        return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames, odometry = _frames(source, options)
@@ -92,9 +104,14 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     return run.calibrated(camera)
 
 
+def _own_odometry(folder: Path) -> Path | None:
+    """The odometry of a run folder as the data set has them."""
+    usual = folder / f"{folder.resolve().name}.txt", folder / "map.circles"
+    return next((path for path in usual if path.is_file()), None)
+
+
 def _source(name: Path, options: SourceOptions) -> Source:
     from detect.sources.bag import BAG_SUFFIXES, Bag
-    from detect.sources.image_files import WILDCARDS, ImageFiles
     from detect.sources.video import LiveCamera, VideoFile
 
     bits = options.bits or None

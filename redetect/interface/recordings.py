@@ -13,12 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.compare import (
-    beside_reference,
-    compare_frames,
-    compare_line_frames,
-    unlisted_lines,
-)
+from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
 from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison
 from detect.drawing.inputs import read_head
@@ -29,7 +24,7 @@ from detect.run import Run, read_image
 from detect.seen import Sight
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
-from detect.sources.opening import open_calibrated, open_source
+from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
 from redetect.landmarks import Step, read_frames
@@ -142,7 +137,7 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
     if isinstance(camera, Camera):
         return Recording(open_source(Path(name), None, options).calibrated(camera))
     path = None if camera is None else Path(camera)
-    return Recording(open_calibrated(Path(name), path, options))
+    return Recording(open_run(Path(name), path, options))
 
 
 def compare(
@@ -202,12 +197,13 @@ def compare(
         )
     frames, names = [one.frame for one in found], (str(in_file), "detections")
     if lines:
-        unlisted = unlisted_lines(in_file)
+        unlisted = rows_beside(in_file, "unlisted.lines")
         return compare_line_frames(
             read_frames(in_file), frames, options, unlisted=unlisted, names=names
         )
     sight = Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level)
     return compare_frames(
         read_frames(in_file), frames, options, sight=sight,
-        beside=beside_reference(in_file), names=names,
+        unlisted=rows_beside(in_file, "unlisted.circles"),
+        lookalikes=rows_beside(in_file, "lookalikes.circles"), names=names,
     )  # fmt: skip

@@ -72,18 +72,9 @@ _DEVICE = re.compile(
 def leads_out(name: str, *folders: str) -> str | None:
     r"""Why a name may not be taken for one of a file within a folder, by its letters alone.
 
-    Parameters
-    ----------
-    name : str
-        With / or \ between folders.
-    folders : str
-        Absolute paths of folders in any of which the file may be; without them any folder will do,
-        and its name is not known.
-
-    Returns
-    -------
-    str or None
-        What is wrong with the name, as the end of a message that starts with it; None if nothing.
+    The name has / or \ between folders. `folders` are absolute paths of folders in any of which the
+    file may be; without them any folder will do. What is wrong is the end of a message that starts
+    with the name; None if nothing.
     """
     parts = name.replace("\\", "/")
     if "\0" in name:

@@ -14,7 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Union, get_type_hints
@@ -206,7 +206,7 @@ class Program:
         short, hidden = _without(kind, self.expert)
         if hidden:
             text, section, parameters = (kind.__doc__ or "").partition("\n\n    Parameters\n")
-            short.__doc__ = f"{text}\n\n    {hidden} more flags are shown by {_HELP_ALL}."
+            short.__doc__ = f"{text.rstrip()}\n\n    {hidden} more flags are shown by {_HELP_ALL}."
             short.__doc__ += section + parameters
         return short
 
@@ -249,7 +249,8 @@ def flags_of(kind: type, prefix: str = "") -> Iterator[str]:
     hints = get_type_hints(kind, include_extras=True)
     for each in fields(kind):
         inner, marks = _parted(hints[each.name])
-        if _is_nested(inner):
+        nested = is_dataclass(inner)
+        if nested:
             inside = prefix if omitted in marks else f"{prefix}{each.name}."
             yield from flags_of(inner, inside)
         else:
@@ -271,10 +272,11 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> tuple[type, i
     for each in fields(kind):
         inner, marks = _parted(hints[each.name])
         default: Any = each.default_factory
+        nested = is_dataclass(inner)
         if each.name in hidden:
             hint: Any = Annotated[hints[each.name], Suppress]
-            count += len(list(flags_of(inner))) if _is_nested(inner) else 1
-        elif _is_nested(inner):
+            count += len(list(flags_of(inner))) if nested else 1
+        elif nested:
             hint, inside = _without(inner, expert)
             count += inside
             default = hint
@@ -282,23 +284,16 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> tuple[type, i
                 hint = Annotated[hint, mark]
         else:
             continue
-        changed.append((each.name, hint, _with_default(each, default)))
+        value: Any = {"default_factory": default}
+        if each.default is not MISSING:
+            value = {"default": each.default}
+        changed.append((each.name, hint, field(**value, kw_only=each.kw_only)))
     if not count:
         return kind, 0
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     return make_dataclass(
         kind.__name__, changed, bases=(kind,), frozen=True, namespace=names
     ), count
-
-
-def _is_nested(kind: Any) -> bool:
-    return is_dataclass(kind)
-
-
-def _with_default(old: Field[Any], factory: Any) -> Any:
-    if old.default is not MISSING:
-        return field(default=old.default, kw_only=old.kw_only)
-    return field(default_factory=factory, kw_only=old.kw_only)
 
 
 def _parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:

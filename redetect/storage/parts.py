@@ -145,22 +145,15 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     """Open a binary stream whose content appears at `path` only once it is complete.
 
     It is written to a hidden file in the same folder, which takes the place of `path` (or, if that
-    is a symbolic link, of its target) in one step when the block ends, and is removed when the
-    block raises.
-
-    Parameters
-    ----------
-    path : path
-    overwrite : bool
-        Whether an existing file may be replaced.
+    is a symbolic link, of its target) in one step when the block ends, and is removed when it
+    raises.
 
     Raises
     ------
     OutputExistsError
         If `path` exists and `overwrite` is false.
     OSError
-        If `path` is no regular file, its folder cannot be written to, or the disk is full; names
-        `path`.
+        If `path` is no regular file, its folder cannot be written to, or the disk is full.
     """
     path = Path(path)
     demand_place(path, overwrite=overwrite)

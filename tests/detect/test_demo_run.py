@@ -12,10 +12,10 @@ import pytest
 from detect.comparison.compare import compare_line_frames, compare_runs
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.line_settings import LineSettings
-from detect.run import open_run
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
+from detect.sources.opening import open_run
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import read_frames
 

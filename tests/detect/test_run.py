@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from camera import Camera, CameraError
 from detect.errors import DetectError, FrameError
-from detect.run import open_run, read_image
+from detect.run import read_image
 from detect.sources.interface import RunFrame
+from detect.sources.opening import open_run
 from redetect.landmarks import LandmarkFileError, Step
 
 ZEROS = (0.0,) * 9
@@ -99,7 +100,7 @@ def test_white_space_in_names_does_not_break_rows(run_folder: Path) -> None:
 def test_names_that_are_no_words_of_a_row_cost_no_run(run_folder: Path) -> None:
     touch(run_folder, "#1.png", "a#2.png", "b\\.png", "c\\d.png")
     run = open_run(run_folder)
-    assert [frame.step.prefix for frame in run.frames] == ["_1", "a#2", "b_", "c\\d"]
+    assert [frame.step.prefix for frame in run.frames] == ["_1", "a_2", "b_", "c_d"]
     assert [frame.failure for frame in run.frames] == [None] * 4
 
 
@@ -158,10 +159,11 @@ def test_malformed_step_is_named_by_file_and_line(run_folder: Path) -> None:
 
 def test_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for path in (tmp_path / "nowhere", tmp_path / "file"):
-        with pytest.raises(DetectError, match="expected a run folder or a folder of images") as e:
-            open_run(path)
-        assert str(e.value).startswith(f"{path}: ")
+    with pytest.raises(DetectError, match=r"expected a run folder, a folder of images") as e:
+        open_run(tmp_path / "nowhere")
+    assert "nowhere" in str(e.value)
+    with pytest.raises(DetectError, match=r"file: no video .*: expected a run folder, images"):
+        open_run(tmp_path / "file")
 
 
 def test_no_images(run_folder: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from camera import read_camera
 from detect.cli import main
-from detect.view_command import summed_steps
+from detect.seen import summed_steps
 from redetect.landmarks import Step, read_frames
 from tests.detect.recordings import write_video
 from tests.detect.test_cli import assert_refused

@@ -18,7 +18,8 @@ from redetect.landmarks import Frame, MarkerCorner, MarkerLandmark, write_frames
 def test_the_demo_sessions_poses_are_true(project_root: Path, tmp_path: Path) -> None:
     from detect.markers.detect import detect_markers
     from detect.markers.settings import MarkerSettings
-    from detect.run import open_run, read_image
+    from detect.run import read_image
+    from detect.sources.opening import open_run
 
     session = tmp_path / "m"
     shutil.copytree(project_root / "images" / "m", session)

@@ -13,7 +13,8 @@ from pathlib import Path
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from detect.run import Run, open_run
+from detect.run import Run
+from detect.sources.opening import open_run
 from redetect.storage import OutputExistsError, write_whole
 from redetect.storage.command_line import exit_code_of
 from tools.benchmark import functions as f

@@ -16,10 +16,10 @@ from tyro.conf import Positional
 from detect.comparison.compare import compare_runs
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.run import open_run
 from detect.runs.plan import FramePlan, Job, Known
 from detect.runs.stream import detect_run
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import FrameTilt, read_tilts
 from tools.evaluation.tables import Table

@@ -20,9 +20,10 @@ from detect.circles import detect_circles, disc_shape
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
-from detect.run import open_run, read_image
+from detect.run import read_image
 from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from redetect.landmarks import read_frames

@@ -268,7 +268,11 @@ class TrainRimNetwork:
             print(line)
         networks = train_all(glances, looks, self.seed)
         self.output.parent.mkdir(parents=True, exist_ok=True)
-        weights: dict[str, Any] = networks.by_name()
+        weights: dict[str, Any] = {
+            f"{sort}_{name}": values
+            for sort, network in networks._asdict().items()
+            for name, values in network._asdict().items()
+        }
         with write_whole(self.output, overwrite=self.force) as stream:
             np.savez(stream, **weights)
         print(f"{self.output}: {sum(array.size for array in weights.values())} weights")

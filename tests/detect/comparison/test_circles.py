@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.compare import Beside, compare_frames, compare_runs
-from detect.comparison.report import format_json
+from detect.comparison.compare import compare_frames, compare_runs
 from detect.comparison.result import DiscComparison, unmet_demands
 from detect.errors import CompareError
 from detect.sources.image_files import image_name
@@ -68,7 +67,7 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
         frame("e.0000", *DETECTED[0].circles, disc(1.5, 1.5, 0.5)),
         frame("e.0001", *DETECTED[1].circles, disc(-0.6, 1.92, 0.9)),
     ]
-    found = compare_frames(REFERENCE, detected, STANDARD, beside=Beside(unlisted, lookalikes))
+    found = compare_frames(REFERENCE, detected, STANDARD, unlisted=unlisted, lookalikes=lookalikes)
     assert (found.matched, found.missed, found.extra) == (4, 1, 2)
     assert (found.set_aside, found.on_lookalikes) == (1, 1)
     assert found.precision == pytest.approx(4 / 6)
@@ -87,7 +86,7 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
 def test_a_reference_row_comes_before_an_unlisted_one() -> None:
     """An unlisted disc beside a listed one must not take its row."""
     unlisted = (frame("e.0000", disc(0.03, 1.04, 1.0)),)
-    found = compare_frames(REFERENCE, DETECTED, STANDARD, beside=Beside(unlisted))
+    found = compare_frames(REFERENCE, DETECTED, STANDARD, unlisted=unlisted)
     assert (found.matched, found.set_aside) == (4, 0)
 
 
@@ -296,7 +295,7 @@ def test_no_matches_give_clear_results(
     assert found.normalised_error.per_dof is None
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
-    assert json.loads(format_json(found))["error_95_m"] is None
+    assert json.loads(found.to_json())["error_95_m"] is None
     assert "position error     median - m, 95 % - m" in format_text(found)
 
 
@@ -314,8 +313,8 @@ def test_demands_are_met_or_named() -> None:
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
-    found = json.loads(format_json(compare(REFERENCE, DETECTED)))
-    empty = json.loads(format_json(compare([], [])))
+    found = json.loads(compare(REFERENCE, DETECTED).to_json())
+    empty = json.loads(compare([], []).to_json())
     assert list(found) == list(empty)
     assert found["matched"] == 4
     assert found["missed"] == found["extra"] == 1
@@ -401,7 +400,7 @@ def test_rows_are_accounted_for_whatever_they_are(
     assert found.detected + found.set_aside == len(detected)
     assert 0 <= found.matched <= min(found.reference, found.detected)
     assert sum(part.reference for part in found.bins) == found.reference
-    json.loads(format_json(found))
+    json.loads(found.to_json())
 
 
 def test_the_shipped_file_agrees_with_itself(shared_data: Path) -> None:

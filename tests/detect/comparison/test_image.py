@@ -15,7 +15,6 @@ from camera import Camera
 from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.compare import compare_frames
-from detect.comparison.report import format_json
 from detect.comparison.result import DiscComparison
 from detect.levelling import levelled
 from detect.seen import Sight, image_positions, level_seen
@@ -144,7 +143,7 @@ def test_a_lean_is_a_difference_on_the_floor_not_missed_rows(published_camera: C
     assert "detected rows are levelled in all frames (medians: pitch -2.30, roll 0.70" in " ".join(
         text.split()
     )
-    told = json.loads(format_json(found))
+    told = json.loads(found.to_json())
     assert told["lean"]["pitch_deg"] == lean.pitch_deg
     assert told["pairs"] == found.matched
 
@@ -207,7 +206,7 @@ def test_few_rows_tell_no_lean(published_camera: Camera) -> None:
     assert compare(published_camera, [frame(0, xy)], [frame(0, xy)]).lean is None
     nothing = compare(published_camera, [frame(0, xy)], [frame(0, xy[:0])])
     assert (nothing.matched, nothing.lean) == (0, None)
-    json.loads(format_json(nothing))
+    json.loads(nothing.to_json())
 
 
 def test_without_a_calibration_the_floor_is_compared(

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 
 from detect.cli import main
 from detect.comparison.compare import compare_line_frames
-from detect.comparison.report import format_json
 from detect.comparison.result import LineComparison, unmet_demands
 from detect.errors import CompareError
 from detect.viewing_options import CompareOptions
@@ -285,7 +284,7 @@ def test_no_matches_give_clear_results(
     assert (found.matched, found.joined) == (0, 0)
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
-    figures = json.loads(format_json(found))
+    figures = json.loads(found.to_json())
     for name in ("bearing_median_deg", "bearing_95_deg", "ends_median", "beta_median_deg"):
         assert figures[name] is None
     assert "median - deg, 95 % - deg" in format_text(found)
@@ -301,8 +300,8 @@ def test_demands_are_met_or_named() -> None:
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
-    found = json.loads(format_json(compare(REFERENCE, DETECTED)))
-    assert list(found) == list(json.loads(format_json(compare([], []))))
+    found = json.loads(compare(REFERENCE, DETECTED).to_json())
+    assert list(found) == list(json.loads(compare([], []).to_json()))
     assert (found["matched"], found["joined"], found["found"]) == (4, 0, 4)
     assert (found["missed"], found["extra"], found["frames"]) == (1, 1, 2)
     assert found["recall"] == pytest.approx(0.8)
@@ -367,10 +366,10 @@ def test_the_order_of_rows_does_not_matter(
     options: CompareOptions,
     random: Random,
 ) -> None:
-    expected = format_json(compare_rows(reference, detected, options))
+    expected = compare_rows(reference, detected, options).to_json()
     random.shuffle(reference)
     random.shuffle(detected)
-    assert format_json(compare_rows(reference, detected, options)) == expected
+    assert compare_rows(reference, detected, options).to_json() == expected
 
 
 @given(LINES, LINES, OPTIONS, st.floats(-pi, pi))
@@ -387,7 +386,7 @@ def test_rows_are_accounted_for_whatever_they_are(
     assert 0 <= found.matched <= min(found.reference, found.detected)
     assert 0 <= found.missed <= found.reference - found.matched
     assert found.joined == 0 or found.matched > 0
-    json.loads(format_json(found))
+    json.loads(found.to_json())
     # Turning the robot changes no difference, so none larger than the widest gate appears.
     turned = [
         [replace(r, alpha=r.alpha + turn_rad) for r in rows] for rows in (reference, detected)

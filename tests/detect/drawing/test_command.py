@@ -14,9 +14,9 @@ from detect.cli import main
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, read_head, select_frames
 from detect.errors import DetectError
-from detect.run import open_images
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
+from detect.sources.opening import open_source
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
@@ -172,7 +172,7 @@ def _circle(points: int) -> FloatArray:
 def test_frames_are_selected(
     small_run: Path, wanted: list[str], every: int, expected: list[int]
 ) -> None:
-    frames = open_images(small_run).frames
+    frames = open_source(small_run).frames
     count, selection = select_frames(frames, wanted, every)
     assert [position for position, _ in selection] == expected
     assert count == len(expected)
@@ -192,7 +192,7 @@ def test_frames_that_are_none_are_refused(
     small_run: Path, wanted: list[str], every: int, says: str
 ) -> None:
     with pytest.raises(DetectError, match=says):
-        select_frames(open_images(small_run).frames, wanted, every)
+        select_frames(open_source(small_run).frames, wanted, every)
 
 
 # -- the command ------------------------------------------------------------------------------

@@ -11,9 +11,10 @@ import pytest
 from camera import Camera, write_camera
 from detect.cli import main
 from detect.markers.settings import MarkerSettings
-from detect.run import Run, open_images
+from detect.run import Run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
+from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
@@ -87,9 +88,9 @@ def test_a_calibration_of_another_size_costs_its_frames(folder: Path) -> None:
 
 def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
     camera = Camera(220, 120, 200.0, 200.0, 109.5, 59.5, (0.0, 0.0, 0.0, 0.0, 0.0), POSE)
-    assert not isinstance(open_images(folder), Run)
+    assert not isinstance(open_source(folder), Run)
     write_camera(camera, folder / "run.cam")
-    run = open_images(folder)
+    run = open_source(folder)
     assert isinstance(run, Run)
     assert run.camera == camera
     plan = FramePlan(run.camera, markers=MarkerSettings())

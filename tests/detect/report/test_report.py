@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.comparison.compare import Beside, compare_frames, compare_line_frames, compare_runs
+from detect.comparison.compare import compare_frames, compare_line_frames, compare_runs
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
@@ -89,7 +89,7 @@ def test_rows_set_aside_are_not_kept() -> None:
     """At the least threshold, the rates are those of the comparison."""
     discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
     unlisted = (Frame(Step("e.0", *[0.0] * 9), (disc(1.0, -2.0),)),)
-    result = compare_frames(frames(discs, 0), frames(discs, 1), GATE, beside=Beside(unlisted))
+    result = compare_frames(frames(discs, 0), frames(discs, 1), GATE, unlisted=unlisted)
     curve = disc_rates(result, [0.4, 0.7])
     assert curve.kept.tolist() == [1, 0]
     np.testing.assert_allclose(curve.precision, [1.0, np.nan])

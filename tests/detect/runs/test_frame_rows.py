@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from detect.run import open_run
 from detect.runs import frame as rows_module
 from detect.runs.frame import FrameDetections, detect_batch, rows_of_frames
 from detect.runs.journal import Journal, task_digest
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, KnownOfFrame
 from detect.settings import PUBLISHED
 from detect.sources.interface import RunFrame
+from detect.sources.opening import open_run
 from redetect.landmarks import FrameTilt
 from redetect.storage.parts import left_part, new_part
 

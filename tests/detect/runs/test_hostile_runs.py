@@ -13,7 +13,8 @@ import pytest
 from camera import Camera
 from detect.cli import main
 from detect.errors import FrameError
-from detect.run import open_run, read_image
+from detect.run import read_image
+from detect.sources.opening import open_run
 from redetect.landmarks import read_frames
 
 STEP = "STEP {} 0 0 0 1e-6 0 1e-6 0 0 1e-6\n"

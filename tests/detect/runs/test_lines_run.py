@@ -13,9 +13,9 @@ import pytest
 from camera import write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
-from detect.run import open_run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
+from detect.sources.opening import open_run
 from detect.verticals.detections import carry_ids
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.line_scene import pinhole

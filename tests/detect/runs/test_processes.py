@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from detect.run import open_run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 from lut import TableError
 
 

@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from detect.line_settings import LineSettings
-from detect.run import open_run
 from detect.runs.plan import KEPT_FAILURES, FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from detect.sources.interface import Frames, RunFrame
+from detect.sources.opening import open_run
 from redetect.landmarks import read_frames, read_tilts
 
 LIGHT = CircleSettings(polarity="light")

@@ -23,7 +23,6 @@ import pytest
 from detect.cli import main
 from detect.errors import WorkerError
 from detect.line_settings import LineSettings
-from detect.run import open_run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.runs.workers import (
@@ -34,6 +33,7 @@ from detect.runs.workers import (
     local_workers,
 )
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48

@@ -21,7 +21,7 @@ from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.run import Run
 from detect.sources.bag import pose_in_dataset, rotation_of
-from detect.sources.opening import open_calibrated, open_source
+from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said
 
@@ -84,7 +84,7 @@ def test_a_bag_that_needs_nothing_else(
     expected, found = tmp_path / "expected.circles", tmp_path / "found.circles"
     assert main(["circles", str(small_run), "-o", str(expected)]) == 0
     assert main(["circles", str(path), "-o", str(found)]) == 0
-    camera = open_calibrated(path).camera
+    camera = open_run(path).camera
     np.testing.assert_allclose(
         camera.robot_from_camera, published_camera.robot_from_camera, atol=1e-4
     )
@@ -107,10 +107,10 @@ def test_without_a_pose_only_markers(
     path = ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
     told = r"no static transforms lead from 'base_footprint' to 'front_optical': name a \.cam file"
     with pytest.raises(DetectError, match=told):
-        open_calibrated(path)
+        open_run(path)
     assert isinstance(open_source(path), Run)
-    assert isinstance(open_calibrated(path, small_run / "s.cam"), Run)
-    named = open_calibrated(path, None, SourceOptions(base_frame="map"))
+    assert isinstance(open_run(path, small_run / "s.cam"), Run)
+    named = open_run(path, None, SourceOptions(base_frame="map"))
     np.testing.assert_allclose(
         named.camera.robot_from_camera, published_camera.robot_from_camera, atol=1e-4
     )
@@ -126,7 +126,7 @@ def test_camera_infos_that_say_nothing_or_too_little(
     )
     assert not isinstance(open_source(path), Run)
     with pytest.raises(DetectError, match=r"no calibration: expected a \.cam file beside"):
-        open_calibrated(path)
+        open_run(path)
     for name, changed in (("binned", {"binning_x": 2}), ("cut", {"roi_width": 100})):
         said = [Said("/front/camera_info", 1.0, info(ros, foreign, **changed))]
         path = ros.write(tmp_path / name, recorded(small_run, ros, said))
@@ -143,9 +143,7 @@ def test_a_decentred_lens_is_taken_over(small_run: Path, tmp_path: Path) -> None
         Said("/tf_static", 1.0, ros.static_transforms(("base_footprint", OPTICAL, np.eye(4)[:3]))),
         Said("/front/camera_info", 1.0, ros.camera_info(768, 288, "plumb_bob", d, k, OPTICAL)),
     ]
-    camera = open_calibrated(
-        ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
-    ).camera
+    camera = open_run(ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))).camera
     assert camera.tangential == pytest.approx((4e-3, -5e-3), abs=1e-4)
     pixels = np.random.default_rng(1).uniform([0, 0], [767, 287], size=(200, 2))
     rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from detect.errors import FrameError
 from detect.sources.image_files import ImageNames, NameIndex
 
-# Short alphabets make names that begin alike; long names are known by their digest.
+# Short alphabets make names that begin alike.
 NAMES = st.lists(
     st.text("ab.0\xff", max_size=6).map(str.encode) | st.binary(min_size=60, max_size=70),
     max_size=30,

@@ -15,7 +15,7 @@ from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.run import Run, read_image
-from detect.sources.opening import open_calibrated, open_source
+from detect.sources.opening import open_run, open_source
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
 from tests.detect.recordings import write_video
@@ -89,7 +89,7 @@ def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) 
 
 
 def test_any_number_of_frames(video: Path) -> None:
-    run = open_calibrated(video, None, SourceOptions(frames=2))
+    run = open_run(video, None, SourceOptions(frames=2))
     assert run.frames.expected == 2
     assert [frame.step.prefix for frame in run.frames] == PREFIXES[:2]
     assert [frame.step.prefix for frame in run.frames] == PREFIXES[:2]  # begun anew
@@ -128,7 +128,7 @@ def test_a_video_of_another_size_is_refused_at_once(tmp_path: Path, small_run: P
     path = write_video(tmp_path / "small.avi", [np.zeros((48, 64), np.uint8)] * 3)
     told = r"is 64x48 px: expected 768x288, the calibration's size: name the calibration"
     with pytest.raises(DetectError, match=told):
-        open_calibrated(path, small_run / "s.cam")
+        open_run(path, small_run / "s.cam")
 
 
 def test_a_video_that_is_cut_off_says_so(video: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -22,10 +22,10 @@ from detect.comparison.compare import compare_runs
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.report.figures import f1_score, knee, pareto_front
-from detect.run import open_run
 from detect.runs.plan import FramePlan
 from detect.runs.workers import Workers, local_workers
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 from detect.tune import (
     Trial,
     combinations,

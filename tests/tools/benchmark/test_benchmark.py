@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from camera import write_camera
-from detect.run import open_run
+from detect.sources.opening import open_run
 from tools.benchmark.__main__ import main, measure_runs
 from tools.benchmark.functions import (
     ALL,

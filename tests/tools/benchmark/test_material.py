@@ -11,8 +11,8 @@ import pytest
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
 from detect.lines import detect_lines
-from detect.run import open_run
 from detect.settings import CircleSettings
+from detect.sources.opening import open_run
 from lut import build_disc_table, build_vertical_table
 from tools.benchmark.material import (
     BenchmarkError,

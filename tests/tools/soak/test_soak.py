@@ -43,7 +43,7 @@ GOOD = SoakResult(
 
 
 def test_a_run_of_any_length(project_root: Path, tmp_path: Path) -> None:
-    from detect.run import open_run
+    from detect.sources.opening import open_run
 
     run = open_run(link_run(project_root / "images" / "e", tmp_path / "s", 200))
     frames = list(run.frames)
