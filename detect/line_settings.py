@@ -46,14 +46,11 @@ class LineSettings:
     start_band_rows: Annotated[int, whole(0)] = 20
     start_spacing_rows: Annotated[int, whole(1)] = 4  #: on every n-th of them.
     gap_rows: Annotated[int, whole(0)] = 6  #: Rows without a point that a track bridges.
-    #: Whether tracks are followed a second time, along the verticals of the estimated tilt.
+    #: Whether tracks expect straight lines; else they follow any curve.
     guided: bool = True
-    #: In the first pass only this many edges are followed, those with the highest responses on the
-    #: horizon, if they determine the tilt beyond doubt; 0: all edges, always.
-    first_edges: Annotated[int, whole(0)] = 10
-    #: In the second pass, the share of a point's offset by which the track is corrected.
+    #: The least share of a point's offset by which the place expected next is corrected.
     guided_pull: ShareAbove0 = 0.07
-    guided_reach_px: Positive = 0.75  #: In the second pass, the largest offset of a point.
+    guided_reach_px: Positive = 0.6  #: Largest offset of a point from the place expected.
     #: Steps in which lines are refined on the grey values: width of the Gaussian and largest
     #: displacement of a line by the step; none for the eigen-decomposition of the tracked points
     #: alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
@@ -183,6 +180,9 @@ class LineNumbers(NamedTuple):
         given: dict[str, Any] = {
             "least_points": settings.least_points(row_aspect),
             "joined_equally": settings.joined == "equal",
+            # Any curve, and not only lines.
+            "guided_pull": settings.guided_pull if settings.guided else 1.0,
+            "guided_reach_px": settings.guided_reach_px if settings.guided else 1.0,
             "level": settings.alpha == "level",
         }
         # Compiled code distinguishes 1 from 1.0.
@@ -194,16 +194,16 @@ class LineNumbers(NamedTuple):
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).
 PUBLISHED = LineSettings(
-    sigma_across_px=2.05,
-    sigma_along_rows=7.33,
-    regulariser=120.0,
-    threshold=0.0435,
+    sigma_across_px=2.015,
+    sigma_along_rows=7.25,
+    regulariser=116.0,
+    threshold=0.0445,
     border_rows=23,
     start_band_rows=0,
     start_spacing_rows=1,
     guided=False,
     refine_steps_px=(),
-    least_rows=52,
+    least_rows=53,
     least_length_px=0.0,
     least_evidence=0.0,
     least_sharpness=0.0,

@@ -17,9 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineNumbers
-from detect.verticals.refinement import LineFits, StepFilters, fit_lines, fit_points, no_fits
+from detect.verticals.refinement import LineFits, StepFilters, fit_lines
 from detect.verticals.response import FloatArray, Strip
-from detect.verticals.starts import Maxima, StartBand
 from detect.verticals.tilt import (
     TiltEstimate,
     Verticals,
@@ -61,14 +60,6 @@ FATES = (
     BESIDE_A_STRONGER_EDGE,
 ) = range(len(FATES))
 
-#: Least number of maxima of a chain; noise alone gives few as long.
-_CHAIN_LEAST = 6
-#: Largest root-mean-square distance of them from a straight line, pixels.
-_CHAIN_SCATTER_PX = 0.3
-#: How far a chain may lean from the vertical over its length, and the standard deviation of its
-#: lean due to causes other than noise, pixels: more than that of lines, which are refined.
-_CHAIN_LEAN_PX, _CHAIN_BEND_PX = 0.5, 0.125
-
 
 class Judgement(NamedTuple):
     """Lines through tracks, and their fates.
@@ -103,7 +94,8 @@ def fit_and_judge(
     numbers: LineNumbers,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    fits = fit_lines(image, strip, tracks, filters, numbers)
+    least = numbers.least_points, numbers.least_evidence / strip.row_aspect
+    fits = fit_lines(image, strip, tracks, filters, least)
     evidence, fate, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
     tilt, agrees = agree_on_tilt(lines, numbers)
     fate[accepted[~agrees]] = NOT_VERTICAL
@@ -252,61 +244,3 @@ def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
     for k in range(len(edge)):
         lines.variance[k] *= members[edge[k]]
         lines.weight[k] /= members[edge[k]]
-
-
-def tilt_of_chains(
-    strip: Strip, maxima: Maxima, band: StartBand, numbers: LineNumbers
-) -> TiltEstimate | None:
-    """The tilt that most chains of the band's maxima agree with; None where too few do."""
-    numbers = numbers._replace(
-        least_points=_CHAIN_LEAST,
-        least_evidence=0.0,
-        bend_px=_CHAIN_BEND_PX,
-        lean_noise=1.0,
-        largest_lean_px=_CHAIN_LEAN_PX,
-    )
-    tilt, _ = agree_on_tilt(_straight_chains(strip, maxima, band.row, numbers), numbers)
-    return tilt if tilt.lines > 0 else None
-
-
-@njit(cache=True, error_model="numpy")
-def _straight_chains(
-    strip: Strip, maxima: Maxima, rows: NDArray[np.int32], numbers: LineNumbers
-) -> Verticals:
-    """Straight chains, all of which count the same."""
-    tracks = _tracks_of_chains(maxima, rows)
-    fits = no_fits(len(tracks.polarity))
-    straight, count = np.empty(len(tracks.polarity), np.int64), 0
-    chart = np.empty((2, len(tracks.row)))
-    for t in range(len(straight)):
-        fit_points(strip, tracks, t, numbers, chart, fits)
-        if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
-            straight[count] = t
-            count += 1
-    return _weigh(fits, straight[:count], np.full(count, numbers.weight_limit), numbers)
-
-
-@njit(cache=True, error_model="numpy")
-def _tracks_of_chains(maxima: Maxima, rows: NDArray[np.int32]) -> LineTracks:
-    """The long chains; those of a band on which tracks start on some (K, W) rows."""
-    level, column, value, chain = maxima.level, maxima.column, maxima.value, maxima.chain
-    length = np.zeros(len(chain), np.int64)
-    for i in range(len(chain)):
-        length[chain[i]] += 1
-    # A chain has the number of its first maximum.
-    begin, bounds = np.empty(len(chain), np.int64), np.zeros(len(chain) + 1, np.int64)
-    count = points = 0
-    for i in range(len(chain)):
-        if length[i] >= _CHAIN_LEAST:
-            begin[i] = points
-            points += length[i]
-            count += 1
-            bounds[count] = points
-    row, place = np.empty(points, np.int32), np.empty(points)
-    score = np.empty(points, np.float32)
-    for i in range(len(chain)):
-        if length[chain[i]] >= _CHAIN_LEAST:
-            k = begin[chain[i]]
-            begin[chain[i]] += 1
-            row[k], place[k], score[k] = rows[level[i], column[i]], maxima.place[i], abs(value[i])
-    return LineTracks(np.ones(count), bounds[: count + 1], row, place, score)

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers, LineSettings
+from detect.line_settings import LineSettings
 from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, Strip
 from detect.verticals.tracking import LineTracks
 
@@ -167,7 +167,7 @@ class Eigenline(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def no_fits(count: int) -> LineFits:
+def _no_fits(count: int) -> LineFits:
     """Of some tracks none of which has a line yet."""
     line, covariance, sharpness = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
     scatter_px, shift_px, spread = np.empty(count), np.empty(count), np.empty(count)
@@ -191,23 +191,15 @@ def no_fits(count: int) -> LineFits:
 
 
 @njit(cache=True, error_model="numpy")
-def fit_points(
-    strip: Strip, tracks: LineTracks, t: int, numbers: LineNumbers, chart: FloatArray,
+def _fit_points(
+    strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
     fits: LineFits,
 ) -> Eigenline:  # fmt: skip
     """Fit a line to track t by the eigen-decomposition of its points' scatter.
 
-    Parameters
-    ----------
-    strip, tracks
-        The table, the tracks.
-    numbers : LineNumbers
-        Tracks of too few points or too little evidence have no line.
-    chart : (2, N) float64
-        Gets X and Z of the points.
-    fits : LineFits
-        Gets the line; the covariance is that of independent points with the scatter that the track
-        shows.
+    Tracks of fewer points or a lower sum of scores than `least` have none. `chart`, (2, N), gets X
+    and Z of the points, `fits` the line; the covariance is that of independent points with the
+    scatter that the track shows.
     """
     begin, end = tracks.bounds[t], tracks.bounds[t + 1]
     n, row, column, score = end - begin, tracks.row, tracks.column, tracks.score
@@ -218,7 +210,7 @@ def fit_points(
     origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
     pixel = 1.0 / abs(strip.columns_per_rad[origin])
     fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
-    if n < numbers.least_points or total < numbers.least_evidence / strip.row_aspect:
+    if n < least[0] or total < least[1]:
         return Eigenline(np.nan, np.nan, np.nan, np.nan, np.nan)
     x, z = chart[0, :n], chart[1, :n]
     _place_in_chart(strip, row[begin:end], column[begin:end], strip.bearing[origin], x, z)
@@ -237,15 +229,25 @@ def fit_points(
 @njit(cache=True, error_model="numpy")
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers,
+    least: tuple[int, float],
 ) -> LineFits:  # fmt: skip
-    """Fit lines to tracks (`fit_points`), and refine them on the grey values in some steps."""
-    fits = no_fits(len(tracks.polarity))
+    """Fit lines to tracks, and refine them on the grey values in some steps.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    strip, tracks, filters
+        The table, the tracks, the steps.
+    least : int, float
+        Tracks of fewer points or a lower sum of scores have no line.
+    """
+    fits = _no_fits(len(tracks.polarity))
     height = image.shape[0]
     chart, column = np.empty((2, height)), np.empty(height)
     by_a, by_b = np.empty(height), np.empty(height)
     for t in range(len(tracks.polarity)):
-        line = fit_points(strip, tracks, t, numbers, chart, fits)
+        line = _fit_points(strip, tracks, t, least, chart, fits)
         if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):
             continue
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]

@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
 from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, weights_across
+from detect.verticals.tilt import strongest_first
 from lut.verticals import VerticalTable
 
 #: Starts must be on chains if each line crosses at least this many rows of the band.
 _CROSSED = 3
 #: Maxima of a chain on neighbouring rows of the band are closer than this, columns.
 _APART = 1.5
+#: Least number of maxima of a chain where starts must be on chains.
+_LEAST = 2
 
 
 class StartBand(NamedTuple):
@@ -69,34 +72,28 @@ class StartBand(NamedTuple):
     height_px: float
 
 
-class Maxima(NamedTuple):
-    """Maxima of the response along the rows of the band, row by row from the left.
+class LineStarts(NamedTuple):
+    """Chains of maxima of the response, from which tracks start.
 
     Attributes
     ----------
-    level, column : (N,) int32
-        Rows of the band, and columns of the strip.
-    value : (N,) float32
-        Responses there.
-    place : (N,) float64
-        Top of the parabola through the maximum and its neighbours, columns.
-    chain : (N,) int64
-        The first maximum of the chain that each is on.
+    first : (N,) int64
+        The uppermost maximum of each chain, the chain of the highest response first.
+    row : (M,) int64
+        Image row of each maximum.
+    column : (M,) float64
+        Top of the parabola through the maximum and its neighbours, columns of the strip.
+    value : (M,) float32
+        Signed response.
+    below : (M,) int64
+        The next maximum of the chain; -1 for none.
     """
 
-    level: NDArray[np.int32]
-    column: NDArray[np.int32]
+    first: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: FloatArray
     value: SingleArray
-    place: FloatArray
-    chain: NDArray[np.int64]
-
-
-class LineStarts(NamedTuple):
-    """Where tracks start: (N,) rows, columns and signed responses, the strongest first."""
-
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
-    value: SingleArray
+    below: NDArray[np.int64]
 
 
 def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
@@ -239,22 +236,31 @@ def _respond(
         response[c] = value if row[c] >= 0 else np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy")
-def find_maxima(response: SingleArray, threshold: float) -> Maxima:
-    """Maxima of the response along rows parallel to the horizon, and their chains.
+def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
+    """Chains of maxima of the response on the rows of the band.
 
     Parameters
     ----------
     response : (K, W) float32
         See `band_response`.
+    band : StartBand
+        The rows. Where each line crosses several of them, a chain has at least two maxima.
     threshold : float
         Least absolute response.
     """
+    return _chains(response, band.row, threshold, _LEAST if band.chained else 1)
+
+
+@njit(cache=True, error_model="numpy")
+def _chains(
+    response: SingleArray, rows: NDArray[np.int32], threshold: float, least: int
+) -> LineStarts:
     levels, width = response.shape
     size = response.size
-    level, column = np.empty(size, np.int32), np.empty(size, np.int32)
-    value, places, chain = np.empty(size, np.float32), np.empty(size), np.empty(size, np.int64)
-    continued = np.zeros(size, np.bool_)
+    row, column, value = np.empty(size, np.int64), np.empty(size), np.empty(size, np.float32)
+    below = np.empty(size, np.int64)
+    # Of each maximum the first one of its chain, of that one the chain's length and strength.
+    chain, length, strength = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
     n = above = begin = 0
     for k in range(levels):
         # Maxima of the row above are those from `above` to before `begin`.
@@ -269,47 +275,28 @@ def find_maxima(response: SingleArray, threshold: float) -> Maxima:
             if here < 0.0 and not (left > here and right >= here):
                 continue
             place = c + 0.5 * float(left - right) / float(left - here - here + right)
-            level[n], column[n], value[n], places[n], chain[n] = k, c, here, place, n
+            row[n], column[n], value[n], below[n] = rows[k, c], place, here, -1
+            chain[n], length[n], strength[n] = n, 1, abs(here)
             # Each goes on the chain of the nearest one above that none has continued yet.
-            while above < begin and places[above] <= place - 2.0 * _APART:
+            while above < begin and column[above] <= place - 2.0 * _APART:
                 above += 1
             nearest, link = _APART, -1
             other = above
-            while other < begin and places[other] < place + _APART:
-                apart = abs(places[other] - place)
-                if value[other] * here > 0.0 and apart < nearest and not continued[other]:
+            while other < begin and column[other] < place + _APART:
+                apart = abs(column[other] - place)
+                if value[other] * here > 0.0 and apart < nearest and below[other] < 0:
                     nearest, link = apart, other
                 other += 1
             if link >= 0:
-                chain[n] = chain[link]
-                continued[link] = True
+                first = chain[link]
+                chain[n], below[link] = first, n
+                length[first] += 1
+                strength[first] = max(strength[first], strength[n])
             n += 1
-    return Maxima(level[:n], column[:n], value[:n], places[:n], chain[:n])
-
-
-def line_starts(maxima: Maxima, band: StartBand) -> LineStarts:
-    """Maxima on chains, or all of them where lines need not cross several rows of the band."""
-    row, column, value = _starts(maxima, band.row, 2 if band.chained else 1)
-    order = np.argsort(-np.abs(value), kind="stable")
-    return LineStarts(row[order], column[order], value[order])
-
-
-@njit(cache=True, error_model="numpy")
-def _starts(maxima: Maxima, rows: NDArray[np.int32], least: int) -> LineStarts:
-    """Maxima on chains of some length, in the order of the maxima."""
-    size = len(maxima.chain)
-    length = np.zeros(size, np.int64)
-    for i in range(size):
-        length[maxima.chain[i]] += 1
-    row, column, value = (
-        np.empty(size, np.int32),
-        np.empty(size, np.int32),
-        np.empty(size, np.float32),
-    )
-    n = 0
-    for i in range(size):
-        if length[maxima.chain[i]] >= least:
-            column[n], value[n] = maxima.column[i], maxima.value[i]
-            row[n] = rows[maxima.level[i], column[n]]
-            n += 1
-    return LineStarts(row[:n], column[:n], value[:n])
+    first, count = np.empty(n, np.int64), 0
+    for i in range(n):
+        if chain[i] == i and length[i] >= least:
+            first[count], strength[count] = i, strength[i]
+            count += 1
+    order = strongest_first(strength[:count])
+    return LineStarts(first[order], row[:n], column[:n], value[:n], below[:n])

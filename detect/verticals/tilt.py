@@ -153,22 +153,9 @@ def with_error(
     if numbers.stray_share == 0.0:
         return tilt
     place = tilt.pitch_rad, tilt.roll_rad
-    return tilt._replace(covariance=_error_of_tilt(lines, edge, place, numbers, _GRID))
-
-
-@njit(cache=True, error_model="numpy")
-def lean_deviation(pp: float, pr: float, rr: float, sine: FloatArray, cosine: FloatArray) -> float:
-    """Largest standard deviation of the lean of verticals at some bearings.
-
-    It is due to a tilt with some variances and covariance of pitch and roll.
-    """
-    largest = 0.0
-    for s, c in zip(sine, cosine):
-        variance = s * s * pp - 2.0 * s * c * pr + c * c * rr
-        # NaN where there is no vertical.
-        if variance > largest:
-            largest = variance
-    return math.sqrt(largest)
+    prior = math.radians(numbers.tilt_prior_deg)
+    error = _error_of_tilt(lines, edge, place, prior, numbers.stray_share, _GRID)
+    return tilt._replace(covariance=error)
 
 
 @njit(cache=True, error_model="numpy")
@@ -362,11 +349,11 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def _error_of_tilt(
-    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], numbers: LineNumbers,
-    grid: FloatArray,
+    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], prior: float,
+    stray_share: float, grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
-    count, stray_share, prior = len(edge), numbers.stray_share, math.radians(numbers.tilt_prior_deg)
+    count = len(edge)
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])

@@ -9,10 +9,10 @@ from detect.line_settings import LineNumbers, LineSettings
 from detect.verticals import starts
 from detect.verticals.judgement import Judgement, fit_and_judge
 from detect.verticals.refinement import step_filters
-from detect.verticals.response import StripResponse, line_filter, strip_of, strip_response
-from detect.verticals.starts import LineStarts, StartBand, band_response, find_maxima, start_band
-from detect.verticals.tilt import TiltEstimate, with_error
-from detect.verticals.tracking import ALL_EDGES, LineTracks, follow_edges
+from detect.verticals.response import line_filter, strip_of
+from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
+from detect.verticals.tilt import with_error
+from detect.verticals.tracking import LineTracks, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -27,31 +27,17 @@ def start_response(
 def line_starts(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> LineStarts:
-    """Maxima of the response on the horizon and on rows near it, the highest first."""
+    """Chains of maxima of the response on the horizon and on rows near it, the highest first."""
     response, band = start_response(image, table, settings)
-    return starts.line_starts(find_maxima(response, settings.threshold), band)
-
-
-def response_to(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
-) -> StripResponse:
-    """The response to an image, of which nothing is evaluated yet."""
-    return strip_response(image, strip_of(table), line_filter(settings))
+    return starts.line_starts(response, band, settings.threshold)
 
 
 def line_tracks(
-    image: NDArray[np.uint8] | StripResponse,
-    starts: LineStarts,
-    table: VerticalTable,
-    settings: LineSettings,
-    tilt: TiltEstimate | None = None,
-    enough: int = ALL_EDGES,
+    image: NDArray[np.uint8], starts: LineStarts, table: VerticalTable, settings: LineSettings
 ) -> LineTracks:
-    """Edges followed from starts: along the verticals of a tilt, or in any direction."""
-    response = image if isinstance(image, StripResponse) else response_to(image, table, settings)
-    expected = None if tilt is None else (float(tilt.pitch_rad), float(tilt.roll_rad))
+    """Edges followed from starts."""
     numbers = LineNumbers.of(settings, table.row_aspect)
-    return follow_edges(response, strip_of(table), starts, numbers, expected, enough)
+    return follow_edges(image, strip_of(table), line_filter(settings), starts, numbers)
 
 
 def judge_tracks(
