@@ -137,15 +137,20 @@ class LineSettings:
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
 
 
-class LineNumbers(NamedTuple):
-    """What compiled code reads of settings, for rows of some height; see `LineSettings`."""
+class TrackingNumbers(NamedTuple):
+    """What tracking reads of settings; see `LineSettings`."""
 
-    least_points: int
     threshold: float
     border_rows: int
     gap_rows: int
     guided_pull: float
     guided_reach_px: float
+
+
+class JudgementNumbers(NamedTuple):
+    """What the judgement of tracks by themselves reads of settings, for rows of some height."""
+
+    least_points: int
     least_evidence: float
     least_sharpness: float
     soft_evidence: float
@@ -155,16 +160,28 @@ class LineNumbers(NamedTuple):
     largest_noise_px: float
     bend_px: float
     lean_noise: float
+    building_deg: float
     largest_lean_deg: float
     largest_lean_sigmas: float
     largest_lean_px: float
+    weight_limit: float
+    same_edge_px: float
+
+
+class TiltNumbers(NamedTuple):
+    """What the consensus about the tilt reads of settings."""
+
     largest_tilt_deg: float
     tilt_prior_deg: float
-    building_deg: float
     proposers: int
     least_lines: int
     stray_share: float
-    weight_limit: float
+
+
+class JoiningNumbers(NamedTuple):
+    """What joining reads of settings."""
+
+    building_deg: float
     same_edge_px: float
     join_px: float
     join_share: float
@@ -174,22 +191,33 @@ class LineNumbers(NamedTuple):
     sigma_px: float
     level: bool
 
+
+class LineNumbers(NamedTuple):
+    """What compiled code reads of settings, stage by stage: a field takes time at each call."""
+
+    tracking: TrackingNumbers
+    judgement: JudgementNumbers
+    tilt: TiltNumbers
+    joining: JoiningNumbers
+
     @classmethod
     def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
         """Those of some settings, for rows of some height in widths of a pixel."""
         given: dict[str, Any] = {
+            **vars(settings),
             "least_points": settings.least_points(row_aspect),
             "joined_equally": settings.joined == "equal",
-            # Any curve, and not only lines.
-            "guided_pull": settings.guided_pull if settings.guided else 1.0,
-            "guided_reach_px": settings.guided_reach_px if settings.guided else 1.0,
             "level": settings.alpha == "level",
         }
-        # Compiled code distinguishes 1 from 1.0.
-        for name, kind in get_type_hints(cls).items():
-            if name not in given:
-                given[name] = kind(getattr(settings, name))
-        return cls(**given)
+        if not settings.guided:
+            # Any curve, and not only lines.
+            given |= {"guided_pull": 1.0, "guided_reach_px": 1.0}
+        stages = (
+            # Compiled code distinguishes 1 from 1.0.
+            stage(**{name: kind(given[name]) for name, kind in get_type_hints(stage).items()})
+            for stage in get_type_hints(cls).values()
+        )
+        return cls(*stages)
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).

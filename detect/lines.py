@@ -6,6 +6,7 @@ The path of an image, each step a function of its own:
     tracks          the edges through them, followed up and down
     fits            straight lines, refined on the grey values
     consensus       the tilt that most of them agree with; the others are no verticals
+    again           tracks that are no lines, but might be, along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
 If all edges are blurred, everything is repeated with filters as wide as the blur
@@ -30,7 +31,7 @@ from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
 from detect.verticals.tilt import with_error
-from detect.verticals.tracking import follow_edges
+from detect.verticals.tracking import follow_again, follow_edges
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
@@ -94,13 +95,19 @@ def detect_lines(
     strip, numbers = tools.strip, tools.numbers
     response = band_response(image, tools.band, settings.regulariser)
     starts = line_starts(response, tools.band, settings.threshold)
-    tracks = follow_edges(image, strip, tools.window, starts, numbers)
+    tracks = follow_edges(image, strip, tools.window, starts, numbers.tracking)
     judged = fit_and_judge(image, strip, tracks, tools.steps, numbers)
     sharpness = median_sharpness(judged.fits)
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
+    if settings.guided and judged.tilt is not None and judged.doubtful.any():
+        tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
+        tracks = follow_again(
+            image, strip, tools.window, starts, numbers.tracking, tracks, judged.doubtful, tilt
+        )
+        judged = fit_and_judge(image, strip, tracks, tools.steps, numbers, judged)
     if judged.tilt is not None:
-        tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
-        judged = judged._replace(tilt=tilt)
-    lines = lines_of_tracks(strip, tracks, judged, numbers)
+        error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
+        judged = judged._replace(tilt=error)
+    lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
     return LineDetections(lines, tracks, judged, sharpness)

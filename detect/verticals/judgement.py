@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers
-from detect.verticals.refinement import LineFits, StepFilters, fit_lines
+from detect.line_settings import JudgementNumbers, LineNumbers
+from detect.verticals.refinement import NO_FITS, LineFits, StepFilters, fit_lines
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.tilt import (
     TiltEstimate,
@@ -60,6 +60,10 @@ FATES = (
     BESIDE_A_STRONGER_EDGE,
 ) = range(len(FATES))
 
+#: Tracks with at least this part of the least evidence might have more if followed otherwise.
+_NEARLY = 0.7
+_NONE = np.empty(0, np.bool_)
+
 
 class Judgement(NamedTuple):
     """Lines through tracks, and their fates.
@@ -73,6 +77,8 @@ class Judgement(NamedTuple):
         sharpness.
     fate : (T,) int8
         Places in `FATES`; lines that disagree with the tilt are "not vertical".
+    doubtful : (T,) bool
+        Tracks that are no lines, but may have gone on beyond the edge's end or lost it early.
     tilt : TiltEstimate or None
         That most lines agree with; None where too few do. Its covariance is that of least squares.
     verticals : Verticals
@@ -84,6 +90,7 @@ class Judgement(NamedTuple):
     fits: LineFits
     evidence: FloatArray
     fate: NDArray[np.int8]
+    doubtful: NDArray[np.bool_]
     tilt: TiltEstimate | None
     verticals: Verticals
     edge: NDArray[np.int64]
@@ -91,15 +98,23 @@ class Judgement(NamedTuple):
 
 def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers,
+    numbers: LineNumbers, before: Judgement | None = None,
 ) -> Judgement:  # fmt: skip
-    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    least = numbers.least_points, numbers.least_evidence / strip.row_aspect
-    fits = fit_lines(image, strip, tracks, filters, least)
-    evidence, fate, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
-    tilt, agrees = agree_on_tilt(lines, numbers)
+    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
+
+    Of tracks of which only those were followed again that had been doubtful before, only these are
+    fitted.
+    """
+    own = numbers.judgement
+    least = own.least_points, own.least_evidence / strip.row_aspect
+    known, again = (before.fits, before.doubtful) if before is not None else (NO_FITS, _NONE)
+    fits = fit_lines(image, strip, tracks, filters, least, known, again)
+    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
+    tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = NOT_VERTICAL
-    return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
+    return Judgement(
+        fits, evidence, fate, doubtful, tilt if tilt.lines > 0 else None, lines, edge
+    )  # fmt: skip
 
 
 # Kernels that are launched one after the other compile faster than one in another.
@@ -107,13 +122,20 @@ def fit_and_judge(
 
 @njit(cache=True, error_model="numpy")
 def _judge(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers
-) -> tuple[FloatArray, NDArray[np.int8], NDArray[np.int64], Verticals, NDArray[np.int64]]:
-    """Evidence and fates of tracks by themselves; which are accepted; their planes and edges."""
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
+) -> tuple[
+    FloatArray, NDArray[np.int8], NDArray[np.bool_], NDArray[np.int64], Verticals, NDArray[np.int64]
+]:  # fmt: skip
+    """Evidence and fates of tracks by themselves, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
-    evidence, fate = np.empty(count), np.empty(count, np.int8)
+    evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
     _reject_soft(fits, evidence, _accepted(fate), numbers, fate)
+    for t in range(count):
+        if fate[t] == LITTLE_EVIDENCE:
+            doubtful[t] = evidence[t] >= _NEARLY * numbers.least_evidence
+        else:
+            doubtful[t] = fate[t] in (NO_MAXIMUM, OFF_THE_TRACK, NOT_STRAIGHT, UNCERTAIN, SOFT)
     accepted = _accepted(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
@@ -127,13 +149,13 @@ def _judge(
     lines = _weigh(fits, accepted, votes, numbers)
     edge = gather(place, near, own_evidence, polarity)
     share_edges(lines, edge)
-    return evidence, fate, accepted, lines, edge
+    return evidence, fate, doubtful, accepted, lines, edge
 
 
 @njit(cache=True, error_model="numpy")
 def _judge_each(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers, evidence: FloatArray,
-    fate: NDArray[np.int8],
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers,
+    evidence: FloatArray, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Evidence of each track, and whether it can be a vertical, by itself."""
     score = tracks.score
@@ -176,7 +198,7 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
 
 @njit(cache=True, error_model="numpy")
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: LineNumbers,
+    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: JudgementNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint among the accepted ones."""
@@ -206,7 +228,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
 
 @njit(cache=True, error_model="numpy")
 def _weigh(
-    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: LineNumbers
+    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with some votes each."""
     count = len(accepted)

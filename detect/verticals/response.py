@@ -46,7 +46,7 @@ class LineFilter(NamedTuple):
     ----------
     reach : int
         r: the window across the line covers r pixels on either side.
-    mean, covariance : (T,) float32
+    across : (2, T) float32
         Across the line: 2r + 1 weights of sum 1, and the same times h; behind them zeros.
     half_length : int
         s: the window along the line covers s rows on either side.
@@ -57,8 +57,7 @@ class LineFilter(NamedTuple):
     """
 
     reach: int
-    mean: SingleArray
-    covariance: SingleArray
+    across: SingleArray
     half_length: int
     along: SingleArray
     regulariser: np.float32
@@ -133,21 +132,21 @@ def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
 
 def line_filter(settings: LineSettings) -> LineFilter:
     """The filter of some settings."""
-    mean, covariance = weights_across(settings.sigma_across_px)
+    across = weights_across(settings.sigma_across_px)
     along = weights_across(settings.sigma_along_rows)[0]
     return LineFilter(
-        reach=len(mean) // 2,
-        mean=_padded(mean),
-        covariance=_padded(covariance),
+        reach=across.shape[1] // 2,
+        across=padded(across),
         half_length=len(along) // 2,
-        along=_padded(along),
+        along=padded(along),
         regulariser=np.float32(settings.regulariser),
     )
 
 
-def _padded(weights: FloatArray) -> SingleArray:
-    """With zeros behind them up to a number that is summed together."""
-    return np.pad(weights, (0, -len(weights) % _TOGETHER)).astype(np.float32)
+def padded(weights: FloatArray) -> SingleArray:
+    """With zeros behind them (last axis) up to a number that is summed together."""
+    behind = [(0, 0)] * (weights.ndim - 1) + [(0, -weights.shape[-1] % _TOGETHER)]
+    return np.pad(weights, behind).astype(np.float32)
 
 
 def strip_of(table: VerticalTable) -> Strip:
@@ -212,7 +211,7 @@ def _respond_everywhere(
 @njit(cache=True, error_model="numpy")
 def empty_stripe(window: LineFilter) -> Stripe:
     """Room for stripes of a filter."""
-    taps, length = len(window.mean), len(window.along)
+    taps, length = window.across.shape[1], len(window.along)
     columns = -(-(_LEAST_COLUMNS + 2 * window.reach) // _VECTOR) * _VECTOR
     size = STRIPE_ROWS * columns
     return Stripe(
@@ -233,19 +232,16 @@ def respond(image: NDArray[np.uint8], top: int, stripe: Stripe) -> None:
     path, response, window = stripe.path, stripe.response, stripe.window
     reach = window.reach
     columns = response.shape[1]
-    grey, square, mean, mean_square = (
-        stripe.samples[0], stripe.samples[1], stripe.means[0], stripe.means[1]
-    )  # fmt: skip
     left = stripe.middle + reach
-    inside = _sample(image, top - window.half_length, left, path, grey, square)
-    _correlate(grey, window.along, columns, mean[: response.size])
-    _correlate(square, window.along, columns, mean_square[: response.size])
-    _correlate(mean, window.mean, 1, stripe.moments[0])
-    _correlate(mean, window.covariance, 1, stripe.moments[1])
-    _correlate(mean_square, window.mean, 1, stripe.moments[2])
+    inside = _sample(image, top - window.half_length, left, path, stripe.samples)
+    # Loops, since each call is compiled anew.
+    for k in range(2):
+        correlate(stripe.samples[k], window.along, columns, stripe.means[k, : response.size])
+    for k in range(3):
+        correlate(stripe.means[k // 2], window.across[k % 2], 1, stripe.moments[k])
     if not inside:
         _normalise(path, window.along, stripe.moments)
-    _divide(stripe.moments, window.regulariser, response.reshape(-1))
+    divide(stripe.moments, window.regulariser, response.reshape(-1))
     if not inside:
         _leave_out(path[window.half_length :], left, image.shape[1] - 2 * reach - 1, response)
 
@@ -264,10 +260,10 @@ def _leave_out(path: FloatArray, left: int, last: int, response: SingleArray) ->
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _sample(
-    image: NDArray[np.uint8], first_row: int, left: int, path: FloatArray, grey: SingleArray,
-    square: SingleArray,
-) -> bool:  # fmt: skip
+    image: NDArray[np.uint8], first_row: int, left: int, path: FloatArray, samples: SingleArray
+) -> bool:
     """Grey values and their squares along a path; whether all are inside the image."""
+    grey, square = samples[0], samples[1]
     pixels, width = image.reshape(-1), image.shape[1]
     # Behind the rows are as many as the filter has weights.
     columns = 2 * left
@@ -299,7 +295,7 @@ def _sample(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def _correlate(values: SingleArray, weights: SingleArray, stride: int, sums: SingleArray) -> None:
+def correlate(values: SingleArray, weights: SingleArray, stride: int, sums: SingleArray) -> None:
     """Weighted sums of values a stride apart; several at a time, for which one pass suffices."""
     for c in range(len(sums)):
         sums[c] = 0.0
@@ -327,7 +323,8 @@ def _normalise(path: FloatArray, along: SingleArray, moments: SingleArray) -> No
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def _divide(moments: SingleArray, regulariser: np.float32, response: SingleArray) -> None:
+def divide(moments: SingleArray, regulariser: np.float32, response: SingleArray) -> None:
+    """The response by mean, covariance and mean square."""
     mean, cov, mean_square = moments[0], moments[1], moments[2]
     for c in range(len(response)):
         # Rounding can make a vanishing variance negative.

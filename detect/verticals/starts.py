@@ -19,7 +19,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, weights_across
+from detect.verticals.response import (
+    MIDDLE_GREY,
+    FloatArray,
+    SingleArray,
+    correlate,
+    divide,
+    padded,
+    weights_across,
+)
 from detect.verticals.tilt import strongest_first
 from lut.verticals import VerticalTable
 
@@ -47,11 +55,13 @@ class StartBand(NamedTuple):
         ends of the vertical.
     scale : (K, W) float32
         One over the sum of the weights that are on the vertical; 0 where there are none.
-    across : (K, 2, 2r + 1) float32
+    across : (K, 2, T) float32
         The filter's weights across the vertical, for the strip's columns, which are a pixel apart
         on the horizon only.
-    along : (2s + 1,) float32
-        Those along it.
+    along : (L,) float32
+        Those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
+    reach : int
+        r, pixels.
     spacing : int
         See above.
     chained : bool
@@ -67,6 +77,7 @@ class StartBand(NamedTuple):
     scale: SingleArray
     across: SingleArray
     along: SingleArray
+    reach: int
     spacing: int
     chained: bool
     height_px: float
@@ -130,8 +141,9 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         left=np.where(seen, 1.0 - (x - j), 0.0).astype(np.float32),
         right=np.where(seen, x - j, 0.0).astype(np.float32),
         scale=np.divide(1.0, on_it, out=np.zeros_like(on_it), where=on_it > 0.0).astype(np.float32),
-        across=across.astype(np.float32),
-        along=along.astype(np.float32),
+        across=padded(across),
+        along=padded(along),
+        reach=r,
         spacing=spacing,
         chained=steps > 0 and long_enough,
         height_px=2.0 * settings.start_band_rows * table.row_aspect,
@@ -148,9 +160,8 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
     """(K, W) responses on the rows of the band, 0 where tracks may not start."""
     levels, width = band.row.shape
     response = np.zeros((levels, width), np.float32)
-    if width >= band.across.shape[2] and image.size > 1:
-        between = np.empty((len(band.pixel), 2 * width), np.float32)
-        _filter_band(image.reshape(-1), band, np.float32(regulariser), between, response)
+    if width > 2 * band.reach and image.size > 1:
+        _filter_band(image.reshape(-1), band, np.float32(regulariser), response)
     return response
 
 
@@ -159,22 +170,40 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
 
 @njit(cache=True, error_model="numpy")
 def _filter_band(
-    pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, between: SingleArray,
-    response: SingleArray,
-) -> None:  # fmt: skip
-    """`between`, (R, 2 W), gets grey values and their squares; `response` the result."""
+    pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, response: SingleArray
+) -> None:
     levels, width = response.shape
-    taps = band.across.shape[2]
-    inner = slice(taps // 2, width - taps // 2)
+    rows, taps = len(band.pixel), band.across.shape[2]
+    # Grey values and their squares. What weights behind the filter's are multiplied by is finite.
+    between = np.empty((rows + len(band.along), 2 * width), np.float32)
+    means = np.empty(2 * width + taps, np.float32)
+    between[rows:] = means[2 * width :] = np.float32(0.0)
     sides = np.empty((2, width), np.uint8)
-    for k in range(len(between)):
+    for k in range(rows):
         _interpolate(pixels, band.pixel[k], band.left[k], band.right[k], sides, between[k])
-    means = np.empty(2 * width, np.float32)
-    sums = np.empty((3, width - taps + 1), np.float32)
+    inner = slice(band.reach, width - band.reach)
+    moments = np.empty((3, width - 2 * band.reach), np.float32)
     for k in range(levels):
-        _average_along(between[k * band.spacing :], band.along, means)
-        _correlate_across(means, band.scale[k], band.across[k], sums)
-        _respond(sums, regulariser, band.row[k, inner], response[k, inner])
+        above = between[k * band.spacing :].reshape(-1)
+        correlate(above, band.along, 2 * width, means[: 2 * width])
+        for m in range(2):
+            _scale(means[m * width :], band.scale[k])
+        for m in range(3):
+            correlate(means[m // 2 * width :], band.across[k, m % 2], 1, moments[m])
+        divide(moments, regulariser, response[k, inner])
+        _leave_out(band.row[k], response[k])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _scale(means: SingleArray, scale: SingleArray) -> None:
+    for c in range(len(scale)):
+        means[c] *= scale[c]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _leave_out(row: NDArray[np.int32], response: SingleArray) -> None:
+    for c in range(len(response)):
+        response[c] = response[c] if row[c] >= 0 else np.float32(0.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -193,47 +222,6 @@ def _interpolate(
         b = np.float32(on_right[c]) - MIDDLE_GREY
         grey[c] = left[c] * a + right[c] * b
         square[c] = left[c] * (a * a) + right[c] * (b * b)
-
-
-@njit(cache=True, error_model="numpy")
-def _average_along(between: SingleArray, along: SingleArray, means: SingleArray) -> None:
-    means[:] = np.float32(0.0)
-    for k in range(len(along)):
-        row, weight = between[k], along[k]
-        for i in range(len(means)):
-            means[i] += weight * row[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _correlate_across(
-    means: SingleArray, scale: SingleArray, across: SingleArray, sums: SingleArray
-) -> None:
-    """Mean, covariance and mean square in windows across verticals."""
-    mean, cov, square = sums[0], sums[1], sums[2]
-    width = len(scale)
-    for c in range(width):
-        means[c] *= scale[c]
-        means[width + c] *= scale[c]
-    sums[:] = np.float32(0.0)
-    for k in range(across.shape[1]):
-        weight, lever = across[0, k], across[1, k]
-        grey, squares = means[k:], means[width + k :]
-        for c in range(len(mean)):
-            mean[c] += weight * grey[c]
-            cov[c] += lever * grey[c]
-            square[c] += weight * squares[c]
-
-
-@njit(cache=True, error_model="numpy")
-def _respond(
-    sums: SingleArray, regulariser: np.float32, row: NDArray[np.int32], response: SingleArray
-) -> None:
-    mean, cov, square = sums[0], sums[1], sums[2]
-    for c in range(len(response)):
-        # Rounding can make a vanishing variance negative.
-        variance = abs(square[c] - mean[c] * mean[c])
-        value = cov[c] * abs(cov[c]) / (variance + regulariser)
-        response[c] = value if row[c] >= 0 else np.float32(0.0)
 
 
 def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:

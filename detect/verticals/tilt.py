@@ -37,7 +37,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import DEFAULT, LineNumbers, LineSettings
+from detect.line_settings import DEFAULT, LineNumbers, LineSettings, TiltNumbers
 
 FloatArray = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    numbers = LineNumbers.of(settings)
+    numbers = LineNumbers.of(settings).tilt
     tilt, consistent = agree_on_tilt(lines, numbers)
     if tilt.lines == 0:
         return None, consistent
@@ -144,7 +144,7 @@ def consensus(
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: LineNumbers
+    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: TiltNumbers
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
@@ -172,7 +172,7 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 
 
 @njit(cache=True, error_model="numpy")
-def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
+def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
     """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
     pitch, roll = _vote_for_tilt(lines, numbers)
@@ -193,7 +193,7 @@ def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate,
 
 
 @njit(cache=True, error_model="numpy")
-def _vote_for_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[float, float]:
+def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float]:
     """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
     Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its

@@ -12,6 +12,10 @@ down to constants (alpha-beta filter: P. R. Kalata, The Tracking Index, IEEE Tra
 Aerospace and Electronic Systems 20, 1984). So a track needs no tilt to follow leaning verticals,
 and does not leave them where other edges cross. The response is evaluated in stripes along the
 places expected.
+
+Where an edge ends and another one goes on beside it, such a track bends. Once the tilt is known,
+the lean of verticals is, too: tracks that are no lines as they are can be followed again along the
+verticals, where only the place yields, by 1 / n.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers
+from detect.line_settings import TrackingNumbers
 from detect.verticals.response import (
     STRIPE_ROWS,
     FloatArray,
@@ -37,7 +41,9 @@ from detect.verticals.response import (
 from detect.verticals.starts import LineStarts
 
 #: That an edge leans no more than verticals of a tilted camera counts like so many points.
-_UPRIGHT_POINTS = 4
+_UPRIGHT_POINTS = 5
+#: Largest offset of a point from the place expected along verticals of known lean, pixels.
+_VERTICAL_REACH_PX = 1.0
 
 
 class LineTracks(NamedTuple):
@@ -86,6 +92,13 @@ class LineTracks(NamedTuple):
         return np.add.reduceat(self.score, self.bounds[:-1], dtype=np.float64)
 
 
+_NO_TRACKS = LineTracks(
+    np.empty(0), np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32)
+)
+_NONE = np.empty(0, np.bool_)
+_NO_TILT = math.nan, math.nan
+
+
 class _Path(NamedTuple):
     """The path of a stripe from row `first` on.
 
@@ -101,17 +114,20 @@ class _Path(NamedTuple):
 
 
 class _Edge(NamedTuple):
-    """Where an edge is, how it leans (as a path does), and from how many points that is known."""
+    """Where an edge is, how it leans (as a path does), and from how many points that is known.
+
+    The lean of a vertical is known beforehand.
+    """
 
     place: float
     lean: float
     points: int
+    vertical: bool
 
 
-@njit(cache=True, error_model="numpy")
 def follow_edges(
     image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: LineNumbers,
+    numbers: TrackingNumbers,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
@@ -123,23 +139,59 @@ def follow_edges(
         The table, the filter.
     starts : LineStarts
         Where to start, in this order.
-    numbers : LineNumbers
+    numbers : TrackingNumbers
         Threshold, gaps, border, and how a track is guided.
     """
+    return _follow_edges(image, strip, window, starts, numbers, _NO_TRACKS, _NONE, _NO_TILT)
+
+
+def follow_again(
+    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
+    tilt_rad: tuple[float, float],
+) -> LineTracks:  # fmt: skip
+    """Follow some of the tracks again, along the verticals of a tilt; the others come first.
+
+    The starts are all those that are on none of the others.
+    """
+    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
+
+
+@njit(cache=True, error_model="numpy")
+def _follow_edges(
+    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
+    tilt: tuple[float, float],
+) -> LineTracks:  # fmt: skip
+    """`follow_again`; without a tilt (NaN) the leans are found along the way."""
     height, width = image.shape
     lowest, highest = height, -1
     for v in starts.row:
         lowest, highest = min(lowest, v), max(highest, v)
     # Columns that were followed, by polarity, on the rows that have starts.
     followed = np.zeros((2, max(highest - lowest + 1, 0), width), np.bool_)
-    count = len(starts.first)
-    polarity, bounds = np.empty(count), np.zeros(count + 1, np.int64)
-    found_row, found_column = np.empty(count * height, np.int32), np.empty(count * height)
-    found_score = np.empty(count * height, np.float32)
+    most = len(again) + len(starts.first)
+    polarity, bounds = np.empty(most), np.zeros(most + 1, np.int64)
+    most = len(tracks.row) + len(starts.first) * height
+    found_row, found_column = np.empty(most, np.int32), np.empty(most)
+    found_score = np.empty(most, np.float32)
+    count = n = 0
+    for t in range(len(again)):
+        if again[t]:
+            continue
+        marks = followed[0 if tracks.polarity[t] > 0.0 else 1]
+        for i in range(tracks.bounds[t], tracks.bounds[t + 1]):
+            row, place = tracks.row[i], tracks.column[i]
+            found_row[n], found_column[n], found_score[n] = row, place, tracks.score[i]
+            n += 1
+            _mark(marks, row - lowest, place)
+        polarity[count] = tracks.polarity[t]
+        count += 1
+        bounds[count] = n
     stripe = empty_stripe(window)
+    vertical = not math.isnan(tilt[0])
     # Of the edge that is followed, by row; no score where there is no point.
     column, score = np.empty(height), np.zeros(height, np.float32)
-    tracks = n = 0
     for start in starts.first:
         sign = np.float32(1.0) if starts.value[start] > 0.0 else np.float32(-1.0)
         marks = followed[0 if sign > 0.0 else 1]
@@ -149,15 +201,23 @@ def follow_edges(
             if sign * starts.value[k] > sign * starts.value[strongest]:
                 strongest = k
             k, bottom = starts.below[k], k
-        if marks[starts.row[strongest] - lowest, int(starts.column[strongest] + 0.5)]:
+        c = int(starts.column[strongest] + 0.5)
+        if marks[starts.row[strongest] - lowest, c]:
             continue
-        top, bottom = starts.row[start], starts.row[bottom]
-        lean = _take_chain(strip, starts, start, column, score)
-        edge = _Edge(column[top], lean, bottom - top + 1)
+        if vertical:
+            top = bottom = starts.row[strongest]
+            column[top], score[top] = starts.column[strongest], abs(starts.value[strongest])
+            lean = tilt[0] * strip.sine[c] - tilt[1] * strip.cosine[c]
+            edge = _Edge(column[top], lean * strip.columns_per_rad[c], 0, True)
+        else:
+            top, bottom = starts.row[start], starts.row[bottom]
+            lean = _take_chain(strip, starts, start, column, score)
+            edge = _Edge(column[top], lean, bottom - top + 1, False)
         first, last = top, bottom
         for direction in (-1, 1):
             v = top if direction < 0 else bottom
-            edge = _Edge(column[v], edge.lean, edge.points)
+            points = 0 if vertical else edge.points
+            edge = _Edge(column[v], edge.lean, points, vertical)
             end, edge = _follow(
                 image, strip, stripe, numbers, (v, direction, sign), edge, column, score
             )
@@ -167,23 +227,29 @@ def follow_edges(
                 found_row[n], found_column[n], found_score[n] = row, column[row], score[row]
                 score[row] = 0.0
                 n += 1
-                if 0 <= row - lowest < len(marks):
-                    j = math.floor(column[row] + 0.5)
-                    for k in range(max(0, j - 1), min(width, j + 2)):
-                        marks[row - lowest, k] = True
-        polarity[tracks] = sign
-        tracks += 1
-        bounds[tracks] = n
+                _mark(marks, row - lowest, column[row])
+        polarity[count] = sign
+        count += 1
+        bounds[count] = n
     return LineTracks(
-        polarity[:tracks],
-        bounds[: tracks + 1],
+        polarity[:count],
+        bounds[: count + 1],
         found_row[:n].copy(),
         found_column[:n].copy(),
         found_score[:n].copy(),
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
+def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
+    """Mark the columns round a point as followed, if its row has starts."""
+    if 0 <= row < len(marks):
+        j = math.floor(column + 0.5)
+        for k in range(max(0, j - 1), min(marks.shape[1], j + 2)):
+            marks[row, k] = True
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _take_chain(
     strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: SingleArray
 ) -> float:
@@ -211,9 +277,9 @@ def _take_chain(
     return (n * xy - x * y) / (n * xx - x * x) if n >= 3.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def _follow(
-    image: NDArray[np.uint8], strip: Strip, stripe: Stripe, numbers: LineNumbers,
+    image: NDArray[np.uint8], strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
     start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: SingleArray,
 ) -> tuple[int, _Edge]:  # fmt: skip
     """Follow an edge of some polarity from a row on in a direction; the last row as well."""
@@ -224,7 +290,9 @@ def _follow(
     border, max_gap = numbers.border_rows, numbers.gap_rows
     rightmost = response.shape[1] - 2 * stripe.window.reach - 3
     v, direction, sign = start
-    place, lean, points = edge.place, edge.lean, edge.points
+    place, lean, points, vertical = edge
+    if vertical:
+        reach = _VERTICAL_REACH_PX
     path = _Path(height, v, int(place), place, lean)
     end, gap = v, 0
     while gap <= max_gap:
@@ -233,7 +301,10 @@ def _follow(
             break
         climb = rise[path.column, v] - rise[path.column, v - direction]
         place += lean * climb
-        per_column = at[path.column + 1, v] - at[path.column, v]
+        # Beyond the first and the last vertical there is none; nor where this one is not seen.
+        if not 0.0 <= place <= width - 1.0:
+            break
+        per_column = _pixels_per_column(at, path.column, v)
         near, beside = -1, np.float64(0.0)
         if path.first <= v < path.first + STRIPE_ROWS:
             beside = (place - _place_on(path, rise, v)) * per_column
@@ -241,9 +312,9 @@ def _follow(
                 near = middle + math.floor(beside + 0.5)
         if not 2 <= near <= rightmost:
             # The edge leaves the stripe.
-            j = int(place) if 1.5 <= place < width - 2.5 else 0
-            per_column = at[j + 1, v] - at[j, v]
-            if j == 0 or not math.isfinite(per_column):
+            j = int(place)
+            per_column = _pixels_per_column(at, j, v)
+            if not math.isfinite(per_column):
                 break
             path = _Path(v if direction > 0 else v - STRIPE_ROWS + 1, v, j, place, lean)
             for i in range(len(stripe.path)):
@@ -251,7 +322,7 @@ def _follow(
                 stripe.path[i] = np.nan
                 if 0 <= row < height:
                     part = _place_on(path, rise, row) - j
-                    stripe.path[i] = at[j, row] + part * (at[j + 1, row] - at[j, row])
+                    stripe.path[i] = at[j, row] + part * _pixels_per_column(at, j, row)
             respond(image, path.first, stripe)
             near, beside = middle, np.float64(0.0)
         # Once to the side if the highest of the three is not the one in the middle.
@@ -263,29 +334,42 @@ def _follow(
         bend = left - here - here + right
         # The top of the parabola through the three.
         off += 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-        if here >= threshold and here >= left and here >= right and abs(off) <= reach:
+        # The start of a vertical is known to a column only.
+        expected = abs(off) <= reach or points == 0
+        if here >= threshold and here >= left and here >= right and expected:
             points += 1
             off /= per_column
-            column[v], score[v] = place + off, here
-            place += off * max(pull, (4.0 * points - 2.0) / (points * (points + 1.0)))
-            if pull < 1.0:
-                alike = points + _UPRIGHT_POINTS
-                share = max(pull * pull / (2.0 - pull), 6.0 / (alike * (alike + 1.0)))
-                lean += share * off / climb
+            column[v], score[v] = min(max(place + off, 0.0), width - 1.0), here
+            share = 1.0 / points
+            if not vertical:
+                share *= (4.0 * points - 2.0) / (points + 1.0)
+                if pull < 1.0:
+                    alike = points + _UPRIGHT_POINTS
+                    turn = max(pull * pull / (2.0 - pull), 6.0 / (alike * (alike + 1.0)))
+                    lean += turn * off / climb
+            place += off * max(pull, share)
             gap = 0
             end = v
         else:
             gap += 1
-    return end, _Edge(place, lean, points)
+    return end, _Edge(place, lean, points, vertical)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", inline="always")
+def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
+    """Distance of verticals in a row, on the side on which there are more of them."""
+    if 2 * j < len(at):
+        return float(at[j + 1, v] - at[j, v])
+    return float(at[j, v] - at[j - 1, v])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _place_on(path: _Path, rise: SingleArray, v: int) -> float:
     """Where a path crosses a row, as a column of the strip."""
     return path.place + path.lean * float(rise[path.column, v] - rise[path.column, path.row])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def _three(
     response: SingleArray, b: int, c: int, sign: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:

@@ -29,7 +29,7 @@ from detect.viewing_options import CompareOptions
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, Step
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
-from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks
+from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks, tracks_again
 from tests.reference.verticals import compensated_bearings, inclinations, plane_normals
 from tools.evaluation.published_lines import compare_printed_lines
 
@@ -264,12 +264,23 @@ def test_the_rows_that_the_report_prints(shared_data: Path) -> None:
 
 
 def test_one_call_goes_the_path_of_the_steps() -> None:
-    """Starts, tracks and judgement, each by itself."""
-    image = scene(tilted(CAMERA, 0.02, -0.01))
+    """Starts, tracks and judgement, and doubtful tracks once more, each by itself."""
+    camera = tilted(CAMERA, 0.02, -0.01)
+    # Edges that are nearly too short and too faint.
+    faint = scene(camera, (*EDGES, Edge(0.22, 13.0), Edge(0.06, 13.0)))
+    image, horizon = scene(camera), int(np.median(TABLE.anchor_row))
+    image[horizon - 16 : horizon + 16] = faint[horizon - 16 : horizon + 16]
     for preset in (DEFAULT, PUBLISHED):
         found = detect_lines(image, TABLE, preset)
-        tracks = line_tracks(image, line_starts(image, TABLE, preset), TABLE, preset)
+        starts = line_starts(image, TABLE, preset)
+        tracks = line_tracks(image, starts, TABLE, preset)
         judged = judge_tracks(image, tracks, TABLE, preset)
+        if preset.guided:
+            assert judged.tilt is not None
+            assert judged.doubtful.any()
+            tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
+            tracks = tracks_again(image, starts, tracks, judged.doubtful, tilt, TABLE, preset)
+            judged = judge_tracks(image, tracks, TABLE, preset, before=judged)
         for name in tracks._fields:
             np.testing.assert_array_equal(getattr(found.tracks, name), getattr(tracks, name))
         for name in found.fits._fields:

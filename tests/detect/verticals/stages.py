@@ -12,7 +12,7 @@ from detect.verticals.refinement import step_filters
 from detect.verticals.response import line_filter, strip_of
 from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
 from detect.verticals.tilt import with_error
-from detect.verticals.tracking import LineTracks, follow_edges
+from detect.verticals.tracking import LineTracks, follow_again, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -36,8 +36,18 @@ def line_tracks(
     image: NDArray[np.uint8], starts: LineStarts, table: VerticalTable, settings: LineSettings
 ) -> LineTracks:
     """Edges followed from starts."""
-    numbers = LineNumbers.of(settings, table.row_aspect)
+    numbers = LineNumbers.of(settings, table.row_aspect).tracking
     return follow_edges(image, strip_of(table), line_filter(settings), starts, numbers)
+
+
+def tracks_again(
+    image: NDArray[np.uint8], starts: LineStarts, tracks: LineTracks, again: NDArray[np.bool_],
+    tilt_rad: tuple[float, float], table: VerticalTable, settings: LineSettings,
+) -> LineTracks:  # fmt: skip
+    """Some of the tracks followed again along the verticals of a tilt."""
+    numbers = LineNumbers.of(settings, table.row_aspect).tracking
+    window, strip = line_filter(settings), strip_of(table)
+    return follow_again(image, strip, window, starts, numbers, tracks, again, tilt_rad)
 
 
 def judge_tracks(
@@ -46,11 +56,13 @@ def judge_tracks(
     table: VerticalTable,
     settings: LineSettings,
     steps: int | None = None,
+    before: Judgement | None = None,
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect)
-    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), numbers)
+    filters = step_filters(settings, steps)
+    judged = fit_and_judge(image, strip_of(table), tracks, filters, numbers, before)
     if judged.tilt is None:
         return judged
-    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
+    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
     return judged._replace(tilt=tilt)

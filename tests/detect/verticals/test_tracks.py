@@ -17,7 +17,12 @@ from detect.verticals.starts import LineStarts, start_band
 from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.stages import line_starts, line_tracks, start_response
+from tests.detect.verticals.stages import (
+    line_starts,
+    line_tracks,
+    start_response,
+    tracks_again,
+)
 
 CAMERA = pinhole(96, 64, 110.0)
 TABLE = build_vertical_table(CAMERA)
@@ -184,6 +189,44 @@ def test_tracks_of_lines_leave_edges_that_bend() -> None:
     )
     assert 40 <= straight.bottom_row[0] <= 52
     assert curved.bottom_row[0] >= 58
+
+
+def test_tracks_are_followed_again_along_verticals() -> None:
+    """Past the row from which it leans, an edge is followed by its own lean, but not by a tilt."""
+    rows, columns = np.mgrid[0:64, 0:96]
+    edge = 60.0 + 0.15 * np.maximum(rows - 42, 0)
+    image = np.where((columns >= 30) & (columns < edge), 160, 60).astype(np.uint8)
+    starts = line_starts(image, TABLE, DEFAULT)
+    tracks = line_tracks(image, starts, TABLE, DEFAULT)
+    np.testing.assert_array_equal(np.sort(tracks.polarity), [-1.0, 1.0])
+    np.testing.assert_array_equal(tracks.bottom_row, 61)
+    leaning = tracks.polarity < 0.0
+    found = tracks_again(image, starts, tracks, leaning, (0.0, 0.0), TABLE, DEFAULT)
+    np.testing.assert_array_equal(found.polarity, [1.0, -1.0])
+    assert 45 <= found.bottom_row[1] <= 57
+    below = slice(found.bounds[1], found.bounds[2])
+    straight = found.row[below] <= 38
+    np.testing.assert_allclose(found.column[below][straight], 59.5, atol=0.1)
+    # The other is kept as it is.
+    (kept,) = np.flatnonzero(~leaning)
+    own = slice(tracks.bounds[kept], tracks.bounds[kept + 1])
+    for name in ("row", "column", "score"):
+        ours, theirs = getattr(found, name)[: found.bounds[1]], getattr(tracks, name)[own]
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_edges_that_come_in_at_the_side_are_followed() -> None:
+    """At the horizon their windows leave the image, farther down they do not."""
+    camera = pinhole(160, 120, 150.0, pitch_deg=15.0)
+    table = build_vertical_table(camera)
+    side = float(np.interp(157.0, np.arange(160), table.bearing_rad))
+    image = render(camera, [Edge(0.1, 80.0), Edge(side, 80.0)], grey=60.0)
+    starts = line_starts(image, table, DEFAULT)
+    tracks = line_tracks(image, starts, table, DEFAULT)
+    again = np.ones(len(tracks.polarity), np.bool_)
+    found = tracks_again(image, starts, tracks, again, (0.0, 0.0), table, DEFAULT)
+    assert len(found.polarity) == 2
+    assert found.points.min() > 90
 
 
 def test_no_horizon_no_tracks() -> None:
