@@ -46,14 +46,11 @@ class LineSettings:
     start_band_rows: Annotated[int, whole(0)] = 20
     start_spacing_rows: Annotated[int, whole(1)] = 4  #: on every n-th of them.
     gap_rows: Annotated[int, whole(0)] = 6  #: Rows without a point that a track bridges.
-    #: Whether tracks are followed a second time, along the verticals of the estimated tilt.
+    #: Whether tracks expect straight lines; else they follow any curve.
     guided: bool = True
-    #: In the first pass only this many edges are followed, those with the highest responses on the
-    #: horizon, if they determine the tilt beyond doubt; 0: all edges, always.
-    first_edges: Annotated[int, whole(0)] = 10
-    #: In the second pass, the share of a point's offset by which the track is corrected.
+    #: The least share of a point's offset by which the place expected next is corrected.
     guided_pull: ShareAbove0 = 0.07
-    guided_reach_px: Positive = 0.75  #: In the second pass, the largest offset of a point.
+    guided_reach_px: Positive = 0.6  #: Largest offset of a point from the place expected.
     #: Steps in which lines are refined on the grey values: width of the Gaussian and largest
     #: displacement of a line by the step; none for the eigen-decomposition of the tracked points
     #: alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
@@ -140,15 +137,20 @@ class LineSettings:
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
 
 
-class LineNumbers(NamedTuple):
-    """What compiled code reads of settings, for rows of some height; see `LineSettings`."""
+class TrackingNumbers(NamedTuple):
+    """What tracking reads of settings; see `LineSettings`."""
 
-    least_points: int
     threshold: float
     border_rows: int
     gap_rows: int
     guided_pull: float
     guided_reach_px: float
+
+
+class JudgementNumbers(NamedTuple):
+    """What the judgement of tracks by themselves reads of settings, for rows of some height."""
+
+    least_points: int
     least_evidence: float
     least_sharpness: float
     soft_evidence: float
@@ -158,16 +160,28 @@ class LineNumbers(NamedTuple):
     largest_noise_px: float
     bend_px: float
     lean_noise: float
+    building_deg: float
     largest_lean_deg: float
     largest_lean_sigmas: float
     largest_lean_px: float
+    weight_limit: float
+    same_edge_px: float
+
+
+class TiltNumbers(NamedTuple):
+    """What the consensus about the tilt reads of settings."""
+
     largest_tilt_deg: float
     tilt_prior_deg: float
-    building_deg: float
     proposers: int
     least_lines: int
     stray_share: float
-    weight_limit: float
+
+
+class JoiningNumbers(NamedTuple):
+    """What joining reads of settings."""
+
+    building_deg: float
     same_edge_px: float
     join_px: float
     join_share: float
@@ -177,33 +191,47 @@ class LineNumbers(NamedTuple):
     sigma_px: float
     level: bool
 
+
+class LineNumbers(NamedTuple):
+    """What compiled code reads of settings, stage by stage: a field takes time at each call."""
+
+    tracking: TrackingNumbers
+    judgement: JudgementNumbers
+    tilt: TiltNumbers
+    joining: JoiningNumbers
+
     @classmethod
     def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
         """Those of some settings, for rows of some height in widths of a pixel."""
         given: dict[str, Any] = {
+            **vars(settings),
             "least_points": settings.least_points(row_aspect),
             "joined_equally": settings.joined == "equal",
             "level": settings.alpha == "level",
         }
-        # Compiled code distinguishes 1 from 1.0.
-        for name, kind in get_type_hints(cls).items():
-            if name not in given:
-                given[name] = kind(getattr(settings, name))
-        return cls(**given)
+        if not settings.guided:
+            # Any curve, and not only lines.
+            given |= {"guided_pull": 1.0, "guided_reach_px": 1.0}
+        stages = (
+            # Compiled code distinguishes 1 from 1.0.
+            stage(**{name: kind(given[name]) for name, kind in get_type_hints(stage).items()})
+            for stage in get_type_hints(cls).values()
+        )
+        return cls(*stages)
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).
 PUBLISHED = LineSettings(
-    sigma_across_px=2.05,
-    sigma_along_rows=7.33,
-    regulariser=120.0,
-    threshold=0.0435,
+    sigma_across_px=2.015,
+    sigma_along_rows=7.25,
+    regulariser=116.0,
+    threshold=0.0445,
     border_rows=23,
     start_band_rows=0,
     start_spacing_rows=1,
     guided=False,
     refine_steps_px=(),
-    least_rows=52,
+    least_rows=53,
     least_length_px=0.0,
     least_evidence=0.0,
     least_sharpness=0.0,

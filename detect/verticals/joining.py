@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers
+from detect.line_settings import JoiningNumbers
 from detect.verticals.judgement import (
     ACCEPTED,
     BESIDE_A_STRONGER_EDGE,
@@ -62,7 +62,7 @@ class Lines(NamedTuple):
 
 
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, numbers: LineNumbers
+    strip: Strip, tracks: LineTracks, judged: Judgement, numbers: JoiningNumbers
 ) -> Lines:
     """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
@@ -74,7 +74,7 @@ def lines_of_tracks(
 @njit(cache=True, error_model="numpy")
 def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
-    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: LineNumbers,
+    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: JoiningNumbers,
 ) -> Lines:  # fmt: skip
     count = 0
     strength, chosen = np.empty(len(fate)), np.empty(len(fate), np.int64)
@@ -135,7 +135,7 @@ def _wrapped(angle: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _bearings(
-    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: LineNumbers
+    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: JoiningNumbers
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
@@ -163,7 +163,7 @@ def _bearings(
 @njit(cache=True, error_model="numpy")
 def _leave_out(
     tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
-    evidence: FloatArray, numbers: LineNumbers, fate: NDArray[np.int8],
+    evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast = fits.pixel_rad, fits.contrast

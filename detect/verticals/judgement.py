@@ -16,10 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers
-from detect.verticals.refinement import LineFits, StepFilters, fit_lines, fit_points, no_fits
+from detect.line_settings import JudgementNumbers, LineNumbers
+from detect.verticals.refinement import NO_FITS, LineFits, StepFilters, fit_lines
 from detect.verticals.response import FloatArray, Strip
-from detect.verticals.starts import Maxima, StartBand
 from detect.verticals.tilt import (
     TiltEstimate,
     Verticals,
@@ -61,13 +60,9 @@ FATES = (
     BESIDE_A_STRONGER_EDGE,
 ) = range(len(FATES))
 
-#: Least number of maxima of a chain; noise alone gives few as long.
-_CHAIN_LEAST = 6
-#: Largest root-mean-square distance of them from a straight line, pixels.
-_CHAIN_SCATTER_PX = 0.3
-#: How far a chain may lean from the vertical over its length, and the standard deviation of its
-#: lean due to causes other than noise, pixels: more than that of lines, which are refined.
-_CHAIN_LEAN_PX, _CHAIN_BEND_PX = 0.5, 0.125
+#: Tracks with at least this part of the least evidence might have more if followed otherwise.
+_NEARLY = 0.7
+_NONE = np.empty(0, np.bool_)
 
 
 class Judgement(NamedTuple):
@@ -82,6 +77,8 @@ class Judgement(NamedTuple):
         sharpness.
     fate : (T,) int8
         Places in `FATES`; lines that disagree with the tilt are "not vertical".
+    doubtful : (T,) bool
+        Tracks that are no lines, but may have gone on beyond the edge's end or lost it early.
     tilt : TiltEstimate or None
         That most lines agree with; None where too few do. Its covariance is that of least squares.
     verticals : Verticals
@@ -93,6 +90,7 @@ class Judgement(NamedTuple):
     fits: LineFits
     evidence: FloatArray
     fate: NDArray[np.int8]
+    doubtful: NDArray[np.bool_]
     tilt: TiltEstimate | None
     verticals: Verticals
     edge: NDArray[np.int64]
@@ -100,14 +98,23 @@ class Judgement(NamedTuple):
 
 def fit_and_judge(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers,
+    numbers: LineNumbers, before: Judgement | None = None,
 ) -> Judgement:  # fmt: skip
-    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree."""
-    fits = fit_lines(image, strip, tracks, filters, numbers)
-    evidence, fate, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
-    tilt, agrees = agree_on_tilt(lines, numbers)
+    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
+
+    Of tracks of which only those were followed again that had been doubtful before, only these are
+    fitted.
+    """
+    own = numbers.judgement
+    least = own.least_points, own.least_evidence / strip.row_aspect
+    known, again = (before.fits, before.doubtful) if before is not None else (NO_FITS, _NONE)
+    fits = fit_lines(image, strip, tracks, filters, least, known, again)
+    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
+    tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = NOT_VERTICAL
-    return Judgement(fits, evidence, fate, tilt if tilt.lines > 0 else None, lines, edge)
+    return Judgement(
+        fits, evidence, fate, doubtful, tilt if tilt.lines > 0 else None, lines, edge
+    )  # fmt: skip
 
 
 # Kernels that are launched one after the other compile faster than one in another.
@@ -115,13 +122,20 @@ def fit_and_judge(
 
 @njit(cache=True, error_model="numpy")
 def _judge(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers
-) -> tuple[FloatArray, NDArray[np.int8], NDArray[np.int64], Verticals, NDArray[np.int64]]:
-    """Evidence and fates of tracks by themselves; which are accepted; their planes and edges."""
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
+) -> tuple[
+    FloatArray, NDArray[np.int8], NDArray[np.bool_], NDArray[np.int64], Verticals, NDArray[np.int64]
+]:  # fmt: skip
+    """Evidence and fates of tracks by themselves, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
-    evidence, fate = np.empty(count), np.empty(count, np.int8)
+    evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
     _reject_soft(fits, evidence, _accepted(fate), numbers, fate)
+    for t in range(count):
+        if fate[t] == LITTLE_EVIDENCE:
+            doubtful[t] = evidence[t] >= _NEARLY * numbers.least_evidence
+        else:
+            doubtful[t] = fate[t] in (NO_MAXIMUM, OFF_THE_TRACK, NOT_STRAIGHT, UNCERTAIN, SOFT)
     accepted = _accepted(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
@@ -135,13 +149,13 @@ def _judge(
     lines = _weigh(fits, accepted, votes, numbers)
     edge = gather(place, near, own_evidence, polarity)
     share_edges(lines, edge)
-    return evidence, fate, accepted, lines, edge
+    return evidence, fate, doubtful, accepted, lines, edge
 
 
 @njit(cache=True, error_model="numpy")
 def _judge_each(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers, evidence: FloatArray,
-    fate: NDArray[np.int8],
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers,
+    evidence: FloatArray, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Evidence of each track, and whether it can be a vertical, by itself."""
     score = tracks.score
@@ -184,7 +198,7 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
 
 @njit(cache=True, error_model="numpy")
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: LineNumbers,
+    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: JudgementNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint among the accepted ones."""
@@ -214,7 +228,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
 
 @njit(cache=True, error_model="numpy")
 def _weigh(
-    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: LineNumbers
+    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with some votes each."""
     count = len(accepted)
@@ -252,61 +266,3 @@ def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
     for k in range(len(edge)):
         lines.variance[k] *= members[edge[k]]
         lines.weight[k] /= members[edge[k]]
-
-
-def tilt_of_chains(
-    strip: Strip, maxima: Maxima, band: StartBand, numbers: LineNumbers
-) -> TiltEstimate | None:
-    """The tilt that most chains of the band's maxima agree with; None where too few do."""
-    numbers = numbers._replace(
-        least_points=_CHAIN_LEAST,
-        least_evidence=0.0,
-        bend_px=_CHAIN_BEND_PX,
-        lean_noise=1.0,
-        largest_lean_px=_CHAIN_LEAN_PX,
-    )
-    tilt, _ = agree_on_tilt(_straight_chains(strip, maxima, band.row, numbers), numbers)
-    return tilt if tilt.lines > 0 else None
-
-
-@njit(cache=True, error_model="numpy")
-def _straight_chains(
-    strip: Strip, maxima: Maxima, rows: NDArray[np.int32], numbers: LineNumbers
-) -> Verticals:
-    """Straight chains, all of which count the same."""
-    tracks = _tracks_of_chains(maxima, rows)
-    fits = no_fits(len(tracks.polarity))
-    straight, count = np.empty(len(tracks.polarity), np.int64), 0
-    chart = np.empty((2, len(tracks.row)))
-    for t in range(len(straight)):
-        fit_points(strip, tracks, t, numbers, chart, fits)
-        if fits.scatter_px[t] <= _CHAIN_SCATTER_PX:
-            straight[count] = t
-            count += 1
-    return _weigh(fits, straight[:count], np.full(count, numbers.weight_limit), numbers)
-
-
-@njit(cache=True, error_model="numpy")
-def _tracks_of_chains(maxima: Maxima, rows: NDArray[np.int32]) -> LineTracks:
-    """The long chains; those of a band on which tracks start on some (K, W) rows."""
-    level, column, value, chain = maxima.level, maxima.column, maxima.value, maxima.chain
-    length = np.zeros(len(chain), np.int64)
-    for i in range(len(chain)):
-        length[chain[i]] += 1
-    # A chain has the number of its first maximum.
-    begin, bounds = np.empty(len(chain), np.int64), np.zeros(len(chain) + 1, np.int64)
-    count = points = 0
-    for i in range(len(chain)):
-        if length[i] >= _CHAIN_LEAST:
-            begin[i] = points
-            points += length[i]
-            count += 1
-            bounds[count] = points
-    row, place = np.empty(points, np.int32), np.empty(points)
-    score = np.empty(points, np.float32)
-    for i in range(len(chain)):
-        if length[chain[i]] >= _CHAIN_LEAST:
-            k = begin[chain[i]]
-            begin[chain[i]] += 1
-            row[k], place[k], score[k] = rows[level[i], column[i]], maxima.place[i], abs(value[i])
-    return LineTracks(np.ones(count), bounds[: count + 1], row, place, score)

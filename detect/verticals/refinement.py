@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers, LineSettings
+from detect.line_settings import LineSettings
 from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, Strip
 from detect.verticals.tracking import LineTracks
 
@@ -68,6 +68,10 @@ class LineFits(NamedTuple):
     spread: FloatArray
     contrast: FloatArray
     sharpness: FloatArray
+
+
+#: Of no tracks.
+NO_FITS = LineFits(*(np.empty((0, *shape)) for shape in [(), (), (2,), (2, 2), *[()] * 5]))
 
 
 class StepFilters(NamedTuple):
@@ -166,9 +170,9 @@ class Eigenline(NamedTuple):
     spread: float
 
 
-@njit(cache=True, error_model="numpy")
-def no_fits(count: int) -> LineFits:
-    """Of some tracks none of which has a line yet."""
+@njit(cache=True, error_model="numpy", inline="always")
+def _fits(count: int, known: LineFits, again: NDArray[np.bool_]) -> tuple[LineFits, int]:
+    """Lines that are known, their number, and others of tracks that have none yet."""
     line, covariance, sharpness = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
     scatter_px, shift_px, spread = np.empty(count), np.empty(count), np.empty(count)
     reference_rad, pixel_rad, contrast = np.empty(count), np.empty(count), np.empty(count)
@@ -177,7 +181,20 @@ def no_fits(count: int) -> LineFits:
         line[t, 0] = line[t, 1] = covariance[t, 0, 0] = covariance[t, 1, 1] = np.nan
         covariance[t, 0, 1] = covariance[t, 1, 0] = np.nan
         sharpness[t] = 1.0
-    return LineFits(
+    n = 0
+    for t in range(len(again)):
+        if again[t]:
+            continue
+        reference_rad[n], pixel_rad[n] = known.reference_rad[t], known.pixel_rad[t]
+        scatter_px[n], shift_px[n] = known.scatter_px[t], known.shift_px[t]
+        spread[n], contrast[n] = known.spread[t], known.contrast[t]
+        sharpness[n] = known.sharpness[t]
+        for i in range(2):
+            line[n, i] = known.line[t, i]
+            for k in range(2):
+                covariance[n, i, k] = known.covariance[t, i, k]
+        n += 1
+    fits = LineFits(
         reference_rad,
         pixel_rad,
         line,
@@ -188,26 +205,19 @@ def no_fits(count: int) -> LineFits:
         contrast,
         sharpness,
     )
+    return fits, n
 
 
-@njit(cache=True, error_model="numpy")
-def fit_points(
-    strip: Strip, tracks: LineTracks, t: int, numbers: LineNumbers, chart: FloatArray,
+@njit(cache=True, error_model="numpy", inline="always")
+def _fit_points(
+    strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
     fits: LineFits,
 ) -> Eigenline:  # fmt: skip
     """Fit a line to track t by the eigen-decomposition of its points' scatter.
 
-    Parameters
-    ----------
-    strip, tracks
-        The table, the tracks.
-    numbers : LineNumbers
-        Tracks of too few points or too little evidence have no line.
-    chart : (2, N) float64
-        Gets X and Z of the points.
-    fits : LineFits
-        Gets the line; the covariance is that of independent points with the scatter that the track
-        shows.
+    Tracks of fewer points or a lower sum of scores than `least` have none. `chart`, (2, N), gets X
+    and Z of the points, `fits` the line; the covariance is that of independent points with the
+    scatter that the track shows.
     """
     begin, end = tracks.bounds[t], tracks.bounds[t + 1]
     n, row, column, score = end - begin, tracks.row, tracks.column, tracks.score
@@ -218,7 +228,7 @@ def fit_points(
     origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
     pixel = 1.0 / abs(strip.columns_per_rad[origin])
     fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
-    if n < numbers.least_points or total < numbers.least_evidence / strip.row_aspect:
+    if n < least[0] or total < least[1]:
         return Eigenline(np.nan, np.nan, np.nan, np.nan, np.nan)
     x, z = chart[0, :n], chart[1, :n]
     _place_in_chart(strip, row[begin:end], column[begin:end], strip.bearing[origin], x, z)
@@ -237,15 +247,29 @@ def fit_points(
 @njit(cache=True, error_model="numpy")
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers,
+    least: tuple[int, float], known: LineFits, again: NDArray[np.bool_],
 ) -> LineFits:  # fmt: skip
-    """Fit lines to tracks (`fit_points`), and refine them on the grey values in some steps."""
-    fits = no_fits(len(tracks.polarity))
+    """Fit lines to tracks, and refine them on the grey values in some steps.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    strip, tracks, filters
+        The table, the tracks, the steps.
+    least : int, float
+        Tracks of fewer points or a lower sum of scores have no line.
+    known : LineFits
+        Lines of other tracks. Those that are not followed again are the first of these.
+    again : (K,) bool
+        Which are.
+    """
+    fits, first = _fits(len(tracks.polarity), known, again)
     height = image.shape[0]
     chart, column = np.empty((2, height)), np.empty(height)
     by_a, by_b = np.empty(height), np.empty(height)
-    for t in range(len(tracks.polarity)):
-        line = fit_points(strip, tracks, t, numbers, chart, fits)
+    for t in range(first, len(tracks.polarity)):
+        line = _fit_points(strip, tracks, t, least, chart, fits)
         if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):
             continue
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
@@ -269,7 +293,7 @@ def fit_lines(
     return fits
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _place_in_chart(
     strip: Strip, row: NDArray[np.int32], column: FloatArray, reference: float,
     x: FloatArray, z: FloatArray,
@@ -287,7 +311,7 @@ def _place_in_chart(
         z[i] = e / (c * ahead + s * left)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _eigenline(x: FloatArray, z: FloatArray) -> Eigenline:
     """The line along the larger eigenvalue's eigenvector of the points' scatter."""
     n = len(x)
@@ -307,7 +331,7 @@ def _eigenline(x: FloatArray, z: FloatArray) -> Eigenline:
     return Eigenline(mean_x - b * mean_z, b, smaller, mean_z, zz)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _cross_rows(
     strip: Strip, tracked: FloatArray, x: FloatArray, z: FloatArray, line: Eigenline,
     crossings: Crossings,
@@ -334,7 +358,7 @@ def _cross_rows(
             by_a[i] = by_b[i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def _climb(
     image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,

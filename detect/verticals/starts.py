@@ -19,13 +19,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, weights_across
+from detect.verticals.response import (
+    MIDDLE_GREY,
+    FloatArray,
+    SingleArray,
+    correlate,
+    divide,
+    padded,
+    weights_across,
+)
+from detect.verticals.tilt import strongest_first
 from lut.verticals import VerticalTable
 
 #: Starts must be on chains if each line crosses at least this many rows of the band.
 _CROSSED = 3
 #: Maxima of a chain on neighbouring rows of the band are closer than this, columns.
 _APART = 1.5
+#: Least number of maxima of a chain where starts must be on chains.
+_LEAST = 2
 
 
 class StartBand(NamedTuple):
@@ -44,11 +55,13 @@ class StartBand(NamedTuple):
         ends of the vertical.
     scale : (K, W) float32
         One over the sum of the weights that are on the vertical; 0 where there are none.
-    across : (K, 2, 2r + 1) float32
+    across : (K, 2, T) float32
         The filter's weights across the vertical, for the strip's columns, which are a pixel apart
         on the horizon only.
-    along : (2s + 1,) float32
-        Those along it.
+    along : (L,) float32
+        Those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
+    reach : int
+        r, pixels.
     spacing : int
         See above.
     chained : bool
@@ -64,39 +77,34 @@ class StartBand(NamedTuple):
     scale: SingleArray
     across: SingleArray
     along: SingleArray
+    reach: int
     spacing: int
     chained: bool
     height_px: float
 
 
-class Maxima(NamedTuple):
-    """Maxima of the response along the rows of the band, row by row from the left.
+class LineStarts(NamedTuple):
+    """Chains of maxima of the response, from which tracks start.
 
     Attributes
     ----------
-    level, column : (N,) int32
-        Rows of the band, and columns of the strip.
-    value : (N,) float32
-        Responses there.
-    place : (N,) float64
-        Top of the parabola through the maximum and its neighbours, columns.
-    chain : (N,) int64
-        The first maximum of the chain that each is on.
+    first : (N,) int64
+        The uppermost maximum of each chain, the chain of the highest response first.
+    row : (M,) int64
+        Image row of each maximum.
+    column : (M,) float64
+        Top of the parabola through the maximum and its neighbours, columns of the strip.
+    value : (M,) float32
+        Signed response.
+    below : (M,) int64
+        The next maximum of the chain; -1 for none.
     """
 
-    level: NDArray[np.int32]
-    column: NDArray[np.int32]
+    first: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: FloatArray
     value: SingleArray
-    place: FloatArray
-    chain: NDArray[np.int64]
-
-
-class LineStarts(NamedTuple):
-    """Where tracks start: (N,) rows, columns and signed responses, the strongest first."""
-
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
-    value: SingleArray
+    below: NDArray[np.int64]
 
 
 def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
@@ -133,8 +141,9 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         left=np.where(seen, 1.0 - (x - j), 0.0).astype(np.float32),
         right=np.where(seen, x - j, 0.0).astype(np.float32),
         scale=np.divide(1.0, on_it, out=np.zeros_like(on_it), where=on_it > 0.0).astype(np.float32),
-        across=across.astype(np.float32),
-        along=along.astype(np.float32),
+        across=padded(across),
+        along=padded(along),
+        reach=r,
         spacing=spacing,
         chained=steps > 0 and long_enough,
         height_px=2.0 * settings.start_band_rows * table.row_aspect,
@@ -151,9 +160,8 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
     """(K, W) responses on the rows of the band, 0 where tracks may not start."""
     levels, width = band.row.shape
     response = np.zeros((levels, width), np.float32)
-    if width >= band.across.shape[2] and image.size > 1:
-        between = np.empty((len(band.pixel), 2 * width), np.float32)
-        _filter_band(image.reshape(-1), band, np.float32(regulariser), between, response)
+    if width > 2 * band.reach and image.size > 1:
+        _filter_band(image.reshape(-1), band, np.float32(regulariser), response)
     return response
 
 
@@ -162,22 +170,40 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
 
 @njit(cache=True, error_model="numpy")
 def _filter_band(
-    pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, between: SingleArray,
-    response: SingleArray,
-) -> None:  # fmt: skip
-    """`between`, (R, 2 W), gets grey values and their squares; `response` the result."""
+    pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, response: SingleArray
+) -> None:
     levels, width = response.shape
-    taps = band.across.shape[2]
-    inner = slice(taps // 2, width - taps // 2)
+    rows, taps = len(band.pixel), band.across.shape[2]
+    # Grey values and their squares. What weights behind the filter's are multiplied by is finite.
+    between = np.empty((rows + len(band.along), 2 * width), np.float32)
+    means = np.empty(2 * width + taps, np.float32)
+    between[rows:] = means[2 * width :] = np.float32(0.0)
     sides = np.empty((2, width), np.uint8)
-    for k in range(len(between)):
+    for k in range(rows):
         _interpolate(pixels, band.pixel[k], band.left[k], band.right[k], sides, between[k])
-    means = np.empty(2 * width, np.float32)
-    sums = np.empty((3, width - taps + 1), np.float32)
+    inner = slice(band.reach, width - band.reach)
+    moments = np.empty((3, width - 2 * band.reach), np.float32)
     for k in range(levels):
-        _average_along(between[k * band.spacing :], band.along, means)
-        _correlate_across(means, band.scale[k], band.across[k], sums)
-        _respond(sums, regulariser, band.row[k, inner], response[k, inner])
+        above = between[k * band.spacing :].reshape(-1)
+        correlate(above, band.along, 2 * width, means[: 2 * width])
+        for m in range(2):
+            _scale(means[m * width :], band.scale[k])
+        for m in range(3):
+            correlate(means[m // 2 * width :], band.across[k, m % 2], 1, moments[m])
+        divide(moments, regulariser, response[k, inner])
+        _leave_out(band.row[k], response[k])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _scale(means: SingleArray, scale: SingleArray) -> None:
+    for c in range(len(scale)):
+        means[c] *= scale[c]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _leave_out(row: NDArray[np.int32], response: SingleArray) -> None:
+    for c in range(len(response)):
+        response[c] = response[c] if row[c] >= 0 else np.float32(0.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -198,63 +224,31 @@ def _interpolate(
         square[c] = left[c] * (a * a) + right[c] * (b * b)
 
 
-@njit(cache=True, error_model="numpy")
-def _average_along(between: SingleArray, along: SingleArray, means: SingleArray) -> None:
-    means[:] = np.float32(0.0)
-    for k in range(len(along)):
-        row, weight = between[k], along[k]
-        for i in range(len(means)):
-            means[i] += weight * row[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _correlate_across(
-    means: SingleArray, scale: SingleArray, across: SingleArray, sums: SingleArray
-) -> None:
-    """Mean, covariance and mean square in windows across verticals."""
-    mean, cov, square = sums[0], sums[1], sums[2]
-    width = len(scale)
-    for c in range(width):
-        means[c] *= scale[c]
-        means[width + c] *= scale[c]
-    sums[:] = np.float32(0.0)
-    for k in range(across.shape[1]):
-        weight, lever = across[0, k], across[1, k]
-        grey, squares = means[k:], means[width + k :]
-        for c in range(len(mean)):
-            mean[c] += weight * grey[c]
-            cov[c] += lever * grey[c]
-            square[c] += weight * squares[c]
-
-
-@njit(cache=True, error_model="numpy")
-def _respond(
-    sums: SingleArray, regulariser: np.float32, row: NDArray[np.int32], response: SingleArray
-) -> None:
-    mean, cov, square = sums[0], sums[1], sums[2]
-    for c in range(len(response)):
-        # Rounding can make a vanishing variance negative.
-        variance = abs(square[c] - mean[c] * mean[c])
-        value = cov[c] * abs(cov[c]) / (variance + regulariser)
-        response[c] = value if row[c] >= 0 else np.float32(0.0)
-
-
-@njit(cache=True, error_model="numpy")
-def find_maxima(response: SingleArray, threshold: float) -> Maxima:
-    """Maxima of the response along rows parallel to the horizon, and their chains.
+def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
+    """Chains of maxima of the response on the rows of the band.
 
     Parameters
     ----------
     response : (K, W) float32
         See `band_response`.
+    band : StartBand
+        The rows. Where each line crosses several of them, a chain has at least two maxima.
     threshold : float
         Least absolute response.
     """
+    return _chains(response, band.row, threshold, _LEAST if band.chained else 1)
+
+
+@njit(cache=True, error_model="numpy")
+def _chains(
+    response: SingleArray, rows: NDArray[np.int32], threshold: float, least: int
+) -> LineStarts:
     levels, width = response.shape
     size = response.size
-    level, column = np.empty(size, np.int32), np.empty(size, np.int32)
-    value, places, chain = np.empty(size, np.float32), np.empty(size), np.empty(size, np.int64)
-    continued = np.zeros(size, np.bool_)
+    row, column, value = np.empty(size, np.int64), np.empty(size), np.empty(size, np.float32)
+    below = np.empty(size, np.int64)
+    # Of each maximum the first one of its chain, of that one the chain's length and strength.
+    chain, length, strength = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
     n = above = begin = 0
     for k in range(levels):
         # Maxima of the row above are those from `above` to before `begin`.
@@ -269,47 +263,28 @@ def find_maxima(response: SingleArray, threshold: float) -> Maxima:
             if here < 0.0 and not (left > here and right >= here):
                 continue
             place = c + 0.5 * float(left - right) / float(left - here - here + right)
-            level[n], column[n], value[n], places[n], chain[n] = k, c, here, place, n
+            row[n], column[n], value[n], below[n] = rows[k, c], place, here, -1
+            chain[n], length[n], strength[n] = n, 1, abs(here)
             # Each goes on the chain of the nearest one above that none has continued yet.
-            while above < begin and places[above] <= place - 2.0 * _APART:
+            while above < begin and column[above] <= place - 2.0 * _APART:
                 above += 1
             nearest, link = _APART, -1
             other = above
-            while other < begin and places[other] < place + _APART:
-                apart = abs(places[other] - place)
-                if value[other] * here > 0.0 and apart < nearest and not continued[other]:
+            while other < begin and column[other] < place + _APART:
+                apart = abs(column[other] - place)
+                if value[other] * here > 0.0 and apart < nearest and below[other] < 0:
                     nearest, link = apart, other
                 other += 1
             if link >= 0:
-                chain[n] = chain[link]
-                continued[link] = True
+                first = chain[link]
+                chain[n], below[link] = first, n
+                length[first] += 1
+                strength[first] = max(strength[first], strength[n])
             n += 1
-    return Maxima(level[:n], column[:n], value[:n], places[:n], chain[:n])
-
-
-def line_starts(maxima: Maxima, band: StartBand) -> LineStarts:
-    """Maxima on chains, or all of them where lines need not cross several rows of the band."""
-    row, column, value = _starts(maxima, band.row, 2 if band.chained else 1)
-    order = np.argsort(-np.abs(value), kind="stable")
-    return LineStarts(row[order], column[order], value[order])
-
-
-@njit(cache=True, error_model="numpy")
-def _starts(maxima: Maxima, rows: NDArray[np.int32], least: int) -> LineStarts:
-    """Maxima on chains of some length, in the order of the maxima."""
-    size = len(maxima.chain)
-    length = np.zeros(size, np.int64)
-    for i in range(size):
-        length[maxima.chain[i]] += 1
-    row, column, value = (
-        np.empty(size, np.int32),
-        np.empty(size, np.int32),
-        np.empty(size, np.float32),
-    )
-    n = 0
-    for i in range(size):
-        if length[maxima.chain[i]] >= least:
-            column[n], value[n] = maxima.column[i], maxima.value[i]
-            row[n] = rows[maxima.level[i], column[n]]
-            n += 1
-    return LineStarts(row[:n], column[:n], value[:n])
+    first, count = np.empty(n, np.int64), 0
+    for i in range(n):
+        if chain[i] == i and length[i] >= least:
+            first[count], strength[count] = i, strength[i]
+            count += 1
+    order = strongest_first(strength[:count])
+    return LineStarts(first[order], row[:n], column[:n], value[:n], below[:n])

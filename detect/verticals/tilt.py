@@ -37,7 +37,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import DEFAULT, LineNumbers, LineSettings
+from detect.line_settings import DEFAULT, LineNumbers, LineSettings, TiltNumbers
 
 FloatArray = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ def consensus(
     consistent : (N,) bool
         Lines that are vertical under that tilt; without an estimate, under no tilt.
     """
-    numbers = LineNumbers.of(settings)
+    numbers = LineNumbers.of(settings).tilt
     tilt, consistent = agree_on_tilt(lines, numbers)
     if tilt.lines == 0:
         return None, consistent
@@ -144,7 +144,7 @@ def consensus(
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: LineNumbers
+    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: TiltNumbers
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
@@ -153,22 +153,9 @@ def with_error(
     if numbers.stray_share == 0.0:
         return tilt
     place = tilt.pitch_rad, tilt.roll_rad
-    return tilt._replace(covariance=_error_of_tilt(lines, edge, place, numbers, _GRID))
-
-
-@njit(cache=True, error_model="numpy")
-def lean_deviation(pp: float, pr: float, rr: float, sine: FloatArray, cosine: FloatArray) -> float:
-    """Largest standard deviation of the lean of verticals at some bearings.
-
-    It is due to a tilt with some variances and covariance of pitch and roll.
-    """
-    largest = 0.0
-    for s, c in zip(sine, cosine):
-        variance = s * s * pp - 2.0 * s * c * pr + c * c * rr
-        # NaN where there is no vertical.
-        if variance > largest:
-            largest = variance
-    return math.sqrt(largest)
+    prior = math.radians(numbers.tilt_prior_deg)
+    error = _error_of_tilt(lines, edge, place, prior, numbers.stray_share, _GRID)
+    return tilt._replace(covariance=error)
 
 
 @njit(cache=True, error_model="numpy")
@@ -185,7 +172,7 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 
 
 @njit(cache=True, error_model="numpy")
-def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
+def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
     """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
     pitch, roll = _vote_for_tilt(lines, numbers)
@@ -206,7 +193,7 @@ def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate,
 
 
 @njit(cache=True, error_model="numpy")
-def _vote_for_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[float, float]:
+def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float]:
     """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
     Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
@@ -362,11 +349,11 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def _error_of_tilt(
-    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], numbers: LineNumbers,
-    grid: FloatArray,
+    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], prior: float,
+    stray_share: float, grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
-    count, stray_share, prior = len(edge), numbers.stray_share, math.radians(numbers.tilt_prior_deg)
+    count = len(edge)
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])

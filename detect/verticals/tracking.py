@@ -1,9 +1,21 @@
 """Tracking: edges followed up and down from where they cross the horizon.
 
-In each row the expected position of an edge moves as verticals do in a camera of the given tilt;
-the highest of the three responses round it, and the parabola through this and its neighbours, give
-the point; the expected position then yields to the point's offset by the larger of `pull` and one
-over the number of points.
+In each row the highest of the three responses round the expected place of an edge, and the parabola
+through this and its neighbours, give the point. From row to row the expected place moves like a
+vertical, and by the lean of the edge against that; both yield to the point's offset, the place by a
+share of it and the lean, per row, by another one. The shares fall with the number n of points as
+those of a straight line through n points fitted by least squares do,
+
+    2 (2 n - 1) / (n (n + 1))    and    6 / (n (n + 1)),
+
+down to constants (alpha-beta filter: P. R. Kalata, The Tracking Index, IEEE Transactions on
+Aerospace and Electronic Systems 20, 1984). So a track needs no tilt to follow leaning verticals,
+and does not leave them where other edges cross. The response is evaluated in stripes along the
+places expected.
+
+Where an edge ends and another one goes on beside it, such a track bends. Once the tilt is known,
+the lean of verticals is, too: tracks that are no lines as they are can be followed again along the
+verticals, where only the place yields, by 1 / n.
 """
 
 from __future__ import annotations
@@ -15,12 +27,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers
-from detect.verticals.response import BLOCK, FloatArray, SingleArray, Strip, StripResponse, extend
+from detect.line_settings import TrackingNumbers
+from detect.verticals.response import (
+    STRIPE_ROWS,
+    FloatArray,
+    LineFilter,
+    SingleArray,
+    Strip,
+    Stripe,
+    empty_stripe,
+    respond,
+)
 from detect.verticals.starts import LineStarts
 
-#: More edges than any image has.
-ALL_EDGES = 2**31
+#: That an edge leans no more than verticals of a tilted camera counts like so many points.
+_UPRIGHT_POINTS = 5
+#: Largest offset of a point from the place expected along verticals of known lean, pixels.
+_VERTICAL_REACH_PX = 1.0
 
 
 class LineTracks(NamedTuple):
@@ -69,181 +92,285 @@ class LineTracks(NamedTuple):
         return np.add.reduceat(self.score, self.bounds[:-1], dtype=np.float64)
 
 
+_NO_TRACKS = LineTracks(
+    np.empty(0), np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32)
+)
+_NONE = np.empty(0, np.bool_)
+_NO_TILT = math.nan, math.nan
+
+
+class _Path(NamedTuple):
+    """The path of a stripe from row `first` on.
+
+    At `row` it is at column `place` of the strip; it leans by `lean` columns per tangent of
+    elevation, as measured at the vertical `column`.
+    """
+
+    first: int
+    row: int
+    column: int
+    place: float
+    lean: float
+
+
+class _Edge(NamedTuple):
+    """Where an edge is, how it leans (as a path does), and from how many points that is known.
+
+    The lean of a vertical is known beforehand.
+    """
+
+    place: float
+    lean: float
+    points: int
+    vertical: bool
+
+
 def follow_edges(
-    response: StripResponse, strip: Strip, starts: LineStarts, numbers: LineNumbers,
-    tilt_rad: tuple[float, float] | None = None, enough: int = ALL_EDGES,
+    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    numbers: TrackingNumbers,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
     Parameters
     ----------
-    response : StripResponse
-        The response; it is evaluated wherever edges go.
-    strip : Strip
-        The table.
+    image : (H, W) uint8
+        Grey values.
+    strip, window
+        The table, the filter.
     starts : LineStarts
         Where to start, in this order.
-    numbers : LineNumbers
+    numbers : TrackingNumbers
         Threshold, gaps, border, and how a track is guided.
-    tilt_rad : (float, float), optional
-        Pitch and roll that the edges are expected to show; without, they are followed wherever
-        they go.
-    enough : int
-        Stop once there are this many tracks that may be lines.
     """
-    if tilt_rad is None:
-        # Any curve, and not only verticals.
-        numbers = numbers._replace(guided_pull=1.0, guided_reach_px=1.0)
-    return _follow_edges(response, strip, starts, numbers, tilt_rad or (0.0, 0.0), enough)
+    return _follow_edges(image, strip, window, starts, numbers, _NO_TRACKS, _NONE, _NO_TILT)
+
+
+def follow_again(
+    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
+    tilt_rad: tuple[float, float],
+) -> LineTracks:  # fmt: skip
+    """Follow some of the tracks again, along the verticals of a tilt; the others come first.
+
+    The starts are all those that are on none of the others.
+    """
+    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
 
 
 @njit(cache=True, error_model="numpy")
 def _follow_edges(
-    response: StripResponse,
-    strip: Strip,
-    starts: LineStarts,
-    numbers: LineNumbers,
+    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
     tilt: tuple[float, float],
-    enough: int,
-) -> LineTracks:
-    rise = strip.rise
-    width, height = rise.shape
-    # By how many columns an edge is expected to move for a rise of 1.
-    columns_per_rise = np.empty(width)
-    for c in range(width):
-        lean = tilt[0] * strip.sine[c] - tilt[1] * strip.cosine[c]
-        columns_per_rise[c] = lean * strip.columns_per_rad[c]
-    count, least_score = len(starts.row), numbers.least_evidence / strip.row_aspect
+) -> LineTracks:  # fmt: skip
+    """`follow_again`; without a tilt (NaN) the leans are found along the way."""
+    height, width = image.shape
     lowest, highest = height, -1
     for v in starts.row:
         lowest, highest = min(lowest, v), max(highest, v)
     # Columns that were followed, by polarity, on the rows that have starts.
     followed = np.zeros((2, max(highest - lowest + 1, 0), width), np.bool_)
-    polarity, bounds = np.empty(count), np.zeros(count + 1, np.int64)
-    found_row, found_column = np.empty(count * height, np.int32), np.empty(count * height)
-    found_score = np.empty(count * height, np.float32)
-    # Numba counts references to arrays in tuples wherever they are taken out of these.
-    start_row, start_column, start_value = starts.row, starts.column, starts.value
+    most = len(again) + len(starts.first)
+    polarity, bounds = np.empty(most), np.zeros(most + 1, np.int64)
+    most = len(tracks.row) + len(starts.first) * height
+    found_row, found_column = np.empty(most, np.int32), np.empty(most)
+    found_score = np.empty(most, np.float32)
+    count = n = 0
+    for t in range(len(again)):
+        if again[t]:
+            continue
+        marks = followed[0 if tracks.polarity[t] > 0.0 else 1]
+        for i in range(tracks.bounds[t], tracks.bounds[t + 1]):
+            row, place = tracks.row[i], tracks.column[i]
+            found_row[n], found_column[n], found_score[n] = row, place, tracks.score[i]
+            n += 1
+            _mark(marks, row - lowest, place)
+        polarity[count] = tracks.polarity[t]
+        count += 1
+        bounds[count] = n
+    stripe = empty_stripe(window)
+    vertical = not math.isnan(tilt[0])
     # Of the edge that is followed, by row; no score where there is no point.
     column, score = np.empty(height), np.zeros(height, np.float32)
-    tracks = n = counting = 0
-    for start in range(len(start_row)):
-        if counting >= enough:
-            break
-        v, c = start_row[start], start_column[start]
-        sign = np.float32(1.0) if start_value[start] > 0.0 else np.float32(-1.0)
+    for start in starts.first:
+        sign = np.float32(1.0) if starts.value[start] > 0.0 else np.float32(-1.0)
         marks = followed[0 if sign > 0.0 else 1]
-        if marks[v - lowest, c]:
+        strongest, bottom = start, start
+        k = start
+        while k >= 0:
+            if sign * starts.value[k] > sign * starts.value[strongest]:
+                strongest = k
+            k, bottom = starts.below[k], k
+        c = int(starts.column[strongest] + 0.5)
+        if marks[starts.row[strongest] - lowest, c]:
             continue
-        column[v] = c
-        top = bottom = v
+        if vertical:
+            top = bottom = starts.row[strongest]
+            column[top], score[top] = starts.column[strongest], abs(starts.value[strongest])
+            lean = tilt[0] * strip.sine[c] - tilt[1] * strip.cosine[c]
+            edge = _Edge(column[top], lean * strip.columns_per_rad[c], 0, True)
+        else:
+            top, bottom = starts.row[start], starts.row[bottom]
+            lean = _take_chain(strip, starts, start, column, score)
+            edge = _Edge(column[top], lean, bottom - top + 1, False)
+        first, last = top, bottom
         for direction in (-1, 1):
-            # Upward from the start, then downward from the point that was found there.
-            begin = v, column[v], direction
-            end = _follow(response, rise, columns_per_rise, numbers, sign, begin, column, score)
-            top, bottom = min(top, end), max(bottom, end)
-            if score[v] == 0.0:
-                break
-        first, total = n, 0.0
-        for row in range(top, bottom + 1):
+            v = top if direction < 0 else bottom
+            points = 0 if vertical else edge.points
+            edge = _Edge(column[v], edge.lean, points, vertical)
+            end, edge = _follow(
+                image, strip, stripe, numbers, (v, direction, sign), edge, column, score
+            )
+            first, last = min(first, end), max(last, end)
+        for row in range(first, last + 1):
             if score[row] > 0.0:
                 found_row[n], found_column[n], found_score[n] = row, column[row], score[row]
-                total += score[row]
                 score[row] = 0.0
                 n += 1
-                if 0 <= row - lowest < len(marks):
-                    j = math.floor(column[row] + 0.5)
-                    for k in range(max(0, j - 1), min(width, j + 2)):
-                        marks[row - lowest, k] = True
-        if n > first:
-            polarity[tracks] = sign
-            tracks += 1
-            bounds[tracks] = n
-            if n - first >= numbers.least_points and total >= least_score:
-                counting += 1
+                _mark(marks, row - lowest, column[row])
+        polarity[count] = sign
+        count += 1
+        bounds[count] = n
     return LineTracks(
-        polarity[:tracks],
-        bounds[: tracks + 1],
+        polarity[:count],
+        bounds[: count + 1],
         found_row[:n].copy(),
         found_column[:n].copy(),
         found_score[:n].copy(),
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _place(column: int, part: float) -> tuple[int, float]:
-    """Whole columns, and what is left, in [-0.5, 0.5).
-
-    Whole columns change seldom: a processor that foresees them works on the next rows before it
-    knows where in this one the edge is.
-    """
-    if part < -0.5 or part >= 0.5:
-        whole = math.floor(part + 0.5)
-        return column + whole, part - whole
-    return column, part
+@njit(cache=True, error_model="numpy", inline="always")
+def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
+    """Mark the columns round a point as followed, if its row has starts."""
+    if 0 <= row < len(marks):
+        j = math.floor(column + 0.5)
+        for k in range(max(0, j - 1), min(marks.shape[1], j + 2)):
+            marks[row, k] = True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", inline="always")
+def _take_chain(
+    strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: SingleArray
+) -> float:
+    """Points on the straight lines between the maxima of a chain; returns the chain's lean."""
+    row, place, value, rise = (
+        starts.row,
+        starts.column,
+        starts.value,
+        strip.rise[int(starts.column[start])],
+    )
+    v, k = row[start], start
+    column[v], score[v] = place[k], abs(value[k])
+    n, x, y, xx, xy = 1.0, 0.0, 0.0, 0.0, 0.0
+    while starts.below[k] >= 0:
+        other = starts.below[k]
+        rows = row[other] - row[k]
+        for i in range(1, rows + 1):
+            share = i / rows
+            column[row[k] + i] = (1.0 - share) * place[k] + share * place[other]
+            score[row[k] + i] = abs((1.0 - share) * value[k] + share * value[other])
+        above, beside = rise[row[other]] - rise[v], place[other] - place[start]
+        n, x, y = n + 1.0, x + above, y + beside
+        xx, xy = xx + above * above, xy + above * beside
+        k = other
+    return (n * xy - x * y) / (n * xx - x * x) if n >= 3.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _follow(
-    response: StripResponse, rise: SingleArray, columns_per_rise: FloatArray,
-    numbers: LineNumbers, sign: np.float32, start: tuple[int, float, int], column: FloatArray,
-    score: SingleArray,
-) -> int:  # fmt: skip
-    """Follow an edge from a row and column on in a direction; return the last row.
-
-    Nothing is found if there is no point in the first row.
-    """
+    image: NDArray[np.uint8], strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
+    start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: SingleArray,
+) -> tuple[int, _Edge]:  # fmt: skip
+    """Follow an edge of some polarity from a row on in a direction; the last row as well."""
     # Numba counts references to arrays in tuples wherever they are taken out of these.
-    value, known = response.value, response.known
+    at, rise, response, middle = strip.column, strip.rise, stripe.response, stripe.middle
+    width, height = rise.shape
     pull, reach, threshold = numbers.guided_pull, numbers.guided_reach_px, numbers.threshold
     border, max_gap = numbers.border_rows, numbers.gap_rows
-    width, height = rise.shape
-    v, place, direction = start
-    j, part = _place(0, place)
-    n = gap = 0
-    end = v
+    rightmost = response.shape[1] - 2 * stripe.window.reach - 3
+    v, direction, sign = start
+    place, lean, points, vertical = edge
+    if vertical:
+        reach = _VERTICAL_REACH_PX
+    path = _Path(height, v, int(place), place, lean)
+    end, gap = v, 0
     while gap <= max_gap:
-        if n > 0:
-            v += direction
-            if v < border or v > height - 1 - border or j < 1 or j > width - 2:
-                break
-            # A vertical leans in the strip of a tilted camera.
-            moved = columns_per_rise[j] * (rise[j, v] - rise[j, v - direction])
-            if not math.isfinite(moved):
-                break
-            j, part = _place(j, part + moved)
-        if j < 2 or j > width - 3:
+        v += direction
+        if v < border or v > height - 1 - border:
             break
-        near = j
-        while True:
-            block = v // BLOCK
-            for c in range(near - 1, near + 2):
-                if not known[c, block]:
-                    extend(response, c, block)
-            left, here, right = (
-                sign * value[near - 1, v], sign * value[near, v], sign * value[near + 1, v]
-            )  # fmt: skip
-            # Once to the side if the highest of the three is not the one in the middle.
-            if near != j or (left <= here and right <= here):
+        climb = rise[path.column, v] - rise[path.column, v - direction]
+        place += lean * climb
+        # Beyond the first and the last vertical there is none; nor where this one is not seen.
+        if not 0.0 <= place <= width - 1.0:
+            break
+        per_column = _pixels_per_column(at, path.column, v)
+        near, beside = -1, np.float64(0.0)
+        if path.first <= v < path.first + STRIPE_ROWS:
+            beside = (place - _place_on(path, rise, v)) * per_column
+            if math.isfinite(beside):
+                near = middle + math.floor(beside + 0.5)
+        if not 2 <= near <= rightmost:
+            # The edge leaves the stripe.
+            j = int(place)
+            per_column = _pixels_per_column(at, j, v)
+            if not math.isfinite(per_column):
                 break
+            path = _Path(v if direction > 0 else v - STRIPE_ROWS + 1, v, j, place, lean)
+            for i in range(len(stripe.path)):
+                row = path.first - stripe.window.half_length + i
+                stripe.path[i] = np.nan
+                if 0 <= row < height:
+                    part = _place_on(path, rise, row) - j
+                    stripe.path[i] = at[j, row] + part * _pixels_per_column(at, j, row)
+            respond(image, path.first, stripe)
+            near, beside = middle, np.float64(0.0)
+        # Once to the side if the highest of the three is not the one in the middle.
+        left, here, right = _three(response, v - path.first, near, sign)
+        if left > here or right > here:
             near += -1 if left > right else 1
-        seen = here >= threshold and here >= left and here >= right
-        off = near - j - part
-        if seen:
-            bend = left - here - here + right
-            # The top of the parabola through the three.
-            off += 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-        # A start is known to a column only.
-        if seen and (n == 0 or abs(off) <= reach):
-            column[v], score[v] = j + (part + off), here
-            # The start counts as the expected position, not as a point that confirms it.
-            yielding = max(pull, 1.0 / (n + 1.0)) if n > 0 else 1.0
-            j, part = _place(j, part + yielding * off)
-            n += 1
+            left, here, right = _three(response, v - path.first, near, sign)
+        off = near - middle - beside
+        bend = left - here - here + right
+        # The top of the parabola through the three.
+        off += 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+        # The start of a vertical is known to a column only.
+        expected = abs(off) <= reach or points == 0
+        if here >= threshold and here >= left and here >= right and expected:
+            points += 1
+            off /= per_column
+            column[v], score[v] = min(max(place + off, 0.0), width - 1.0), here
+            share = 1.0 / points
+            if not vertical:
+                share *= (4.0 * points - 2.0) / (points + 1.0)
+                if pull < 1.0:
+                    alike = points + _UPRIGHT_POINTS
+                    turn = max(pull * pull / (2.0 - pull), 6.0 / (alike * (alike + 1.0)))
+                    lean += turn * off / climb
+            place += off * max(pull, share)
             gap = 0
             end = v
-        elif n == 0:
-            break
         else:
             gap += 1
-    return end
+    return end, _Edge(place, lean, points, vertical)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
+    """Distance of verticals in a row, on the side on which there are more of them."""
+    if 2 * j < len(at):
+        return float(at[j + 1, v] - at[j, v])
+    return float(at[j, v] - at[j - 1, v])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _place_on(path: _Path, rise: SingleArray, v: int) -> float:
+    """Where a path crosses a row, as a column of the strip."""
+    return path.place + path.lean * float(rise[path.column, v] - rise[path.column, path.row])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _three(
+    response: SingleArray, b: int, c: int, sign: np.float32
+) -> tuple[np.float32, np.float32, np.float32]:
+    return sign * response[b, c - 1], sign * response[b, c], sign * response[b, c + 1]

@@ -9,10 +9,10 @@ from detect.line_settings import LineNumbers, LineSettings
 from detect.verticals import starts
 from detect.verticals.judgement import Judgement, fit_and_judge
 from detect.verticals.refinement import step_filters
-from detect.verticals.response import StripResponse, line_filter, strip_of, strip_response
-from detect.verticals.starts import LineStarts, StartBand, band_response, find_maxima, start_band
-from detect.verticals.tilt import TiltEstimate, with_error
-from detect.verticals.tracking import ALL_EDGES, LineTracks, follow_edges
+from detect.verticals.response import line_filter, strip_of
+from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
+from detect.verticals.tilt import with_error
+from detect.verticals.tracking import LineTracks, follow_again, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -27,31 +27,27 @@ def start_response(
 def line_starts(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> LineStarts:
-    """Maxima of the response on the horizon and on rows near it, the highest first."""
+    """Chains of maxima of the response on the horizon and on rows near it, the highest first."""
     response, band = start_response(image, table, settings)
-    return starts.line_starts(find_maxima(response, settings.threshold), band)
-
-
-def response_to(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
-) -> StripResponse:
-    """The response to an image, of which nothing is evaluated yet."""
-    return strip_response(image, strip_of(table), line_filter(settings))
+    return starts.line_starts(response, band, settings.threshold)
 
 
 def line_tracks(
-    image: NDArray[np.uint8] | StripResponse,
-    starts: LineStarts,
-    table: VerticalTable,
-    settings: LineSettings,
-    tilt: TiltEstimate | None = None,
-    enough: int = ALL_EDGES,
+    image: NDArray[np.uint8], starts: LineStarts, table: VerticalTable, settings: LineSettings
 ) -> LineTracks:
-    """Edges followed from starts: along the verticals of a tilt, or in any direction."""
-    response = image if isinstance(image, StripResponse) else response_to(image, table, settings)
-    expected = None if tilt is None else (float(tilt.pitch_rad), float(tilt.roll_rad))
-    numbers = LineNumbers.of(settings, table.row_aspect)
-    return follow_edges(response, strip_of(table), starts, numbers, expected, enough)
+    """Edges followed from starts."""
+    numbers = LineNumbers.of(settings, table.row_aspect).tracking
+    return follow_edges(image, strip_of(table), line_filter(settings), starts, numbers)
+
+
+def tracks_again(
+    image: NDArray[np.uint8], starts: LineStarts, tracks: LineTracks, again: NDArray[np.bool_],
+    tilt_rad: tuple[float, float], table: VerticalTable, settings: LineSettings,
+) -> LineTracks:  # fmt: skip
+    """Some of the tracks followed again along the verticals of a tilt."""
+    numbers = LineNumbers.of(settings, table.row_aspect).tracking
+    window, strip = line_filter(settings), strip_of(table)
+    return follow_again(image, strip, window, starts, numbers, tracks, again, tilt_rad)
 
 
 def judge_tracks(
@@ -60,11 +56,13 @@ def judge_tracks(
     table: VerticalTable,
     settings: LineSettings,
     steps: int | None = None,
+    before: Judgement | None = None,
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect)
-    judged = fit_and_judge(image, strip_of(table), tracks, step_filters(settings, steps), numbers)
+    filters = step_filters(settings, steps)
+    judged = fit_and_judge(image, strip_of(table), tracks, filters, numbers, before)
     if judged.tilt is None:
         return judged
-    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
+    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
     return judged._replace(tilt=tilt)

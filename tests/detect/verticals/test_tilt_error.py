@@ -38,7 +38,7 @@ def stated_error(
     settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
     lines = Verticals(normal, variance, np.ones(len(weight)), weight)
     estimate = TiltEstimate(*tilt, np.eye(2), len(weight))
-    return with_error(estimate, lines, edge, LineNumbers.of(settings)).covariance
+    return with_error(estimate, lines, edge, LineNumbers.of(settings).tilt).covariance
 
 
 def building(

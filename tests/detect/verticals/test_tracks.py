@@ -13,11 +13,16 @@ from hypothesis.extra import numpy as hnp
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.verticals import starts
 from detect.verticals.response import line_response, weights_across
-from detect.verticals.starts import find_maxima, start_band
-from detect.verticals.tilt import TiltEstimate
+from detect.verticals.starts import LineStarts, start_band
+from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.stages import line_starts, line_tracks, response_to, start_response
+from tests.detect.verticals.stages import (
+    line_starts,
+    line_tracks,
+    start_response,
+    tracks_again,
+)
 
 CAMERA = pinhole(96, 64, 110.0)
 TABLE = build_vertical_table(CAMERA)
@@ -83,14 +88,23 @@ def test_filter_goes_up_to_where_the_verticals_end() -> None:
 def test_starts_lie_on_the_horizon_band_highest_first() -> None:
     image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0)
     on_horizon = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
-    np.testing.assert_array_equal(
-        on_horizon.row, np.rint(TABLE.anchor_row[on_horizon.column]).astype(int)
-    )
-    assert len(on_horizon.row) == 2
+    column = np.rint(on_horizon.column).astype(int)
+    np.testing.assert_array_equal(on_horizon.row, np.rint(TABLE.anchor_row[column]).astype(int))
+    assert len(on_horizon.first) == 2
     band = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=8))
-    assert set(np.unique(band.row - np.rint(TABLE.anchor_row[band.column]))) == {-8, -4, 0, 4, 8}
-    assert np.all(np.diff(np.abs(band.value)) <= 0.0)
+    off = band.row - np.rint(TABLE.anchor_row[np.rint(band.column).astype(int)])
+    assert set(np.unique(off)) == {-8, -4, 0, 4, 8}
+    highest = [np.abs(band.value[members(band, first)]).max() for first in band.first]
+    assert np.all(np.diff(highest) <= 0.0)
     assert np.all(np.abs(band.value) >= DEFAULT.threshold)
+
+
+def members(found: LineStarts, first: int) -> list[int]:
+    """The maxima of a chain, from top to bottom."""
+    chain = [first]
+    while found.below[chain[-1]] >= 0:
+        chain.append(int(found.below[chain[-1]]))
+    return chain
 
 
 def test_starts_are_on_chains() -> None:
@@ -99,21 +113,30 @@ def test_starts_are_on_chains() -> None:
     image = render(CAMERA, [Edge(0.2, 40.0), Edge(-0.1, 90.0)], grey=60.0, noise=12.0, rng=rng)
     response, band = start_response(image, TABLE, DEFAULT)
     assert band.chained
-    maxima = find_maxima(response, DEFAULT.threshold)
-    every = starts.line_starts(maxima, band._replace(chained=False))
-    found = starts.line_starts(maxima, band)
-    assert 10 < len(found.row) <= len(every.row) - 4
-    places = set(zip(found.row.tolist(), found.column.tolist()))
-    above_or_below = np.abs(maxima.level[:, None] - maxima.level) == 1
-    near = above_or_below & (np.abs(maxima.place[:, None] - maxima.place) < 1.5)
-    near &= maxima.value[:, None] * maxima.value > 0.0
-    for k in range(len(maxima.level)):
-        place = int(band.row[maxima.level[k], maxima.column[k]]), int(maxima.column[k])
-        if place in places:
-            assert near[k].any()
+    every = starts.line_starts(response, band._replace(chained=False), DEFAULT.threshold)
+    found = starts.line_starts(response, band, DEFAULT.threshold)
+    np.testing.assert_array_equal(found.column, every.column)
+    assert 2 <= len(found.first) <= len(every.first) - 4
+    for first in found.first:
+        chain = members(found, first)
+        assert len(chain) >= 2
+        assert np.all(np.diff(found.row[chain]) == band.spacing)
+        assert np.all(np.abs(np.diff(found.column[chain])) < 1.5)
+        assert np.all(found.value[chain] * found.value[first] > 0.0)
     for edge in (0.2, -0.1):
         at = 47.5 - 110.0 * np.tan(edge)
-        assert np.sum(np.abs(found.column - at) < 1.6) >= 3
+        near = [first for first in found.first if abs(found.column[first] - at) < 1.6]
+        assert max(len(members(found, first)) for first in near) >= 3
+
+
+def test_chains_go_on_with_the_nearest_maximum_of_their_sign() -> None:
+    response, band = np.zeros((3, 96), np.float32), start_band(TABLE, DEFAULT)
+    for k, row in enumerate([{10: 0.5, 20: -0.5}, {9: -0.5, 11: 0.5, 23: -0.5}, {12: 0.5}]):
+        for c, value in row.items():
+            response[k, c - 1 : c + 2] = value * np.array([0.2, 1.0, 0.2], np.float32)
+    found = starts.line_starts(response, band, 0.1)
+    np.testing.assert_allclose(found.column, [10, 20, 9, 11, 23, 12], atol=0.3)
+    assert [members(found, first) for first in found.first] == [[0, 3, 5]]
 
 
 @pytest.mark.parametrize("spacing", [1, 4, 8])
@@ -154,13 +177,56 @@ def test_tracks_know_polarity_and_follow_subpixel() -> None:
         assert np.abs(columns - np.polyval(line, rows)).max() < 0.12
 
 
-def test_guided_tracks_leave_edges_that_lean_otherwise() -> None:
-    leaning = render(tilted(CAMERA, 0.0, np.radians(5.0)), [Edge(0.0, 90.0)])
-    starts = line_starts(leaning, TABLE, replace(DEFAULT, start_band_rows=0))
-    none, right = (TiltEstimate(0.0, np.radians(roll), np.eye(2), 3) for roll in (0.0, 5.0))
-    assert line_tracks(leaning, starts, TABLE, DEFAULT).points[0] == 60
-    assert line_tracks(leaning, starts, TABLE, DEFAULT, right).points[0] == 60
-    assert line_tracks(leaning, starts, TABLE, DEFAULT, none).points[0] < 45
+def test_tracks_of_lines_leave_edges_that_bend() -> None:
+    """An edge that goes straight up, and from some row on leans."""
+    rows, columns = np.mgrid[0:64, 0:96]
+    edge = 48.0 + 0.4 * np.maximum(rows - 42, 0)
+    image = np.where(columns >= edge, 160, 60).astype(np.uint8)
+    starts = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=8))
+    straight, curved = (
+        line_tracks(image, starts, TABLE, replace(DEFAULT, guided=guided))
+        for guided in (True, False)
+    )
+    assert 40 <= straight.bottom_row[0] <= 52
+    assert curved.bottom_row[0] >= 58
+
+
+def test_tracks_are_followed_again_along_verticals() -> None:
+    """Past the row from which it leans, an edge is followed by its own lean, but not by a tilt."""
+    rows, columns = np.mgrid[0:64, 0:96]
+    edge = 60.0 + 0.15 * np.maximum(rows - 42, 0)
+    image = np.where((columns >= 30) & (columns < edge), 160, 60).astype(np.uint8)
+    starts = line_starts(image, TABLE, DEFAULT)
+    tracks = line_tracks(image, starts, TABLE, DEFAULT)
+    np.testing.assert_array_equal(np.sort(tracks.polarity), [-1.0, 1.0])
+    np.testing.assert_array_equal(tracks.bottom_row, 61)
+    leaning = tracks.polarity < 0.0
+    found = tracks_again(image, starts, tracks, leaning, (0.0, 0.0), TABLE, DEFAULT)
+    np.testing.assert_array_equal(found.polarity, [1.0, -1.0])
+    assert 45 <= found.bottom_row[1] <= 57
+    below = slice(found.bounds[1], found.bounds[2])
+    straight = found.row[below] <= 38
+    np.testing.assert_allclose(found.column[below][straight], 59.5, atol=0.1)
+    # The other is kept as it is.
+    (kept,) = np.flatnonzero(~leaning)
+    own = slice(tracks.bounds[kept], tracks.bounds[kept + 1])
+    for name in ("row", "column", "score"):
+        ours, theirs = getattr(found, name)[: found.bounds[1]], getattr(tracks, name)[own]
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_edges_that_come_in_at_the_side_are_followed() -> None:
+    """At the horizon their windows leave the image, farther down they do not."""
+    camera = pinhole(160, 120, 150.0, pitch_deg=15.0)
+    table = build_vertical_table(camera)
+    side = float(np.interp(157.0, np.arange(160), table.bearing_rad))
+    image = render(camera, [Edge(0.1, 80.0), Edge(side, 80.0)], grey=60.0)
+    starts = line_starts(image, table, DEFAULT)
+    tracks = line_tracks(image, starts, table, DEFAULT)
+    again = np.ones(len(tracks.polarity), np.bool_)
+    found = tracks_again(image, starts, tracks, again, (0.0, 0.0), table, DEFAULT)
+    assert len(found.polarity) == 2
+    assert found.points.min() > 90
 
 
 def test_no_horizon_no_tracks() -> None:
@@ -172,12 +238,9 @@ def test_no_horizon_no_tracks() -> None:
     assert len(tracks.polarity) == 0
 
 
-# -- evaluated only where needed: against the filter evaluated everywhere -------------------------
-
-
 @pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
-@pytest.mark.parametrize("tilt_deg", [0.0, 4.0, -9.0])
-def test_tracks_see_the_same_response_as_the_whole_strip(
+@pytest.mark.parametrize("tilt_deg", [0.0, 4.0])
+def test_tracks_see_nearly_the_response_of_the_whole_strip(
     preset: LineSettings, tilt_deg: float
 ) -> None:
     camera = pinhole(160, 120, 150.0, pitch_deg=15.0, roll_deg=0.5 * tilt_deg)
@@ -189,16 +252,20 @@ def test_tracks_see_the_same_response_as_the_whole_strip(
     response = line_response(image, table, preset)
     tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
     assert tracks.points.sum() > 100
-    for t in range(len(tracks.polarity)):
-        part = slice(tracks.bounds[t], tracks.bounds[t + 1])
-        column = np.rint(tracks.column[part]).astype(int)
-        signed = (
-            tracks.polarity[t] * response[tracks.row[part][:, None], column[:, None] + [-1, 0, 1]]
-        )
-        np.testing.assert_allclose(signed.max(axis=1), tracks.score[part], atol=2e-4)
+    off = np.abs(highest_near(tracks, response) - tracks.score)
+    # Along the edge instead of the vertical a leaning edge is seen a little better.
+    assert np.quantile(off, 0.9) <= (0.1 if tilt_deg == 0.0 else 0.12)
 
 
-def test_tracks_see_the_same_response_at_the_borders() -> None:
+def highest_near(tracks: LineTracks, response: np.ndarray) -> np.ndarray:
+    """Of the three columns round each point the highest response of its sign."""
+    polarity = np.repeat(tracks.polarity, tracks.points)
+    column = np.rint(tracks.column).astype(int)
+    around = response[tracks.row[:, None], column[:, None] + [-1, 0, 1]]
+    return np.asarray((polarity[:, None] * around).max(axis=1))
+
+
+def test_tracks_see_nearly_the_same_response_at_the_borders() -> None:
     """Where windows are cut off, verticals leave the image, or there are none beside them."""
     camera = pinhole(160, 120, 90.0, pitch_deg=35.0, roll_deg=20.0)
     table = build_vertical_table(camera)
@@ -209,24 +276,9 @@ def test_tracks_see_the_same_response_at_the_borders() -> None:
         preset = replace(preset, border_rows=0, threshold=0.1)
         response = line_response(image, table, preset)
         tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
-        assert tracks.points.sum() > 500
-        polarity = np.repeat(tracks.polarity, tracks.points)
-        column = np.rint(tracks.column).astype(int)
-        around = response[tracks.row[:, None], column[:, None] + [-1, 0, 1]]
-        highest = (polarity[:, None] * around).max(axis=1)
-        np.testing.assert_allclose(highest, tracks.score, atol=2e-4)
-
-
-def test_what_was_filtered_before_gives_the_same_tracks() -> None:
-    image = render(CAMERA, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
-    starts = line_starts(image, TABLE, DEFAULT)
-    response = response_to(image, TABLE, DEFAULT)
-    tilt = TiltEstimate(0.01, -0.02, np.eye(2), 3)
-    fresh = line_tracks(image, starts, TABLE, DEFAULT, tilt)
-    line_tracks(response, starts, TABLE, DEFAULT)
-    again = line_tracks(response, starts, TABLE, DEFAULT, tilt)
-    for name in ("row", "column", "score", "bounds", "polarity"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+        assert tracks.points.sum() > 300
+        off = np.abs(highest_near(tracks, response) - tracks.score)
+        assert np.quantile(off, 0.9) <= 0.1
 
 
 @pytest.mark.parametrize("preset", [DEFAULT, PUBLISHED], ids=["default", "published"])
