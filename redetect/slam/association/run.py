@@ -30,7 +30,7 @@ from redetect.slam.association.loop_closing import (
     pairs_by_votes,
     pairs_in_place,
 )
-from redetect.slam.association.loop_path import Solution, intersect_bearings, solve_path
+from redetect.slam.association.loop_path import LabelledMap, intersect_bearings, solve_path
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
 from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
@@ -236,7 +236,7 @@ def _solved(
     path: FloatArray | None,
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
-) -> Solution:
+) -> LabelledMap:
     """Path and map by discs, or by lines where there are no discs."""
     line_xy = None
     if not by_discs:

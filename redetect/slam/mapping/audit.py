@@ -19,12 +19,13 @@ from scipy.sparse.linalg import SuperLU
 from scipy.stats import chi2
 
 from camera import Camera
+from redetect.least_squares.solver import factor
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
 from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.mapping.solve import factor, normal_equations, solve
+from redetect.slam.mapping.solve import equations_at, solve
 from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
@@ -189,7 +190,7 @@ def _fit(
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
     estimate = solve(graph, first, weighting, tolerance=1e-7).estimate
-    equations = normal_equations(linearise(graph, estimate, weighting))
+    equations = equations_at(graph, estimate, weighting)
     table = chi_squared(graph, estimate, weighting)
     return _Fit(graph, estimate, weighting, factor(equations.matrix), table)
 

@@ -47,6 +47,8 @@ class Graph:
         Where in the robot frame bearings are taken from (m).
     camera : Camera or None
         As calibrated; it is needed where the mounting or a tilt is estimated.
+    line_prior : (K, 2) float64 or None
+        Where lines are believed to be (m): it bounds those that bearings leave open.
     """
 
     steps: FloatArray
@@ -64,6 +66,7 @@ class Graph:
     member_line: IntArray
     camera_xy: FloatArray
     camera: Camera | None = None
+    line_prior: FloatArray | None = None
 
     @property
     def disc_row_counts(self) -> IntArray:

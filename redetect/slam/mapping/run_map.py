@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.least_squares.solver import LossKind
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
 from redetect.slam.mapping.connection import check_connected
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import Loss, Weighting
+from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.marginals import Marginals, marginals
-from redetect.slam.mapping.solve import Solution, solve
+from redetect.slam.mapping.solve import Marginals, Solution, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -240,7 +240,7 @@ def _with_lines(
         ids, xy = ids[good], estimate.line_xy[good]
 
 
-def _descent(solver: Solver, loss: Loss) -> Callable[[Graph, Estimate, Weighting], Solution]:
+def _descent(solver: Solver, loss: LossKind) -> Callable[[Graph, Estimate, Weighting], Solution]:
     if solver == "gtsam":
         return solve_gtsam
     # A robust loss converges slowly at last: reweighting is no Newton's method.
