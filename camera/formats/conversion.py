@@ -14,7 +14,7 @@ from camera.calibration.model import free_span, is_possible, project_points
 from camera.calibration.projection import UNPOSED, intrinsics_of, with_intrinsics
 from camera.distortion import NO_POLYNOMIAL
 from camera.errors import CameraError, ConversionError
-from camera.formats.conversion_fit import EXACT_PX, least_squares, smallest_largest
+from camera.formats.conversion_fit import EXACT_PX, CameraFit, smallest_largest
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
 from camera.model import Camera
 
@@ -133,7 +133,8 @@ def convert_to_foreign(
 
     every = np.eye(len(start))
     spans = [every[:, : 4 + count] for count in _stages(model, number)]
-    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
+    fit = CameraFit(project, every, pixels, possible)
+    best = _nearest(fit, camera_of, start, spans, check)
     if best is None:
         raise ConversionError(f"no {model} camera sees what the source sees")
     return best
@@ -224,10 +225,11 @@ def convert_to_camera(
     )
     moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
     wavy = _wavy_start(start, radius, moved)
-    best = _nearest(project, camera_of, start, spans, pixels, possible, check, wavy)
+    fit = CameraFit(project, together, pixels, possible)
+    best = _nearest(fit, camera_of, start, spans, check, wavy)
     if best is None or best.deviation_px > _NEAR_PX:
         nearest = start if best is None else _intrinsics(best)
-        fuller = _nearest(project, camera_of, nearest, [together], pixels, possible, check)
+        fuller = _nearest(fit, camera_of, nearest, [together], check)
         if best is None or (fuller is not None and fuller.deviation_px < best.deviation_px):
             best = fuller
     if best is None:
@@ -255,12 +257,10 @@ def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> Flo
 
 
 def _nearest(
-    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    fit: CameraFit,
     camera_of: Callable[[FloatArray], AnyCamera],
     start: FloatArray,
     spans: list[FloatArray],
-    pixels: FloatArray,
-    possible: Callable[[FloatArray], bool],
     check: tuple[FloatArray, FloatArray],
     other_start: FloatArray | None = None,
 ) -> Converted | None:
@@ -284,22 +284,20 @@ def _nearest(
 
     span = spans[0]
     for wider in spans:
-        parameters = least_squares(project, parameters, wider, pixels, possible)
+        parameters = fit._replace(span=wider).fitted(parameters)
         if keep(parameters):
             nearest, span = parameters, wider
         if best is not None and best.deviation_px < EXACT_PX:
             return best
     if (
         other_start is not None
-        and possible(other_start)
+        and fit.possible(other_start)
         and (best is None or best.deviation_px > _NEAR_PX)
     ):
-        parameters = least_squares(
-            project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS
-        )
+        parameters = fit._replace(span=spans[-1]).fitted(other_start, _MANY_STEPS)
         if keep(parameters):
             nearest, span = parameters, spans[-1]
-    keep(smallest_largest(project, nearest, span, pixels, possible))
+    keep(smallest_largest(fit._replace(span=span), nearest))
     return best
 
 
