@@ -41,22 +41,7 @@ _LAST_STEP = 1e-9
 def radial_factor(
     radius: NDArray[np.float64], coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> NDArray[np.float64]:
-    """f(r), the factor by which the distortion moves a point along its radius.
-
-    Parameters
-    ----------
-    radius : array
-        Undistorted normalised radii (dimensionless, >= 0).
-    coef : tuple of 5 floats
-        a2, a3, b1, b2, b3.
-    polynomial : tuple of 3 floats, optional
-        k1, k2, k3.
-
-    Returns
-    -------
-    array
-        f(r), of the shape of `radius`.
-    """
+    """f(r), the factor by which the distortion moves a point along its radius."""
     a2, a3, b1, b2, b3 = coef
     numerator = radius * (a2 + radius * a3)
     denominator = 1.0 + radius * (b1 + radius * (b2 + radius * b3))
@@ -156,18 +141,6 @@ def undistorted_radius(
     g of the result is always right to the last digits.)
 
     Newton's method, kept inside the cell of a table of g.
-
-    Parameters
-    ----------
-    distorted : array
-        Distorted normalised radii (>= 0).
-    coef, polynomial
-        As in `radial_factor`.
-
-    Returns
-    -------
-    array
-        Undistorted radii; NaN where no ray is seen at that radius.
     """
     target = np.asarray(distorted, dtype=np.float64)
     table_g, table_r = inverse_table(coef, polynomial)

@@ -194,13 +194,7 @@ def project_estimate(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of all points, and their derivatives.
 
-    Returns
-    -------
-    pixels : (N, 2) array
-    by_intrinsics : (N, 2, 14) array
-    by_pose : (N, 2, 6) array
-        By the rotation (from the left, about the board's origin) and the translation of the
-        point's own view.
+    Returns `pixels` (N, 2), `by_intrinsics` (N, 2, 14), `by_pose` (N, 2, 6).
     """
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
@@ -222,23 +216,7 @@ def adjust(
 ) -> Adjusted:
     """Fit intrinsics and poses by the reprojection error.
 
-    Parameters
-    ----------
-    start : Estimate
-        Must project all points.
-    points : Points
-    span : (14, K) array
-        Directions in which the intrinsics may change (`free_span`); K = 0 fits poses alone.
-    robust : bool
-        Huber's loss per coordinate, at `HUBER` standard deviations.
-    sigma_px : float, optional
-        Noise of a coordinate, if it is known; else it is found from the residuals.
-    tolerance : float
-        Relative decrease of the cost at which a fit ends.
-
-    Returns
-    -------
-    Adjusted
+    Takes `span` (14, K).
     """
     estimate = start
     loss = Loss("huber", HUBER) if robust else Loss()

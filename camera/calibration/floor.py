@@ -83,28 +83,7 @@ def place_on_floor(
 ) -> FloorPose:
     """The camera's pose from points on the floor.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its intrinsics; its pose does not matter.
-    pixels : (N, 2) array
-        Where the points are seen.
-    floor_xy : (N, 2) array
-        Where they are, robot X and Y in metres.
-    intrinsics_covariance : (14, 14) array, optional
-        Of `calibration_model.INTRINSICS`; zero if not given.
-    radius_m : float
-        Where the points are the centroids of circles' images, the circles' radius: it takes off
-        what perspective and lens move them.
-
-    Returns
-    -------
-    FloorPose
-
-    Raises
-    ------
-    CalibrationError
-        If there are too few points, they lie in a line, or no pose above the floor sees them.
+    Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor)

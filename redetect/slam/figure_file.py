@@ -27,30 +27,7 @@ _WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 def picture(
     png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
 ) -> Iterator[Figure]:
-    """A figure to draw into; at the end it is written and, on request, shown.
-
-    Parameters
-    ----------
-    png : Path
-        The picture's file.
-    size : (float, float)
-        Width and height (inches of `DPI` pixels).
-    overwrite : bool
-        Whether an existing file may be replaced.
-    interactive : bool
-        Show a window as well, and wait until it is closed.
-
-    Yields
-    ------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    SlamError
-        If a window is requested but cannot be opened.
-    """
+    """A figure to draw into; at the end it is written and, on request, shown."""
     if not overwrite and png.exists():  # before the work instead of after it
         raise OutputExistsError(png)
     with mpl.rc_context():

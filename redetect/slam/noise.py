@@ -75,16 +75,6 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
 
     Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
     comment at the head says what was added. Without noise the rows come out as they are.
-
-    Parameters
-    ----------
-    rows : iterable of Row
-        As `redetect.landmarks.read_rows` gives them.
-    noise : AddedNoise
-
-    Yields
-    ------
-    Row
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])

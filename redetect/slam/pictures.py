@@ -49,26 +49,7 @@ def pose_errors(
 ) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
     """Errors of a path's poses, their standard deviations, and the normalised error squared.
 
-    Parameters
-    ----------
-    path : Path2D
-        The estimate.
-    reference : (N, 3) array_like
-        True poses in the same map, one for each of the path's.
-
-    Returns
-    -------
-    error : (N, 3) float64
-        Estimate less truth: x, y (m), theta (rad, wrapped).
-    sigma : (N, 3) float64 or None
-        Standard deviations; None where the path has no covariance.
-    nees : (N,) float64 or None
-        Normalised estimation error squared; NaN where a covariance is singular, as a start's is.
-
-    Raises
-    ------
-    SlamError
-        If there is not one reference pose for each pose.
+    Takes `reference` (N, 3); returns `error` (N, 3), `sigma` (N, 3), `nees` (N,).
     """
     truth = np.asarray(reference, dtype=np.float64)
     if truth.shape != path.poses.shape:
@@ -90,19 +71,7 @@ def pose_errors(
 def ellipse_outlines(xy: ArrayLike, covariance: ArrayLike, sigmas: float = 3.0) -> FloatArray:
     """Outlines of covariance ellipses.
 
-    Parameters
-    ----------
-    xy : (M, 2) array_like
-        Centres (m).
-    covariance : (M, 2, 2) array_like
-        Positive semidefinite (m^2).
-    sigmas : float
-        Mahalanobis distance of the outline.
-
-    Returns
-    -------
-    (M, K, 2) float64
-        Points round each ellipse (m).
+    Takes `xy` (M, 2), `covariance` (M, 2, 2); returns (M, K, 2).
     """
     centre = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
     spread, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64).reshape(-1, 2, 2))
@@ -201,26 +170,7 @@ def draw_errors(
 ) -> None:
     """Draw position and heading error over the steps, and the normalised error squared.
 
-    Parameters
-    ----------
-    png : Path
-        The picture's file.
-    path : Path2D
-        The estimate. Without covariance there is no band and no normalised error.
-    reference : (N, 3) array_like
-        True poses in the same map.
-    title : str
-        Drawn above the picture.
-    overwrite, interactive : bool
-        As for `draw_map`.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    SlamError
-        If there is not one reference pose for each pose, or `interactive` where no window can be
-        opened.
+    Takes `reference` (N, 3).
     """
     error, sigma, nees = pose_errors(path, reference)
     step = np.arange(len(error))
@@ -408,17 +358,7 @@ def picture_of_frame(folder: Path, prefix: str) -> Path | None:
 
 
 def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool = False) -> None:
-    """Draw parts of images side by side, a cross-hair with a gap in the middle of each.
-
-    Parameters
-    ----------
-    png : Path
-        The picture's file.
-    crops : sequence of Crop
-    title : str
-    overwrite : bool
-        Whether an existing file may be replaced.
-    """
+    """Draw parts of images side by side, a cross-hair with a gap in the middle of each."""
     rows = -(-len(crops) // _CROPS_ABREAST)
     size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
     with picture(png, size, overwrite=overwrite, interactive=False) as figure:

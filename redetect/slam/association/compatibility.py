@@ -61,26 +61,7 @@ def nearest_compatible(
 ) -> Pairing:
     """Nearest neighbour with Mahalanobis gate: closest pairs first, each row and landmark once.
 
-    Parameters
-    ----------
-    innovations : (n, m, d) array_like
-        Measurement of row i minus the prediction for landmark j (bearings wrapped by the caller).
-    predicted_covariance : (m d, m d) array_like
-        Of the predictions, H P H^T of all m landmarks stacked; only its diagonal d x d blocks
-        count here.
-    noise : (n, d, d) array_like
-        Covariance R of each row's measurement.
-    gate_probability : float
-        Share of right pairs that pass the gate, in (0, 1).
-
-    Returns
-    -------
-    Pairing
-
-    Raises
-    ------
-    SlamError
-        If the shapes do not fit or the probability is not in (0, 1).
+    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     width = innovation.shape[2]
@@ -100,31 +81,11 @@ def joint_compatible(
 ) -> Pairing:
     """The largest set of pairs that are compatible jointly; among equals the most likely one.
 
-    Branch and bound. Every pair must pass the individual gate, and all k pairs together the gate
-    of d k degrees of freedom. Unlike the published search, a branch is only given up where no set
+    Branch and bound. Every pair must pass the individual gate, and all k pairs together the gate of
+    d k degrees of freedom. Unlike the published search, a branch is only given up where no set
     below it can pass, so that the result does not depend on the order of the rows.
 
-    Parameters
-    ----------
-    innovations : (n, m, d) array_like
-        Measurement of row i minus the prediction for landmark j (bearings wrapped by the caller).
-    predicted_covariance : (m d, m d) array_like
-        Joint covariance of the predictions: H P H^T with the rows of H of all m landmarks stacked.
-    noise : (n, d, d) array_like
-        Covariance R of each row's measurement; rows are independent of each other.
-    gate_probability : float
-        Share of right sets of pairs that pass the gate, in (0, 1).
-    most_nodes : int
-        Pairs that are tried before the best set so far has to do.
-
-    Returns
-    -------
-    Pairing
-
-    Raises
-    ------
-    SlamError
-        If the shapes do not fit or the probability is not in (0, 1).
+    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     n, _, width = innovation.shape
@@ -139,24 +100,7 @@ def joint_compatible(
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
     """Largest squared distances of 0, 1, 2, ... pairs that stay below with a probability.
 
-    Parameters
-    ----------
-    probability : float
-        In (0, 1).
-    width : int
-        Degrees of freedom of a pair.
-    most_pairs : int
-        Largest number of pairs to return.
-
-    Returns
-    -------
-    (max(most_pairs, 1) + 1,) float64
-        Entry k belongs to k pairs.
-
-    Raises
-    ------
-    SlamError
-        If the probability is not in (0, 1).
+    Returns (most_pairs, 1).
     """
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")

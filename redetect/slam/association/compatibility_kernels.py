@@ -105,12 +105,7 @@ def search_jointly(
     individual distances (n, m), the joint gate of k pairs `gates[k]` (n + 1), and how many pairs
     may be tried.
 
-    Returns
-    -------
-    partner : (n,) int64
-    squared distance : float
-    nodes : int
-        Pairs tried; `most_nodes` where the search was cut short.
+    Returns `partner` (n,), `squared distance`, `nodes`.
     """
     n, m, width = innovations.shape
     # Rows with few candidates first: they decide most.

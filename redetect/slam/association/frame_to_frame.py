@@ -122,20 +122,7 @@ def associate_locally(
 ) -> LocalAssociation:
     """Label the rows of a run, frame by frame, ignoring IDs in the file.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    settings : LocalSettings, optional
-        By default as `LocalSettings` says.
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m): bearings of lines are from there.
-    progress : callable, optional
-        Called with the number of frames done.
-
-    Returns
-    -------
-    LocalAssociation
+    Takes `camera_xy` (2,).
     """
     setting = settings or LocalSettings()
     circles, lines = recording.circles, recording.lines

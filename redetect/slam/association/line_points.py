@@ -112,29 +112,8 @@ def lines_by_points(
 ) -> tuple[IntArray, FloatArray]:
     """Labels of the rows of verticals, by the points in which they meet.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    path : (N + 1, 3) float64
-        Its poses, as the discs give them.
-    circle_labels : (n,) int64
-        Disc of each row.
-    line_labels : (m,) int64
-        Label of each row of a vertical as it was found frame to frame: that of rows for which no
-        point is found.
-    settings : PointSettings, optional
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-    disc_sigma_scale : float
-        Factor on the discs' standard deviations.
-
-    Returns
-    -------
-    labels : (m,) int64
-        From 0.
-    path : (N + 1, 3) float64
-        The path that the points helped to find.
+    Takes `path` (N + 1, 3), `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,); returns
+    `labels` (m,), `path` (N + 1, 3).
     """
     setting = settings or PointSettings()
     for _ in range(_FIRST_ROUNDS):
@@ -177,20 +156,7 @@ def rays_of(
 ) -> Rays:
     """The rows of verticals as rays in the map.
 
-    Parameters
-    ----------
-    recording : Recording
-    path : (N + 1, 3) float64
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-    sigma_scale : float
-        Factor on the rows' standard deviations.
-    heading_sigma_rad : float
-        Of the path's heading in a single frame.
-
-    Returns
-    -------
-    Rays
+    Takes `path` (N + 1, 3), `camera_xy` (2,).
     """
     lines = recording.lines
     row = np.lexsort((lines.bearing_rad, lines.frame))
@@ -212,17 +178,7 @@ def rays_of(
 def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArray]:
     """The points in which rays meet, the best first.
 
-    Parameters
-    ----------
-    rays : Rays
-    setting : PointSettings
-
-    Returns
-    -------
-    labels : (n,) int64
-        The point of each row, -1 without one.
-    points : (k, 2) float64
-        In the map (m).
+    Returns `labels` (n,), `points` (k, 2).
     """
     points, frames = crossings(
         rays,

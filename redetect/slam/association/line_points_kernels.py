@@ -104,21 +104,7 @@ def crossings(
 ) -> tuple[FloatArray, IntArray]:
     """Where rays of frames that are some steps apart cross, ahead of both.
 
-    Parameters
-    ----------
-    rays : Rays
-    gaps : (g,) int64
-        Distances of frames that are tried.
-    least_parallax : float
-        Least angle between two rays, in standard deviations of it.
-    farthest_m : float
-        Crossings farther away than this do not count.
-
-    Returns
-    -------
-    points : (k, 2) float64
-    frames : (k,) int64
-        The first of the two frames.
+    Takes `gaps` (g,); returns `points` (k, 2), `frames` (k,).
     """
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
@@ -224,20 +210,7 @@ def take_points(
 ) -> tuple[IntArray, FloatArray]:
     """The best of all points with the rays that it takes, then the best by the other rays, ...
 
-    Parameters
-    ----------
-    points : (k, 2) float64
-    frames : (k,) int64
-        See `crossings`.
-    rays : Rays
-    search : Search
-
-    Returns
-    -------
-    labels : (n,) int64
-        The point of each ray, -1 without one.
-    found : (m, 2) float64
-        In the map (m).
+    Takes `points` (k, 2), `frames` (k,); returns `labels` (n,), `found` (m, 2).
     """
     # How much likelier a ray is from a vertical than from anywhere, as a logarithm.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)

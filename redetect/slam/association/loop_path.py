@@ -40,21 +40,7 @@ def intersect_bearings(
 ) -> FloatArray:
     """Places of lines from the bearings of all rows that saw them, the path being known.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    path : (N + 1, 3) float64
-        Its poses.
-    labels : (n,) int64
-        Label of each line row, from 0.
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    (L, 2) float64
-        NaN where the place is less certain than 0.5 m, or behind the camera.
+    Takes `path` (N + 1, 3), `labels` (n,), `camera_xy` (2,); returns (L, 2).
     """
     lines = recording.lines
     count = int(labels.max(initial=-1)) + 1

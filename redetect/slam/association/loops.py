@@ -148,20 +148,7 @@ def stretches_of(
 ) -> list[Stretch]:
     """The constellations along a run.
 
-    Parameters
-    ----------
-    frames, labels : (n,) int64
-        Frame and landmark of each row, by frame.
-    xy : (M, 2) float64
-        Places of the landmarks by label (m); those that are NaN are left out.
-    count : int
-        Frames of the run.
-    settings : LoopSettings
-
-    Returns
-    -------
-    list of Stretch
-        Those with enough landmarks for a match.
+    Takes `frames, labels` (n,), `xy` (M, 2).
     """
     found = []
     for start in range(0, max(count - settings.stretch_frames // 2, 1), settings.stride_frames):
@@ -194,21 +181,8 @@ def find_matches(
 ) -> list[Match]:
     """All pairs of stretches that show one place more surely than by chance.
 
-    Landmarks that two stretches share already are left out; stretches that share three or more
-    need no match.
-
-    Parameters
-    ----------
-    stretches : list of Stretch
-        In the order of the run.
-    settings : LoopSettings
-    progress : callable, optional
-        Called with the progress of the search.
-
-    Returns
-    -------
-    list of Match
-        The surest first.
+    Landmarks that two stretches share already are left out; stretches that share three or more need
+    no match.
     """
     candidates: list[tuple[Stretch, Stretch, BoolArray, BoolArray, float, FloatArray]] = []
     tried = 0
@@ -267,16 +241,7 @@ def find_matches(
 def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]:
     """The rigid motion of least squares between paired points of the plane.
 
-    Parameters
-    ----------
-    moved, fixed : (n, 2) float64
-        Points and where they go (m).
-
-    Returns
-    -------
-    turn_rad : float
-    shift : (2,) float64
-        x -> R(turn) x + shift.
+    Takes `moved, fixed` (n, 2); returns `turn_rad`, `shift` (2,).
     """
     first, second = moved.mean(axis=0), fixed.mean(axis=0)
     a, b = moved - first, fixed - second
@@ -287,17 +252,7 @@ def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
     """Points of two sets that are each other's nearest, and near.
 
-    Parameters
-    ----------
-    first, second : (n, 2), (m, 2) float64
-        Points (m).
-    reach_m : float
-        Largest distance of a pair.
-
-    Returns
-    -------
-    (k, 2) int64
-        Indices into both.
+    Takes `first, second` (n, 2), (m, 2); returns (k, 2).
     """
     if len(first) == 0 or len(second) == 0:
         return np.zeros((0, 2), dtype=np.int64)
@@ -313,21 +268,6 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
 
     Two of the landmarks agree because the motion was made from them; of the others each agrees by
     chance with probability `chance`.
-
-    Parameters
-    ----------
-    agreeing : int
-        Landmarks that agree.
-    present : int
-        Landmarks that could have.
-    chance : float
-        Probability that a landmark at random falls near one of the other constellation.
-    tried : int
-        Number of motions tried.
-
-    Returns
-    -------
-    float
     """
     tail = float(binom.logsf(agreeing - 3, max(present - 2, 0), min(chance, 1.0)))
     return float(np.log10(max(tried, 1)) + tail / np.log(10.0))

@@ -52,20 +52,11 @@ class AssociationScore:
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:
     """Score labels.
 
-    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`,
-    and for the one-to-one matching, a row with several IDs counts as the one among them that most
-    rows of its label have.
+    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`, and
+    for the one-to-one matching, a row with several IDs counts as the one among them that most rows
+    of its label have.
 
-    Parameters
-    ----------
-    labels : (n,) int64
-        Labels found, at least 0; -1 for rows that were given none.
-    ids : sequence of n tuples of int
-        The file's IDs of each row; empty where unknown.
-
-    Returns
-    -------
-    AssociationScore
+    Takes `labels` (n,).
     """
     known = [k for k, listed in enumerate(ids) if listed]
     names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}

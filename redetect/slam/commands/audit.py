@@ -69,21 +69,7 @@ def perform(options: Options) -> int:
 
 
 def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
-    """Rows of a file, those that contradict mended or left out; all other bytes as they were.
-
-    Parameters
-    ----------
-    rows : iterable of Row
-        The file's.
-    audit : Audit
-        Of its discs.
-    apply : "mend" or "drop"
-        Give rows their new identifier (-1 where nothing explains them), or leave them out.
-
-    Yields
-    ------
-    Row
-    """
+    """Rows of a file, those that contradict mended or left out; all other bytes as they were."""
     new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
     disc = -1
     for row in rows:

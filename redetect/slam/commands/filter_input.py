@@ -21,19 +21,7 @@ FloatArray = NDArray[np.float64]
 def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
     """Rows of the run that a command names, and where its camera is.
 
-    Returns
-    -------
-    recording : Recording
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m); zero where there are no lines, which alone need
-        it.
-
-    Raises
-    ------
-    SlamError
-        If there is nothing to use, or lines without a calibration.
-    camera.CameraError
-        If the calibration is malformed.
+    Returns `recording`, `camera_xy` (2,).
     """
     recording = recording_of(flags)
     return recording, camera_xy_of(recording, flags.run, flags.camera)
@@ -48,13 +36,7 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
 
 
 def read_reference(path: Path, poses: Path2D) -> Path2D:
-    """A path to compare with, which must be of the same run.
-
-    Raises
-    ------
-    SlamError
-        If it has not as many poses.
-    """
+    """A path to compare with, which must be of the same run."""
     reference = read_path(path)
     if len(reference.poses) != len(poses.poses):
         raise SlamError(

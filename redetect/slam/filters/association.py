@@ -81,22 +81,7 @@ class Associator:
     def identified(
         self, rows: FrameRows, estimate: Estimate, new_id: Callable[[], int] | None = None
     ) -> FrameRows:
-        """Rows with the identifiers of the landmarks they are found to show.
-
-        Parameters
-        ----------
-        rows : FrameRows
-            A frame's rows. Unless association is known, their identifiers are ignored.
-        estimate : Estimate
-            The filter, predicted to that frame.
-        new_id : callable, optional
-            Gives an unused identifier for a disc that is far from all known ones; without it such
-            rows stay unknown.
-
-        Returns
-        -------
-        FrameRows
-        """
+        """Rows with the identifiers of the landmarks they are found to show."""
         if self.method == "known":
             return rows
         discs = self._discs(rows, estimate, new_id) if rows.disc_ids else ()

@@ -68,21 +68,8 @@ def triangulate(
 ) -> FloatArray | None:
     """The most likely place of a line that bearings from several poses show.
 
-    Parameters
-    ----------
-    poses : (k, 3) float64
-        Poses of the robot in the map, two or more.
-    bearing_rad, sigma_rad : (k,) float64
-        Bearings and their standard deviations.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-    pose_covariance : (3 k, 3 k) float64, optional
-        Of the poses; by default they are exact.
-
-    Returns
-    -------
-    (2,) float64, or None
-        None if the rays have no parallax, or do not meet in front of the camera.
+    Takes `poses` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,), `pose_covariance` (3 k, 3
+    k); returns (2,).
     """
     origin = disc_in_map(poses, camera_xy)
     angle = poses[:, 2] + bearing_rad
@@ -131,20 +118,8 @@ def bearing_rows(
 ) -> tuple[FloatArray, FloatArray]:
     """Jacobians of one line's bearings by the poses and by its place.
 
-    Parameters
-    ----------
-    poses, line_xy : (k, 3), (2,) float64
-        Latest estimates.
-    poses_at, line_at : (k, 3), (2,) float64
-        Where the offset of the line from the robot, which the heading turns, is taken from: the
-        same, or first estimates.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    by_pose : (k, 3) float64
-    by_line : (k, 2) float64
+    Takes `poses, line_xy` (k, 3), (2,), `poses_at, line_at` (k, 3), (2,), `camera_xy` (2,); returns
+    `by_pose` (k, 3), `by_line` (k, 2).
     """
     seen = disc_in_robot(poses, line_xy) - camera_xy
     by_seen = np.stack([-seen[:, 1], seen[:, 0]], axis=-1) / np.sum(seen**2, axis=1)[:, None]
@@ -168,21 +143,8 @@ def start_line(
 ) -> LineStart | None:
     """Place a line by bearings from several poses.
 
-    Parameters
-    ----------
-    poses, poses_at : (k, 3) float64
-        Latest estimates of the poses, and where Jacobians are evaluated.
-    bearing_rad, sigma_rad : (k,) float64
-        The bearings.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-    pose_covariance : (3 k, 3 k) float64
-        Of the poses.
-
-    Returns
-    -------
-    LineStart, or None
-        None if they do not meet; see `triangulate`.
+    Takes `poses, poses_at` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,),
+    `pose_covariance` (3 k, 3 k).
     """
     xy = triangulate(poses, bearing_rad, sigma_rad, camera_xy, pose_covariance)
     if xy is None:
@@ -205,16 +167,7 @@ def start_line(
 def relative_range_sigma(pose: FloatArray, line_xy: FloatArray, covariance: FloatArray) -> float:
     """Standard deviation of a line's distance from the robot, over that distance.
 
-    Parameters
-    ----------
-    pose, line_xy : (3,), (2,) float64
-        Of the robot and of the line.
-    covariance : (5, 5) float64
-        Of both.
-
-    Returns
-    -------
-    float
+    Takes `pose, line_xy` (3,), (2,), `covariance` (5, 5).
     """
     offset = line_xy - pose[:2]
     distance = float(np.hypot(*offset))

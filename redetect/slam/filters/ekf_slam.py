@@ -103,12 +103,7 @@ class EkfSlam:
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step.
 
-        Parameters
-        ----------
-        step : (3,) array
-            dx, dy (m), dphi (rad).
-        noise : (3, 3) array
-            Its covariance.
+        Takes `step` (3,), `noise` (3, 3).
         """
         state, at = self._state, self._linearised
         cos, sin = np.cos(state[2]), np.sin(state[2])
@@ -126,10 +121,6 @@ class EkfSlam:
 
         Rows without ID are left out, and so are rows of several lines of which not all are in the
         map yet. A row of several lines measures the mean of their bearings.
-
-        Parameters
-        ----------
-        rows : FrameRows
         """
         discs, lines = [], []
         new_discs: dict[int, int] = {}

@@ -63,21 +63,7 @@ class FrameRows:
     ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
         """Innovation of some of the rows.
 
-        Parameters
-        ----------
-        discs, lines : sequences of int
-            The rows, by their places here; all of known landmarks.
-        disc_slots, line_slots : mappings of int to int
-            Where in the state each landmark begins.
-        state, linearised_at : (n,) float64
-            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
-        camera_xy : (2,) float64
-            The camera's centre in the robot frame (m).
-
-        Returns
-        -------
-        innovation, jacobian, noise, index
-            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
+        Takes `state, linearised_at` (n,), `camera_xy` (2,).
         """
         line_ids = [self.line_ids[k] for k in lines]
         return frame_innovation(

@@ -61,28 +61,8 @@ def frame_innovation(
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Measured minus predicted, its Jacobian and its noise, for all rows of a frame.
 
-    Parameters
-    ----------
-    state : (n,) float64
-        Pose, then landmarks; predictions are made from it.
-    linearised_at : (n,) float64
-        Where the offset of landmarks from the robot, which the heading turns, is taken from:
-        usually the same. With first estimates a frame turned as a whole is no innovation.
-    discs : MeasuredDiscs
-    lines : MeasuredLines
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    innovation : (m,) float64
-        m = 2 d + l; bearings wrapped.
-    jacobian : (m, 3 + 2 d + 2 e) float64
-        By the numbers of the state that `index` names.
-    noise : (m, m) float64
-        Covariance of the measurements.
-    index : (3 + 2 d + 2 e,) int64
-        Into the state. A landmark that several rows show is included several times.
+    Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
+    `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
     """
     disc_count, line_count = len(discs.slot), len(lines.bearing_rad)
     rows = 2 * disc_count + line_count

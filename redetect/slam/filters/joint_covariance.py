@@ -96,12 +96,7 @@ class JointCovariance:
     def move_pose(self, by_pose: FloatArray, noise: FloatArray) -> None:
         """The pose moves: P becomes F P F^T + Q, F the identity except for the pose.
 
-        Parameters
-        ----------
-        by_pose : (3, 3) array
-            F's block of the pose.
-        noise : (3, 3) array
-            Q's block of the pose.
+        Takes `by_pose` (3, 3), `noise` (3, 3).
         """
         base, size = self._base, self.size
         base[POSE_SIZE:size, :POSE_SIZE] = base[POSE_SIZE:size, :POSE_SIZE] @ by_pose.T
@@ -115,26 +110,8 @@ class JointCovariance:
     ) -> tuple[FloatArray, float]:
         """Subtract K S K^T.
 
-        Parameters
-        ----------
-        projected : (size, m) array
-            P H^T, see `projected`.
-        innovation_covariance : (m, m) array
-            S = H P H^T + R.
-        innovation : (m,) array
-            Measured minus predicted.
-
-        Returns
-        -------
-        change : (size,) float64
-            K times the innovation: what the state changes by.
-        squared : float
-            The innovation squared, normalised by S.
-
-        Raises
-        ------
-        SlamError
-            If S is not positive definite.
+        Takes `projected` (size, m), `innovation_covariance` (m, m), `innovation` (m,); returns
+        `change`, `squared`.
         """
         try:
             root = np.linalg.cholesky(innovation_covariance)
@@ -159,19 +136,7 @@ class JointCovariance:
     def append(self, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> int:
         """Add numbers that depend on the state and on a measurement.
 
-        Parameters
-        ----------
-        index : (k,) int64 array
-            Indices of the state that they depend on.
-        jacobian : (d, k) array
-            Their derivative by that.
-        noise : (d, d) array
-            Covariance that the measurement adds.
-
-        Returns
-        -------
-        int
-            Where they begin in the state.
+        Takes `index` (k,), `jacobian` (d, k), `noise` (d, d).
         """
         first = self.size
         self._make_room(first + len(jacobian))

@@ -14,16 +14,7 @@ IntArray = NDArray[np.int64]
 def symmetric_columns(lower: FloatArray, size: int, index: IntArray, columns: FloatArray) -> None:
     """Copy columns of a symmetric matrix.
 
-    Parameters
-    ----------
-    lower : (capacity, capacity) float64, column by column in memory
-        Its lower triangle; the upper is not used.
-    size : int
-        Rows to copy.
-    index : (k,) int64
-        The columns wanted.
-    columns : (size, k) float64, column by column in memory
-        Written.
+    Takes `index` (k,), `columns` (size, k).
     """
     for k in range(len(index)):
         c = index[k]
@@ -37,16 +28,7 @@ def symmetric_columns(lower: FloatArray, size: int, index: IntArray, columns: Fl
 def set_symmetric_rows(lower: FloatArray, size: int, first: int, rows: FloatArray) -> None:
     """Overwrite adjacent rows (and so columns) of a symmetric matrix.
 
-    Parameters
-    ----------
-    lower : (capacity, capacity) float64, column by column in memory
-        Its lower triangle, changed in place.
-    size : int
-        Rows and columns in use.
-    first : int
-        The first row to overwrite.
-    rows : (k, size) float64
-        New values; the block on the diagonal is symmetric.
+    Takes `rows` (k, size).
     """
     for k in range(len(rows)):
         r = first + k
@@ -60,16 +42,7 @@ def set_symmetric_rows(lower: FloatArray, size: int, first: int, rows: FloatArra
 def symmetric_block(lower: FloatArray, index: IntArray) -> FloatArray:
     """Rows and columns of a symmetric matrix.
 
-    Parameters
-    ----------
-    lower : (capacity, capacity) float64, column by column in memory
-        Its lower triangle; the upper is not used.
-    index : (k,) int64
-        The rows, and columns, wanted.
-
-    Returns
-    -------
-    (k, k) float64
+    Takes `index` (k,); returns (k, k).
     """
     count = len(index)
     block = np.empty((count, count))

@@ -108,14 +108,7 @@ class Localizer:
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns of the joint covariance of pose and map.
 
-        Parameters
-        ----------
-        index : (3 + 2 k,) int64 array
-            The pose, and then landmarks, of which each may be there several times.
-
-        Returns
-        -------
-        (3 + 2 k, 3 + 2 k) float64
+        Takes `index` (3 + 2 k,); returns (3 + 2 k, 3 + 2 k).
         """
         landmarks = index[_POSE_SIZE:] - _POSE_SIZE
         cross = self._cross[:, landmarks]
@@ -125,12 +118,7 @@ class Localizer:
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step.
 
-        Parameters
-        ----------
-        step : (3,) array
-            dx, dy (m), dphi (rad).
-        noise : (3, 3) array
-            Its covariance.
+        Takes `step` (3,), `noise` (3, 3).
         """
         by_pose, by_step = move_jacobians(self.pose, step)
         self._state[:_POSE_SIZE] = move(self.pose, step)
@@ -148,15 +136,6 @@ class Localizer:
         """Use the rows of a frame whose landmarks are in the map; the others are left out.
 
         A row of several lines measures the mean of their bearings.
-
-        Parameters
-        ----------
-        rows : FrameRows
-
-        Raises
-        ------
-        SlamError
-            If the covariance of the innovation is not positive definite.
         """
         discs = [k for k, number in enumerate(rows.disc_ids) if number in self.disc_slots]
         lines = [

@@ -28,24 +28,7 @@ _ROBOTS = 5
 
 
 def read_robot(odometry: Path) -> RangeBearing:
-    """What a robot logged; other robots that it saw are left out.
-
-    Parameters
-    ----------
-    odometry : Path
-        `RobotN_Odometry.dat` (time, v, omega), beside its `RobotN_Measurement.dat` (time, barcode,
-        range, bearing) and the `Barcodes.dat` of all (subject, barcode).
-
-    Returns
-    -------
-    RangeBearing
-        A frame for each time of a measurement; landmarks are called by their subjects' numbers.
-
-    Raises
-    ------
-    SlamError
-        If a file cannot be read or is malformed, or nothing was measured.
-    """
+    """What a robot logged; other robots that it saw are left out."""
     velocity = _table(odometry, ("time", "v", "omega"))
     seen = _table(_beside(odometry, MEASUREMENTS), ("time", "barcode", "range", "bearing"))
     barcodes = _table(odometry.with_name(BARCODES), ("subject", "barcode"))
@@ -67,13 +50,7 @@ def read_robot(odometry: Path) -> RangeBearing:
 
 
 def read_truth(odometry: Path) -> Path2D:
-    """True poses of a robot at the times of its frames, and first that at the start.
-
-    Raises
-    ------
-    SlamError
-        If a file cannot be read or is malformed.
-    """
+    """True poses of a robot at the times of its frames, and first that at the start."""
     run = read_robot(odometry)
     truth = _table(_beside(odometry, TRUTH), ("time", "x", "y", "theta"))
     if len(truth) == 0:
@@ -86,13 +63,7 @@ def read_truth(odometry: Path) -> Path2D:
 
 
 def read_landmarks(path: Path) -> LandmarkMap:
-    """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map.
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read or is malformed.
-    """
+    """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map."""
     table = _table(path, ("subject", "x", "y", "x sigma", "y sigma"))
     table = table[np.argsort(table[:, 0])]
     covariance = np.zeros((len(table), 2, 2))

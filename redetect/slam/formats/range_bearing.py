@@ -46,18 +46,7 @@ class RangeBearing:
 
 
 def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame]:
-    """The run as frames, whose steps state no covariance; landmarks as discs.
-
-    Parameters
-    ----------
-    run : RangeBearing
-    sigma_m, sigma_rad : float
-        Standard deviations of ranges and bearings.
-
-    Returns
-    -------
-    list of Frame
-    """
+    """The run as frames, whose steps state no covariance; landmarks as discs."""
     xy, covariance = disc_of_range_and_bearing(run.range_m, run.bearing_rad, sigma_m, sigma_rad)
     starts = np.searchsorted(run.frame, np.arange(len(run.times) + 1))
     frames = []

@@ -33,23 +33,7 @@ _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
 
 
 def read_drive(drive: Path) -> RangeBearing:
-    """What the car logged, with the trees found in its scans.
-
-    Parameters
-    ----------
-    drive : Path
-        `aa3_dr.mat`, beside `aa3_lsr2.mat`.
-
-    Returns
-    -------
-    RangeBearing
-        A frame for each scan from the first row of dead reckoning on; trees are not identified.
-
-    Raises
-    ------
-    SlamError
-        If a file cannot be read or is not such a file.
-    """
+    """What the car logged, with the trees found in its scans."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
@@ -72,15 +56,7 @@ def read_drive(drive: Path) -> RangeBearing:
 def trees_of(scan: FloatArray) -> FloatArray:
     """Trunks in a scan: runs of beams of nearly one range with nothing near beside them.
 
-    Parameters
-    ----------
-    scan : (361,) float64
-        Ranges (m) every half degree, from the right to the left.
-
-    Returns
-    -------
-    (n, 2) float64
-        Range of the middle (m) and bearing (rad) of each.
+    Takes `scan` (361,); returns (n, 2).
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])

@@ -116,30 +116,7 @@ def audit_run(
     gate: float = 100.0,
     name: str = "run",
 ) -> Audit:
-    """Find the rows whose identifier contradicts the rest.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run, without lines.
-    camera : Camera, optional
-        As calibrated.
-    calibrate : bool
-        Estimate the camera's mounting as well.
-    gate : float
-        Squared error, in units of its covariance, from which on a row contradicts.
-    name : str
-        What messages call the run.
-
-    Returns
-    -------
-    Audit
-
-    Raises
-    ------
-    SlamError
-        If the run has lines; else as `map_run`.
-    """
+    """Find the rows whose identifier contradicts the rest."""
     if len(recording.lines):
         raise SlamError(f"{name}: has lines: expected discs, the only ones that are audited")
     plain = Weighting(calibrate=calibrate, row_errors="recorded")

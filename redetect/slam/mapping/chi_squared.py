@@ -53,21 +53,7 @@ class ChiSquared:
 
 
 def chi_squared(graph: Graph, estimate: Estimate, weighting: Weighting) -> ChiSquared:
-    """Tabulate the squared errors of an estimate.
-
-    Parameters
-    ----------
-    graph : Graph
-        The measurements.
-    estimate : Estimate
-        Where to evaluate them.
-    weighting : Weighting
-        What was unknown. Its loss does not matter: every row counts in full.
-
-    Returns
-    -------
-    ChiSquared
-    """
+    """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
     parts = [
         float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines, error.tilt)

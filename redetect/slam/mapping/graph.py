@@ -161,19 +161,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
 def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
     """The problem with the bearings of some lines.
 
-    Parameters
-    ----------
-    graph : Graph
-        Without lines.
-    rows : LineRows
-        All rows of lines. One that shows a line other than those to be estimated, or none that is
-        known, is left out.
-    line_ids : (K,) int64
-        The lines to be estimated, ascending.
-
-    Returns
-    -------
-    Graph
+    Takes `line_ids` (K,).
     """
     place = {int(number): k for k, number in enumerate(line_ids)}
     usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]

@@ -27,17 +27,7 @@ def nominal_mounting(camera: Camera) -> FloatArray:
 def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     """Rays from the camera as calibrated to rows' places on the floor.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    floor_xy : (n, 2) float64
-        Rows in the robot frame (m).
-
-    Returns
-    -------
-    (n, 3) float64
-        Directions in the robot frame, z below 0, not of unit length.
+    Takes `floor_xy` (n, 2); returns (n, 3).
     """
     on_floor = np.concatenate([floor_xy, np.zeros((len(floor_xy), 1))], axis=1)
     return np.asarray(on_floor - camera.centre)
@@ -105,22 +95,8 @@ def rows_as_recorded(
     The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
     the camera.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    floor_xy : (n, 2) float64
-        Discs in the robot frame (m).
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-    tilt : (n, 2) float64
-        Pitch and roll of the robot: x and y of a rotation vector in the robot frame (rad).
-
-    Returns
-    -------
-    rows_xy : (n, 2) float64
-        In the robot frame (m); NaN where the ray does not go down for the calibrated camera.
-    jacobians : RecordedJacobians
+    Takes `floor_xy` (n, 2), `mounting` (3, 4), `tilt` (n, 2); returns `rows_xy` (n, 2),
+    `jacobians`.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
     from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
@@ -146,16 +122,7 @@ def rows_as_recorded(
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
     """Rotation vector in the robot frame (rad) and height (m), true less calibrated.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-
-    Returns
-    -------
-    (4,) float64
+    Takes `mounting` (3, 4); returns (4,).
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     return np.append(
@@ -166,20 +133,7 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
 def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, FloatArray]:
     """By how much a camera is turned about the vertical against its calibration.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-
-    Returns
-    -------
-    angle : float
-        The turn of the plane nearest to the rotation (rad).
-    by_mounting : (4,) float64
-        Its derivatives by a rotation vector in the robot frame, applied to the mounting from the
-        left, and by the height.
+    Takes `mounting` (3, 4); returns `angle`, `by_mounting` (4,).
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     sin, cos = turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]
@@ -191,14 +145,7 @@ def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, Float
 
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
-    """See that rows can come from a camera at all.
-
-    Raises
-    ------
-    SlamError
-        If a row lies where the camera as calibrated cannot see the floor: the calibration is not
-        that of the run.
-    """
+    """See that rows can come from a camera at all."""
     pixels = camera.project_floor(floor_xy)
     outside = ~np.all(np.isfinite(pixels), axis=-1)
     if np.any(outside):
