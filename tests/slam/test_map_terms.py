@@ -19,8 +19,7 @@ from redetect.slam.mapping.graph_terms import (
 )
 from redetect.slam.mapping.solve import marginals, moved, solve
 from redetect.slam.models.measurement import bearing_of_vertical
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
-from redetect.slam.models.mounting import mounting_change, rows_as_recorded
+from redetect.slam.models.mounting import mounting_change, rotation_exp
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, small_run
 
@@ -137,24 +136,6 @@ def test_mounting_change_is_what_was_applied(published_camera: Camera) -> None:
     found = mounting_change(published_camera, mounting)
     # The file's rotation has six digits.
     np.testing.assert_allclose(found, [*vector, -0.045], atol=1e-5)
-
-
-def test_rows_as_recorded_go_through_the_lens_and_back(published_camera: Camera) -> None:
-    rng = np.random.default_rng(2)
-    floor = np.column_stack([rng.uniform(-1, 1, 20), rng.uniform(-3.5, -1.2, 20)])
-    tilt = 0.02 * rng.standard_normal((20, 2))
-    turn, _ = rotation_exp(np.array([-0.04, 0.01, 0.002]))
-    centre = published_camera.centre + np.array([0.0, 0.0, -0.02])
-    geometry = Geometry(np.zeros((20, 3)), floor, turn @ published_camera.rotation, centre, tilt)
-    every = np.arange(20)
-    pixels, by = predict_pixels(published_camera, geometry, every, every)
-    mounting = np.column_stack([geometry.rotation, centre])
-    rows, by_rows = rows_as_recorded(published_camera, floor, mounting, tilt)
-    np.testing.assert_allclose(rows, published_camera.floor_from_pixel(pixels), atol=1e-5)
-    into = published_camera.floor_jacobian(pixels)
-    np.testing.assert_allclose(by_rows.mounting, into @ by.mounting, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_rows.tilt, into @ by.tilt, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_rows.floor, into @ by.disc, rtol=1e-4, atol=1e-4)
 
 
 def test_first_sight_places_each_disc_where_its_first_row_does() -> None:

@@ -17,8 +17,7 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.slam.commands.run_camera import camera_of_run
-from redetect.slam.commands.run_rows import print_assumed, recording_of
+from redetect.slam.commands.inputs import camera_of_run, print_assumed, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import mrclam, victoria_park
 from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset

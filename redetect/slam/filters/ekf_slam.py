@@ -20,16 +20,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
+from redetect.slam.filters.association import Associator, run_filter
 from redetect.slam.filters.delayed_lines import relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     FilterRun,
     FrameRows,
     RowCount,
-    frames_of,
     unknown,
 )
 from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
@@ -90,6 +89,11 @@ class EkfSlam:
         self._linearised = self._state.copy() if jacobians == "first" else self._state
         self._waiting = WaitingLines()
         self._free_slots: list[int] = []
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3)."""
+        return self.covariance.pose()
 
     @property
     def state(self) -> FloatArray:
@@ -337,26 +341,6 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
             f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
             "only; expected known association, or a run without lines"
         )
-    new_id = count(1).__next__
-    disc_ids: list[int] = []
-    line_ids: list[tuple[int, ...]] = []
-    poses = np.empty((len(recording) + 1, POSE_SIZE))
-    covariance = np.empty((len(recording) + 1, POSE_SIZE, POSE_SIZE))
-    poses[0], covariance[0] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
-    for k, rows in enumerate(frames_of(recording)):
-        try:
-            ekf.predict(recording.steps[k], recording.step_covariance[k])
-            identified = pairing.identified(rows, ekf, new_id)
-            ekf.measure(identified)
-        except SlamError as error:
-            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
-        disc_ids.extend(identified.disc_ids)
-        line_ids.extend(identified.line_ids)
-        poses[k + 1], covariance[k + 1] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
+    filtered = run_filter(recording, ekf, pairing, count(1).__next__)
     ekf.finish()
-    return FilterRun(
-        path=Path2D(("start", *recording.prefixes), poses, covariance),
-        count=ekf.count,
-        disc_ids=np.array(disc_ids, dtype=np.int64),
-        line_ids=tuple(line_ids),
-    )
+    return filtered

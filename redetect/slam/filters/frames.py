@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +149,32 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
             bearing_rad=lines.bearing_rad[some],
             sigma_rad=lines.sigma_rad[some],
         )
+
+
+class Filter(Protocol):
+    """A filter that is taken through a run."""
+
+    disc_slots: dict[int, int]
+    line_slots: dict[int, int]
+    camera_xy: FloatArray
+    count: RowCount
+
+    @property
+    def state(self) -> FloatArray:
+        """The pose, then landmarks, as the slots say."""
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3)."""
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns of the state's covariance."""
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> None:
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
+
+    def measure(self, rows: FrameRows) -> None:
+        """Update with the rows of a frame."""
 
 
 def unknown(number: int) -> bool:

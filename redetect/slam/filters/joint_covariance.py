@@ -20,11 +20,6 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.joint_covariance_kernels import (
-    set_symmetric_rows,
-    symmetric_block,
-    symmetric_columns,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,7 +56,8 @@ class JointCovariance:
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns `index` of the covariance: (k, k)."""
         factor = self._factor[index, : self._pending]
-        return np.asarray(symmetric_block(self._base, index) - factor @ factor.T)
+        low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
+        return np.asarray(self._base[high, low] - factor @ factor.T)
 
     def pose(self) -> FloatArray:
         """Covariance of the pose: (3, 3)."""
@@ -85,9 +81,7 @@ class JointCovariance:
 
     def projected(self, index: IntArray, jacobian: FloatArray) -> FloatArray:
         """Covariance of the state with a measurement: P[:, index] @ jacobian.T, (size, m)."""
-        columns = np.empty((self.size, len(index)), order="F")
-        symmetric_columns(self._base, self.size, index, columns)
-        product = columns @ jacobian.T
+        product = self._columns(index) @ jacobian.T
         if self._pending:
             factor = self._factor[: self.size, : self._pending]
             product -= factor @ (factor[index].T @ jacobian.T)
@@ -146,15 +140,23 @@ class JointCovariance:
 
     def replace(self, first: int, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> None:
         """Replace numbers from `first` on by others; see `append`."""
-        count, size = len(jacobian), self.size
-        columns = np.empty((size, len(index)), order="F")
-        symmetric_columns(self._base, size, index, columns)
-        rows = jacobian @ columns.T
+        count = len(jacobian)
+        rows = jacobian @ self._columns(index).T
         own = rows[:, index] @ jacobian.T + noise
         rows[:, first : first + count] = 0.5 * (own + own.T)
-        set_symmetric_rows(self._base, size, first, rows)
+        for r, row in enumerate(rows, first):
+            self._base[r, : r + 1] = row[: r + 1]
+            self._base[r + 1 : self.size, r] = row[r + 1 :]
         factor = self._factor[:, : self._pending]
         factor[first : first + count] = jacobian @ factor[index]
+
+    def _columns(self, index: IntArray) -> FloatArray:
+        """Columns of B: (size, k)."""
+        columns = np.empty((self.size, len(index)), order="F")
+        for k, c in enumerate(index.tolist()):
+            columns[:c, k] = self._base[c, :c]
+            columns[c:, k] = self._base[c : self.size, c]
+        return columns
 
     def _settle(self) -> None:
         """Subtract W W^T from B."""

@@ -17,15 +17,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.landmarks.map_file import LandmarkMap, Path2D
+from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
+from redetect.slam.filters.association import Associator, run_filter
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     FilterRun,
     FrameRows,
     RowCount,
-    frames_of,
     unknown,
 )
 from redetect.slam.models.motion import move, move_jacobians
@@ -217,25 +216,4 @@ def run_localizer(
     SlamError
         If an update is not possible; the message names the step.
     """
-    pairing = associator or Associator()
-    poses = np.empty((len(recording) + 1, _POSE_SIZE))
-    covariance = np.empty((len(recording) + 1, _POSE_SIZE, _POSE_SIZE))
-    poses[0], covariance[0] = localizer.pose, localizer.pose_covariance
-    disc_ids: list[int] = []
-    line_ids: list[tuple[int, ...]] = []
-    for k, rows in enumerate(frames_of(recording)):
-        try:
-            localizer.predict(recording.steps[k], recording.step_covariance[k])
-            identified = pairing.identified(rows, localizer)
-            localizer.measure(identified)
-        except SlamError as error:
-            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
-        disc_ids.extend(identified.disc_ids)
-        line_ids.extend(identified.line_ids)
-        poses[k + 1], covariance[k + 1] = localizer.pose, localizer.pose_covariance
-    return FilterRun(
-        path=Path2D(("start", *recording.prefixes), poses, covariance),
-        count=localizer.count,
-        disc_ids=np.array(disc_ids, dtype=np.int64),
-        line_ids=tuple(line_ids),
-    )
+    return run_filter(recording, localizer, associator or Associator())

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import (
@@ -24,7 +25,6 @@ from redetect.least_squares.solver import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
-from redetect.slam.models.mounted_discs import rotation_exp
 from redetect.slam.models.mounting import nominal_mounting
 
 FloatArray = NDArray[np.float64]
@@ -204,7 +204,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
         turned = np.concatenate([np.zeros((1, 2)), tilt.reshape(-1, 2)])
         after = replace(after, tilt=estimate.tilt + turned)
     if mounting.size and estimate.mounting is not None:
-        turn, _ = rotation_exp(mounting[:3])
+        turn = Rotation.from_rotvec(mounting[:3]).as_matrix()
         changed = np.concatenate([turn @ estimate.mounting[:, :3], estimate.mounting[:, 3:]], 1)
         changed[2, 3] += mounting[3]
         after = replace(after, mounting=changed)

@@ -13,10 +13,37 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from camera.calibration.model import cross_matrices
 from redetect.slam.errors import SlamError
-from redetect.slam.models.mounted_discs import rotation_exp, skew
 
 FloatArray = NDArray[np.float64]
+
+
+def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations of rotation vectors, and the left Jacobians of that map.
+
+    Parameters
+    ----------
+    vectors : (..., 3) float array
+        Rotation vectors, radians.
+
+    Returns
+    -------
+    rotations : (..., 3, 3) float array
+        exp([v]x), by Rodrigues' formula.
+    left_jacobians : (..., 3, 3) float array
+        J with ``exp([v + d]x) = exp([J d]x) exp([v]x)`` to first order in d.
+    """
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    # sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, all defined at a = 0.
+    sine = np.sinc(angle / np.pi)
+    versine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    small = angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    k = cross_matrices(vectors)
+    k2 = k @ k
+    return np.eye(3) + sine * k + versine * k2, np.eye(3) + versine * k + third * k2
 
 
 def nominal_mounting(camera: Camera) -> FloatArray:
@@ -63,7 +90,7 @@ def rows_through_mounting(
     by_ray = np.zeros((len(ray), 2, 3))
     by_ray[:, 0, 0] = by_ray[:, 1, 1] = -centre[2] / ray[:, 2]
     by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
-    by_mounting = np.concatenate([-by_ray @ skew(ray), -slope[:, :, None]], axis=2)
+    by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
     return centre[:2] - centre[2] * slope, by_mounting
 
 
@@ -114,8 +141,10 @@ def rows_as_recorded(
     by_robot = by_untilted @ level
     return camera.centre[:2] - height * slope, RecordedJacobians(
         floor=by_robot[:, :, :2],
-        tilt=(by_robot @ skew(from_centre) @ left)[:, :, :2],
-        mounting=np.concatenate([by_untilted @ skew(untilted), -by_robot[:, :, 2:]], axis=2),
+        tilt=(by_robot @ cross_matrices(from_centre) @ left)[:, :, :2],
+        mounting=np.concatenate(
+            [by_untilted @ cross_matrices(untilted), -by_robot[:, :, 2:]], axis=2
+        ),
     )
 
 
