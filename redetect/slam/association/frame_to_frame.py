@@ -120,10 +120,7 @@ def associate_locally(
     camera_xy: tuple[float, float] = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
 ) -> LocalAssociation:
-    """Label the rows of a run, frame by frame, ignoring IDs in the file.
-
-    Takes `camera_xy` (2,).
-    """
+    """Label the rows of a run, frame by frame, ignoring IDs in the file."""
     setting = settings or LocalSettings()
     circles, lines = recording.circles, recording.lines
     circle_labels = np.full(len(circles), -1, dtype=np.int64)

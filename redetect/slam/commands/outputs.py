@@ -25,10 +25,7 @@ def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> Non
 
 
 def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
-    """Take a filter through a run.
-
-    Returns `run`, `line`.
-    """
+    """Take a filter through a run; also returned is what to print of its time."""
     began, began_working = time.perf_counter(), time.thread_time()
     run = work()
     seconds, working = time.perf_counter() - began, time.thread_time() - began_working

@@ -105,10 +105,7 @@ class EkfSlam:
         return self.covariance.block(index)
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step.
-
-        Takes `step` (3,), `noise` (3, 3).
-        """
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
         state, at = self._state, self._linearised
         cos, sin = np.cos(state[2]), np.sin(state[2])
         x = state[0] + cos * step[0] - sin * step[1]

@@ -115,10 +115,7 @@ class Localizer:
         return np.block([[self.pose_covariance, cross], [cross.T, own]])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step.
-
-        Takes `step` (3,), `noise` (3, 3).
-        """
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
         by_pose, by_step = move_jacobians(self.pose, step)
         self._state[:_POSE_SIZE] = move(self.pose, step)
         if self._map_errors == "considered":

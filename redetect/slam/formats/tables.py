@@ -90,10 +90,7 @@ def write_bearings(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write the bearings of verticals that have identifiers: columns as `BEARING_COLUMNS`.
-
-    Takes `camera_xy` (2,).
-    """
+    """Write the bearings of verticals that have identifiers: columns as `BEARING_COLUMNS`."""
     some = recording.lines
     camera = from_dataset(camera_xy, axes).tolist()
     rows = [
