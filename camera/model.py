@@ -22,21 +22,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera.brown import (
+from camera.distortion import (
+    NO_POLYNOMIAL,
     NOT_TANGENTIAL,
     Brown,
+    Coef,
+    Polynomial,
     Tangential,
     brown_of,
     brown_shift,
     distorted_jacobian,
     one_to_one_radius,
-    straightened,
-)
-from camera.distortion import (
-    NO_POLYNOMIAL,
-    Coef,
-    Polynomial,
     radial_factor,
+    straightened,
     undistorted_radius,
 )
 from camera.model_checks import (
@@ -80,9 +78,9 @@ class Camera:
     unknown : tuple of (key, text)
         Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
     tangential : 2 floats
-        p1, p2 of the distortion (see `camera.brown`); the data set's cameras have none.
+        p1, p2 of the distortion (see `camera.distortion`); the data set's cameras have none.
     polynomial : 3 floats
-        k1, k2, k3 of the distortion (see `camera.brown`); the data set's cameras have none.
+        k1, k2, k3 of the distortion (see `camera.distortion`); the data set's cameras have none.
     covariance : tuple of float, optional
         Of the calibration's parameters (`camera.uncertainty`): the lower triangle, row by row.
 

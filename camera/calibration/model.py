@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from camera.brown import Brown, brown_shift, distorted_jacobian, one_to_one_radius
-from camera.distortion import Coef, fold_radius, radial_factor
+from camera.distortion import (
+    Brown,
+    Coef,
+    brown_shift,
+    distorted_jacobian,
+    fold_radius,
+    one_to_one_radius,
+    radial_factor,
+)
 from camera.model_checks import border_pixels
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.brown import one_to_one_radius, straightened
 from camera.calibration.adjustment import (
     Adjusted,
     Estimate,
@@ -17,7 +16,7 @@ from camera.calibration.adjustment import (
     project_estimate,
 )
 from camera.calibration.model import COUNT, brown_terms, coefficients, free_span
-from camera.distortion import undistorted_radius
+from camera.distortion import one_to_one_radius, straightened, undistorted_radius
 
 FloatArray = NDArray[np.float64]
 

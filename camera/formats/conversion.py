@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.calibration.projection import UNPOSED, intrinsics_of, with_intrinsics
-from camera.distortion import NO_POLYNOMIAL
+from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.errors import CameraError, ConversionError
 from camera.formats.conversion_fit import EXACT_PX, CameraFit, smallest_largest
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted

@@ -19,8 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from camera.brown_kernels import straightened_point
-from camera.kernels import has_brown, project_floor_point
+from camera.kernels import has_brown, project_floor_point, straightened_point
 
 FloatArray = NDArray[np.float64]
 
