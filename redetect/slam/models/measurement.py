@@ -110,20 +110,3 @@ def bearing_jacobians(
         np.asarray(np.einsum("...i,...ij->...j", by_seen, by_pose)),
         np.asarray(np.einsum("...i,...ij->...j", by_seen, by_line)),
     )
-
-
-def disc_of_range_and_bearing(
-    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
-) -> tuple[FloatArray, FloatArray]:
-    """Landmarks measured by range and bearing, as positions in the robot frame.
-
-    Takes `range_m, bearing_rad` (n,); returns `xy` (n, 2), `covariance` (n, 2, 2).
-    """
-    distance = np.asarray(range_m, dtype=np.float64)
-    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
-    direction = np.stack([sin, -cos], axis=-1)
-    root = np.stack(
-        [sigma_m * direction, sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)],
-        axis=-1,
-    )
-    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
