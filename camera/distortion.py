@@ -66,7 +66,7 @@ _NODES_BETWEEN = 513
 def radial_factor(
     radius: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> FloatArray:
-    """f(r), the factor by which the distortion moves a point along its radius."""
+    """f(r), by which the distortion moves points of undistorted normalised radii r >= 0."""
     a2, a3, b1, b2, b3 = coef
     numerator = radius * (a2 + radius * a3)
     denominator = 1.0 + radius * (b1 + radius * (b2 + radius * b3))
@@ -160,12 +160,11 @@ def largest_distorted_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL)
 def undistorted_radius(
     distorted: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> FloatArray:
-    """Inverse of g on [0, r_max], to 1e-12 relative to the larger of 1 and r.
+    """Inverse of g on [0, r_max], to 1e-12 relative to the larger of 1 and r; NaN beyond.
 
     (At the fold itself g' vanishes, so there r is only as good as the last digit of g allows, 1e-8;
-    g of the result is always right to the last digits.)
-
-    Newton's method, kept inside the cell of a table of g.
+    g of the result is always right to the last digits.) Newton's method, kept inside the cell of a
+    table of g.
     """
     target = np.asarray(distorted, dtype=np.float64)
     table_g, table_r = inverse_table(coef, polynomial)

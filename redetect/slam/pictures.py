@@ -88,8 +88,7 @@ def draw_map(
     landmark_map: LandmarkMap,
     path: Path2D,
     *,
-    before: Path2D | None = None,
-    before_map: LandmarkMap | None = None,
+    before: tuple[LandmarkMap | None, Path2D] | None = None,
     reference: Path2D | None = None,
     title: str = "",
     overwrite: bool,
@@ -105,7 +104,7 @@ def draw_map(
         Discs and verticals. Verticals far outside are counted in the legend, not drawn.
     path : Path2D
         The robot's path.
-    before, before_map : Path2D, LandmarkMap, optional
+    before : (LandmarkMap or None, Path2D), optional
         The same before loops were closed: drawn in a panel of its own, to the same scale.
     reference : Path2D, optional
         The true path, or another to compare with; dashed.
@@ -126,7 +125,7 @@ def draw_map(
     panels: list[tuple[str, LandmarkMap | None, Path2D]] = [("", landmark_map, path)]
     if before is not None:
         panels = [
-            ("before closing loops", before_map, before),
+            ("before closing loops", *before),
             ("after closing loops", landmark_map, path),
         ]
     low, high = _extent([(m, p) for _, m, p in panels], reference)

@@ -192,8 +192,10 @@ def _draw(
         output / PICTURE_NAME,
         final,
         path,
-        before=path_of(recording, mapped.start, None),
-        before_map=LandmarkMap(discs=first.discs, lines=no_landmarks()),
+        before=(
+            LandmarkMap(discs=first.discs, lines=no_landmarks()),
+            path_of(recording, mapped.start, None),
+        ),
         title=command.run.resolve().name,
         overwrite=command.force,
         interactive=command.interactive,
