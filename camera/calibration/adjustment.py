@@ -110,29 +110,15 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An `Estimate` that fits best, and how well.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    sigma_px : float
-        Noise of a coordinate that the residuals show (robust, by degrees of freedom).
-    residuals : (N, 2) float64
-        Seen less projected, pixels.
-    weights : (N, 2) float64
-        Robust weights, 1 where a residual counts in full.
-    covariance : (14, 14) float64
-        Of the intrinsics; zero for those held fixed.
-    pose_covariances : (V, 6, 6) float64
-        Of each view's rotation (perturbed from the left, in the camera frame, rad) and translation
-        (m), the intrinsics' uncertainty included.
-    """
+    """An `Estimate` that fits best, and how well."""
 
     estimate: Estimate
-    sigma_px: float
-    residuals: FloatArray
-    weights: FloatArray
-    covariance: FloatArray
+    sigma_px: float  # noise of a coordinate that the residuals show (robust, by degrees of freedom)
+    residuals: FloatArray  # (N, 2): seen less projected, pixels
+    weights: FloatArray  # (N, 2): robust weights, 1 where a residual counts in full
+    covariance: FloatArray  # (14, 14): of the intrinsics; zero for those held fixed
+    # (V, 6, 6): of each view's rotation (perturbed from the left, in the camera frame, rad) and
+    # translation (m), the intrinsics' uncertainty included.
     pose_covariances: FloatArray
 
     @property

@@ -35,27 +35,15 @@ _LARGEST_FILE_BYTES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class FloorPose:
-    """The camera's pose in the robot frame.
+    """The camera's pose in the robot frame."""
 
-    Attributes
-    ----------
-    robot_from_camera : (3, 4) float64
-    covariance : (6, 6) float64
-        Of the position (m, robot frame) and of a small rotation from the left (rad, about the
-        robot's axes), in this order; errors of the points and of the intrinsics.
-    residuals : (N, 2) float64
-        Seen less projected, pixels.
-    sigma_px : float
-        Noise of a coordinate that the residuals show.
-    by_intrinsics : (6, 14) float64
-        How the pose follows errors of the intrinsics.
-    """
-
-    robot_from_camera: FloatArray
+    robot_from_camera: FloatArray  # (3, 4)
+    # (6, 6): of the position (m, robot frame) and of a small rotation from the left (rad, about the
+    # robot's axes), in this order; errors of the points and of the intrinsics.
     covariance: FloatArray
-    residuals: FloatArray
-    sigma_px: float
-    by_intrinsics: FloatArray
+    residuals: FloatArray  # (N, 2): seen less projected, pixels
+    sigma_px: float  # noise of a coordinate that the residuals show
+    by_intrinsics: FloatArray  # (6, 14): how the pose follows errors of the intrinsics
 
     @property
     def rms_px(self) -> float:

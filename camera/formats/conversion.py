@@ -38,21 +38,13 @@ _DIP = (-2.5, 2.5, -0.85)
 
 @dataclass(frozen=True)
 class Converted:
-    """A converted camera.
-
-    Attributes
-    ----------
-    camera : Camera or ForeignCamera
-    deviation_px : float
-        Largest distance, over the image, between where a pixel's ray is seen by the source and by
-        the target (target's pixels).
-    at : (float, float)
-        The target's pixel where it is largest.
-    """
+    """A converted camera."""
 
     camera: AnyCamera
+    # Largest distance, over the image, between where a pixel's ray is seen by the source and by the
+    # target (target's pixels).
     deviation_px: float
-    at: tuple[float, float]
+    at: tuple[float, float]  # the target's pixel where it is largest
 
 
 def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:

@@ -31,22 +31,14 @@ MOST_NODES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """Rows and the landmarks they show.
+    """Rows and the landmarks they show."""
 
-    Attributes
-    ----------
-    landmark : (n,) int64
-        Index of each row's landmark, -1 where it shows none of them; none is there twice.
-    squared_distance : float
-        Squared Mahalanobis distance of all pairs: joint for `joint_compatible`, the sum of the
-        single ones for `nearest_compatible`.
-    complete : bool
-        Whether the search was finished: only then is no better pairing left.
-    """
-
+    # (n,): index of each row's landmark, -1 where it shows none of them; none is there twice.
     landmark: IntArray
+    # Squared Mahalanobis distance of all pairs: joint for `joint_compatible`, the sum of the single
+    # ones for `nearest_compatible`.
     squared_distance: float
-    complete: bool = True
+    complete: bool = True  # whether the search was finished: only then is no better pairing left
 
 
 def nearest_compatible(

@@ -91,26 +91,16 @@ class LocalSettings:
 
 @dataclass(frozen=True, eq=False)
 class LocalAssociation:
-    """Result of the association from frame to frame.
+    """Result of the association from frame to frame."""
 
-    Attributes
-    ----------
-    circle_labels, line_labels : (n,) int64
-        The landmark of each row, numbered from 0 in order of first sight.
-    line_places : (L, 2) float64
-        The last estimate of each line's position in the robot frame (m); NaN if that was behind the
-        camera or beyond 50 m.
-    line_frames : (L,) int64
-        After which step.
-    incomplete : int
-        Frames whose joint search was cut short.
-    """
-
+    # (n,): the landmark of each row, numbered from 0 in order of first sight.
     circle_labels: IntArray
     line_labels: IntArray
+    # (L, 2): the last estimate of each line's position in the robot frame (m); NaN if that was
+    # behind the camera or beyond 50 m.
     line_places: FloatArray
-    line_frames: IntArray
-    incomplete: int
+    line_frames: IntArray  # (L,): after which step
+    incomplete: int  # frames whose joint search was cut short
 
 
 def associate_locally(

@@ -41,46 +41,23 @@ _FIRST_ROUNDS = 2
 
 @dataclass(frozen=True)
 class PointSettings:
-    """Settings of the search for points.
+    """Settings of the search for points."""
 
-    Attributes
-    ----------
-    heading_sigma_deg : tuple of float
-        Standard deviation of the path's heading in a single frame, for each round (degrees).
-    sigma_scale : float
-        Factor on the rows' standard deviations, which do not include the detector's errors at edges
-        that are close together.
-    path_sigma_scale : float
-        The same factor for rows that correct the path.
-    detected : float
-        Probability that a vertical in view gives a row.
-    gate_sigmas : float
-        A ray that passes farther from a point does not support it.
-    least_score : float
-        Least log likelihood ratio of the rows with a point to those without.
-    gaps : tuple of int
-        Numbers of steps between frames whose rays are intersected.
-    least_parallax_sigmas : float
-        Least angle between two rays that are intersected.
-    farthest_m : float
-        Intersections farther away are ignored.
-    window_frames : int
-        Number of frames before and after an intersection that are scored.
-    path_rows : int
-        Points of fewer rows do not correct the path.
-    """
-
+    # Standard deviation of the path's heading in a single frame, for each round (degrees).
     heading_sigma_deg: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    # Factor on the rows' standard deviations, which do not include the detector's errors at edges
+    # that are close together.
     sigma_scale: float = 1.5
-    path_sigma_scale: float = 2.0
-    detected: float = 0.7
-    gate_sigmas: float = 3.0
-    least_score: float = 4.0
+    path_sigma_scale: float = 2.0  # the same factor for rows that correct the path
+    detected: float = 0.7  # probability that a vertical in view gives a row
+    gate_sigmas: float = 3.0  # a ray that passes farther from a point does not support it
+    least_score: float = 4.0  # least log likelihood ratio of the rows with a point to those without
+    # Numbers of steps between frames whose rays are intersected.
     gaps: tuple[int, ...] = (2, 4, 7, 11)
-    least_parallax_sigmas: float = 4.0
-    farthest_m: float = 14.0
-    window_frames: int = 40
-    path_rows: int = 6
+    least_parallax_sigmas: float = 4.0  # least angle between two rays that are intersected
+    farthest_m: float = 14.0  # intersections farther away are ignored
+    window_frames: int = 40  # number of frames before and after an intersection that are scored
+    path_rows: int = 6  # points of fewer rows do not correct the path
 
     def __post_init__(self) -> None:
         demand(

@@ -29,25 +29,14 @@ _LEAST_INVERSE_DISTANCE = 0.02
 
 @dataclass(eq=False)
 class LocalMap:
-    """Landmarks in the frame of the robot.
+    """Landmarks in the frame of the robot."""
 
-    Attributes
-    ----------
-    mean : (m, 2) float64
-        Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
-    covariance : (2 m, 2 m) float64
-    is_line : (m,) bool
-    number : (m,) int64
-        Number of the landmark; discs and lines are counted separately.
-    last_frame : (m,) int64
-        When it was seen last.
-    """
-
+    # (m, 2): Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
     mean: FloatArray
-    covariance: FloatArray
-    is_line: NDArray[np.bool_]
-    number: IntArray
-    last_frame: IntArray
+    covariance: FloatArray  # (2 m, 2 m)
+    is_line: NDArray[np.bool_]  # (m,)
+    number: IntArray  # (m,): number of the landmark; discs and lines are counted separately
+    last_frame: IntArray  # (m,): when it was seen last
 
     @classmethod
     def empty(cls) -> LocalMap:

@@ -39,45 +39,27 @@ SHARED_BY_ONE_PLACE = 3
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Settings of the search for loops.
+    """Settings of the search for loops."""
 
-    Attributes
-    ----------
-    stretch_frames : int
-        Frames whose landmarks form a constellation.
-    stride_frames : int
-        Frames from one constellation to the next.
-    length_tolerance_m : float
-        By how much the lengths of two pairs of landmarks may differ to vote.
-    least_length_m : float
-        Pairs shorter than this do not vote.
-    reach_m : float
-        Largest distance of landmarks that agree.
-    most_turn_rad, most_shift_m : float
-        Largest motion that brings one constellation onto the other.
-    least_agreeing : int
-        Least number of agreeing landmarks, whatever the number of false alarms.
-    false_alarms : float
-        Largest number of matches at least as good that are expected by chance in the whole search.
-    later_step, earlier_step : int
-        Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
-        `earlier_step`-th of these.
-    attached_frames : int
-        A stretch that shares landmarks with one at least this many frames earlier is part of the
-        map already and not matched again; 0 to match all.
-    """
-
-    stretch_frames: int = 50
-    stride_frames: int = 10
+    stretch_frames: int = 50  # frames whose landmarks form a constellation
+    stride_frames: int = 10  # frames from one constellation to the next
+    # By how much the lengths of two pairs of landmarks may differ to vote.
     length_tolerance_m: float = 0.08
-    least_length_m: float = 0.8
-    reach_m: float = 0.12
+    least_length_m: float = 0.8  # pairs shorter than this do not vote
+    reach_m: float = 0.12  # largest distance of landmarks that agree
+    # Largest motion that brings one constellation onto the other.
     most_turn_rad: float = 0.8
     most_shift_m: float = 8.0
+    # Least number of agreeing landmarks, whatever the number of false alarms.
     least_agreeing: int = 7
+    # Largest number of matches at least as good that are expected by chance in the whole search.
     false_alarms: float = 1e-3
+    # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
+    # `earlier_step`-th of these.
     later_step: int = 1
     earlier_step: int = 2
+    # A stretch that shares landmarks with one at least this many frames earlier is part of the map
+    # already and not matched again; 0 to match all.
     attached_frames: int = 0
 
     def __post_init__(self) -> None:
@@ -101,45 +83,26 @@ class LoopSettings:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Landmarks seen in a stretch of frames.
-
-    Attributes
-    ----------
-    middle_frame : int
-    labels : (n,) int64
-        Ascending.
-    xy : (n, 2) float64
-        Their places in the map (m).
-    """
+    """Landmarks seen in a stretch of frames."""
 
     middle_frame: int
-    labels: IntArray
-    xy: FloatArray
+    labels: IntArray  # (n,): ascending
+    xy: FloatArray  # (n, 2): their places in the map (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Two stretches that show one place.
+    """Two stretches that show one place."""
 
-    Attributes
-    ----------
-    earlier_frame, later_frame : int
-        Middle frames of the two.
-    pairs : (k, 2) int64
-        Labels of the earlier and of the later stretch that are one landmark.
-    turn_rad : float
-    shift : (2,) float64
-        Motion that brings the later stretch's landmarks, in the map, onto the earlier one's:
-        x -> R(turn) x + shift.
-    log10_false_alarms : float
-        Logarithm of the number of matches as good that chance would bring about.
-    """
-
+    # Middle frames of the two.
     earlier_frame: int
     later_frame: int
-    pairs: IntArray
+    pairs: IntArray  # (k, 2): labels of the earlier and of the later stretch that are one landmark
     turn_rad: float
+    # (2,): motion that brings the later stretch's landmarks, in the map, onto the earlier one's: x
+    # -> R(turn) x + shift.
     shift: FloatArray
+    # Logarithm of the number of matches as good that chance would bring about.
     log10_false_alarms: float
 
 

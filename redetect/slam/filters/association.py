@@ -49,18 +49,10 @@ _NO_LINES = MeasuredLines(
 
 @dataclass(frozen=True)
 class Associator:
-    """How rows are paired with landmarks.
+    """How rows are paired with landmarks."""
 
-    Attributes
-    ----------
-    method : str
-        `known`, `nearest` or `joint`.
-    gate_probability : float
-        Share of right rows that pass.
-    """
-
-    method: Association = "known"
-    gate_probability: float = DEFAULT_GATE_PROBABILITY
+    method: Association = "known"  # `known`, `nearest` or `joint`
+    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of right rows that pass
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)

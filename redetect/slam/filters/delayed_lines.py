@@ -32,31 +32,19 @@ _NEAREST_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class LineStart:
-    """A line that joins the state, and what its bearings say of the poses.
+    """A line that joins the state, and what its bearings say of the poses."""
 
-    Attributes
-    ----------
-    xy : (2,) float64
-        Its most likely position in the map (m); the equations are linearised there.
-    correction : (2,) float64
-        What the place is off from where Q1's two equations alone have it (m): to be added to it
-        before the residual is used, which takes it back.
-    by_poses : (2, 3 k) float64
-        Its derivative by the k poses.
-    noise : (2, 2) float64
-        Covariance that the bearings add (m^2).
-    residual : (k - 2,) float64
-        Measured less predicted, in standard deviations, of what the bearings say of the poses.
-    residual_by_poses : (k - 2, 3 k) float64
-        Jacobian of that.
-    """
-
+    # (2,): its most likely position in the map (m); the equations are linearised there.
     xy: FloatArray
+    # (2,): what the place is off from where Q1's two equations alone have it (m): to be added to it
+    # before the residual is used, which takes it back.
     correction: FloatArray
-    by_poses: FloatArray
-    noise: FloatArray
+    by_poses: FloatArray  # (2, 3 k): its derivative by the k poses
+    noise: FloatArray  # (2, 2): covariance that the bearings add (m^2)
+    # (k - 2,): measured less predicted, in standard deviations, of what the bearings say of the
+    # poses.
     residual: FloatArray
-    residual_by_poses: FloatArray
+    residual_by_poses: FloatArray  # (k - 2, 3 k): Jacobian of that
 
 
 def triangulate(

@@ -22,27 +22,14 @@ NO_CAMERA = np.zeros(2)
 
 @dataclass(frozen=True, eq=False)
 class FrameRows:
-    """Measurements of one frame.
+    """Measurements of one frame."""
 
-    Attributes
-    ----------
-    disc_ids : tuple of d int
-        -1 where unknown.
-    disc_xy : (d, 2) float64
-        In the robot frame (m).
-    disc_covariance : (d, 2, 2) float64
-    line_ids : tuple of l tuples of int
-        All lines that a row shows; empty where unknown.
-    bearing_rad : (l,) float64
-    sigma_rad : (l,) float64
-    """
-
-    disc_ids: tuple[int, ...]
-    disc_xy: FloatArray
-    disc_covariance: FloatArray
-    line_ids: tuple[tuple[int, ...], ...]
-    bearing_rad: FloatArray
-    sigma_rad: FloatArray
+    disc_ids: tuple[int, ...]  # -1 where unknown
+    disc_xy: FloatArray  # (d, 2): in the robot frame (m)
+    disc_covariance: FloatArray  # (d, 2, 2)
+    line_ids: tuple[tuple[int, ...], ...]  # all lines that a row shows; empty where unknown
+    bearing_rad: FloatArray  # (l,)
+    sigma_rad: FloatArray  # (l,)
 
     def identified(
         self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
@@ -87,24 +74,15 @@ class FrameRows:
 
 @dataclass
 class RowCount:
-    """How a run's rows were used.
+    """How a run's rows were used."""
 
-    Attributes
-    ----------
-    discs, lines : int
-        Rows that were used.
-    left_out : Counter of str
-        Rows that were not, by the reason.
-    innovation_squared : float
-        Sum of the squared innovations, normalised by their covariances.
-    innovation_numbers : int
-        Their degrees of freedom: if the covariances are right, what the sum is expected to be.
-    """
-
+    # Rows that were used.
     discs: int = 0
     lines: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
+    # Sum of the squared innovations, normalised by their covariances.
     innovation_squared: float = 0.0
+    # Their degrees of freedom: if the covariances are right, what the sum is expected to be.
     innovation_numbers: int = 0
 
 

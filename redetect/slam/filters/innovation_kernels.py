@@ -33,20 +33,12 @@ class MeasuredDiscs(NamedTuple):
 
 
 class MeasuredLines(NamedTuple):
-    """Rows of l lines, each of which may be that of several of e lines of the state.
+    """Rows of l lines, each of which may be that of several of e lines of the state."""
 
-    Attributes
-    ----------
-    slot : (e,) int64
-        Where in the state the lines of the rows begin.
-    start : (l + 1,) int64
-        Row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
-    bearing_rad, sigma_rad : (l,) float64
-        Measured.
-    """
-
-    slot: IntArray
+    slot: IntArray  # (e,): where in the state the lines of the rows begin
+    # (l + 1,): row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
     start: IntArray
+    # (l,): measured.
     bearing_rad: FloatArray
     sigma_rad: FloatArray
 

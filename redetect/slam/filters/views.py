@@ -15,17 +15,10 @@ LEAST_PARALLAX_RAD, PARALLAX_GROWTH = 0.02, 1.05
 
 @dataclass(frozen=True)
 class View:
-    """A bearing that waits.
+    """A bearing that waits."""
 
-    Attributes
-    ----------
-    frame : int
-        Its frame, whose pose is kept.
-    bearing_rad, sigma_rad : float
-        The row.
-    """
-
-    frame: int
+    frame: int  # its frame, whose pose is kept
+    # The row.
     bearing_rad: float
     sigma_rad: float
 

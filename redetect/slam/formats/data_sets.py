@@ -51,28 +51,16 @@ _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
 
 @dataclass(frozen=True, eq=False)
 class RangeBearing:
-    """A run.
+    """A run."""
 
-    Attributes
-    ----------
-    times : (N,) float64
-        Of the frames (s), ascending.
-    steps : (N, 3) float64
-        Movements before each frame in the data set's axes: dx, dy (m), dphi (rad).
-    frame : (n,) int64
-        The frame of each measurement, ascending.
-    range_m, bearing_rad : (n,) float64
-        From the origin of the robot frame; 0 forward, positive to the left.
-    ids : (n,) int64
-        The landmark; -1 where it is not known.
-    """
-
-    times: FloatArray
+    times: FloatArray  # (N,): of the frames (s), ascending
+    # (N, 3): movements before each frame in the data set's axes: dx, dy (m), dphi (rad).
     steps: FloatArray
-    frame: IntArray
+    frame: IntArray  # (n,): the frame of each measurement, ascending
+    # (n,): from the origin of the robot frame; 0 forward, positive to the left.
     range_m: FloatArray
     bearing_rad: FloatArray
-    ids: IntArray
+    ids: IntArray  # (n,): the landmark; -1 where it is not known
 
     @property
     def prefixes(self) -> tuple[str, ...]:

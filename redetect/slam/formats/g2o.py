@@ -43,39 +43,17 @@ FRAME_COMMENT = "# FRAME"
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """A run with estimates of its poses and discs, in the data set's axes.
+    """A run with estimates of its poses and discs, in the data set's axes."""
 
-    Attributes
-    ----------
-    prefixes : tuple of N + 1 str
-        Name of each pose; of the start ``start``.
-    poses : (N + 1, 3) float64
-        Estimates: x, y (m), theta (rad).
-    disc_ids : (M,) int64
-        Identifiers, ascending.
-    discs : (M, 2) float64
-        Estimates (m).
-    steps : (N, 3) float64
-        dx, dy (m), dphi (rad) in the robot frame before each step.
-    step_covariance : (N, 3, 3) float64
-        Of `steps`.
-    circles : CircleRows
-        Measurements of discs, all with an identifier.
-    quality : (n,) float64
-        Of those rows; NaN where it is unknown.
-    unstated_steps : int
-        Steps whose covariance is an assumed one.
-    """
-
-    prefixes: tuple[str, ...]
-    poses: FloatArray
-    disc_ids: IntArray
-    discs: FloatArray
-    steps: FloatArray
-    step_covariance: FloatArray
-    circles: CircleRows
-    quality: FloatArray
-    unstated_steps: int = 0
+    prefixes: tuple[str, ...]  # name of each pose; of the start ``start``
+    poses: FloatArray  # (N + 1, 3): Estimates: x, y (m), theta (rad)
+    disc_ids: IntArray  # (M,): identifiers, ascending
+    discs: FloatArray  # (M, 2): estimates (m)
+    steps: FloatArray  # (N, 3): dx, dy (m), dphi (rad) in the robot frame before each step
+    step_covariance: FloatArray  # (N, 3, 3): of `steps`
+    circles: CircleRows  # measurements of discs, all with an identifier
+    quality: FloatArray  # (n,): of those rows; NaN where it is unknown
+    unstated_steps: int = 0  # steps whose covariance is an assumed one
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:

@@ -47,51 +47,27 @@ _LEAST_PROBABILITY = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Rows of one identifier in neighbouring frames that contradict the rest.
+    """Rows of one identifier in neighbouring frames that contradict the rest."""
 
-    Attributes
-    ----------
-    rows : (k,) int64
-        Which rows of the recording's discs.
-    id : int
-        Their identifier in the file.
-    kind : "exchange", "split" or "drop"
-        Whether they show another landmark, one of their own, or nothing that could be said.
-    new_id : int
-        That landmark; -1 for `drop`.
-    xy : (k, 2) float64
-        Where the rows lie in the map (m).
-    own_m : float
-        How far the median of these is from the landmark of that identifier.
-    row_chi_squared : (k,) float64
-        Squared error of each row against the map without any of the suspects.
-    chi_squared, mended_chi_squared : float
-        Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
-    """
-
-    rows: IntArray
-    id: int
+    rows: IntArray  # (k,): which rows of the recording's discs
+    id: int  # their identifier in the file
+    # Whether they show another landmark, one of their own, or nothing that could be said.
     kind: Kind
-    new_id: int
-    xy: FloatArray
-    own_m: float
+    new_id: int  # that landmark; -1 for `drop`
+    xy: FloatArray  # (k, 2): where the rows lie in the map (m)
+    own_m: float  # how far the median of these is from the landmark of that identifier
+    # (k,): squared error of each row against the map without any of the suspects.
     row_chi_squared: FloatArray
+    # Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
     chi_squared: float
     mended_chi_squared: float
 
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """What contradicts, and chi-squared with all rows, without those, and with identifiers mended.
+    """What contradicts; chi-squared with all rows, without those, with mended identifiers."""
 
-    Attributes
-    ----------
-    groups : tuple of Group
-        By frame.
-    before, dropped, mended : ChiSquared
-    """
-
-    groups: tuple[Group, ...]
+    groups: tuple[Group, ...]  # by frame
     before: ChiSquared
     dropped: ChiSquared
     mended: ChiSquared

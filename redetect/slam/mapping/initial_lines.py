@@ -26,21 +26,11 @@ _LOCAL_PATH_M = 15.0
 
 @dataclass(frozen=True, eq=False)
 class InitialLines:
-    """Lines that can be placed, and the others.
+    """Lines that can be placed, and the others."""
 
-    Attributes
-    ----------
-    ids : (K,) int64
-        Lines that can be placed, ascending.
-    xy : (K, 2) float64
-        Their positions in the map (m).
-    unplaced : (U,) int64
-        Lines never seen, alone in a row, under enough parallax.
-    """
-
-    ids: IntArray
-    xy: FloatArray
-    unplaced: IntArray
+    ids: IntArray  # (K,): lines that can be placed, ascending
+    xy: FloatArray  # (K, 2): their positions in the map (m)
+    unplaced: IntArray  # (U,): lines never seen, alone in a row, under enough parallax
 
 
 def place_lines(

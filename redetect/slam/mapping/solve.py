@@ -32,40 +32,21 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a descent ended.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    cost : float
-        What was minimised: chi-squared, or less under a robust loss.
-    costs : tuple of float
-        At the start and after each step.
-    """
+    """Where a descent ended."""
 
     estimate: Estimate
-    cost: float
-    costs: tuple[float, ...]
+    cost: float  # what was minimised: chi-squared, or less under a robust loss
+    costs: tuple[float, ...]  # at the start and after each step
 
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
-    """Covariance of each unknown, all others unknown too.
+    """Covariance of each unknown, all others unknown too."""
 
-    Attributes
-    ----------
-    poses : (N + 1, 3, 3) float64
-        Zero for the first, which is given.
-    discs : (M, 2, 2) float64
-    lines : (K, 2, 2) float64
-    mounting : (4, 4) float64 or None
-        Of the rotation vector (rad) and the height (m).
-    """
-
-    poses: FloatArray
-    discs: FloatArray
-    lines: FloatArray
-    mounting: FloatArray | None
+    poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
+    discs: FloatArray  # (M, 2, 2)
+    lines: FloatArray  # (K, 2, 2)
+    mounting: FloatArray | None  # (4, 4): of the rotation vector (rad) and the height (m)
 
 
 @dataclass(frozen=True, eq=False)

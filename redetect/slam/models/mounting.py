@@ -96,21 +96,12 @@ def rows_through_mounting(
 
 @dataclass(frozen=True, eq=False)
 class RecordedJacobians:
-    """Derivatives of n rows as recorded.
+    """Derivatives of n rows as recorded."""
 
-    Attributes
-    ----------
-    floor : (n, 2, 2) float64
-        By the disc in the robot frame.
-    tilt : (n, 2, 2) float64
-        By the frame's pitch and roll.
-    mounting : (n, 2, 4) float64
-        By a rotation vector in the robot frame, applied to the mounting from the left, and by the
-        height.
-    """
-
-    floor: FloatArray
-    tilt: FloatArray
+    floor: FloatArray  # (n, 2, 2): by the disc in the robot frame
+    tilt: FloatArray  # (n, 2, 2): by the frame's pitch and roll
+    # (n, 2, 4): by a rotation vector in the robot frame, applied to the mounting from the left, and
+    # by the height.
     mounting: FloatArray
 
 
