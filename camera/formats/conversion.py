@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.calibration.projection import UNPOSED, intrinsics_of, with_intrinsics
-from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL, Tangential, brown_of, brown_shift
+from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import CameraError, ConversionError
 from camera.formats.conversion_fit import EXACT_PX, CameraFit, smallest_largest
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
@@ -27,13 +27,10 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-_MANY_STEPS = 200
 # The rational model's coefficients before those of the thin prism.
 _WITHOUT_PRISM = 8
-# A largest deviation after least squares from which on another start is tried.
+# A largest deviation after least squares from which on a fuller model is tried.
 _NEAR_PX = 0.02
-# b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
-_DIP = (-2.5, 2.5, -0.85)
 
 
 @dataclass(frozen=True)
@@ -210,14 +207,8 @@ def convert_to_camera(
         # Finally, the copied terms may compensate for what the radial part cannot follow.
         spans.append(free_span(5, None, tangential=True))
     together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
-    radius = np.hypot(rays[:, 0], rays[:, 1])
-    away = (pixels - start[2:4]) / start[:2] - brown_shift(
-        rays, brown_of(NO_POLYNOMIAL, _tangential(source))
-    )
-    moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
-    wavy = _wavy_start(start, radius, moved)
     fit = CameraFit(project, together, pixels, possible)
-    best = _nearest(fit, camera_of, start, spans, check, wavy)
+    best = _nearest(fit, camera_of, start, spans, check)
     if best is None or best.deviation_px > _NEAR_PX:
         nearest = start if best is None else _intrinsics(best)
         fuller = _nearest(fit, camera_of, nearest, [together], check)
@@ -233,32 +224,14 @@ def _intrinsics(found: Converted) -> FloatArray:
     return intrinsics_of(found.camera)
 
 
-def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> FloatArray:
-    """Where a fit begins to a lens whose radial distortion changes its sign within the image.
-
-    Least squares does not get there from a lens without distortion: the denominator has to dip
-    towards the border. With the dip given, a2 and a3 are linear.
-    """
-    reach = float(radius.max())
-    b = np.array(_DIP) / reach ** np.array([1.0, 2.0, 3.0])
-    denominator = 1.0 + radius * (b[0] + radius * (b[1] + radius * b[2]))
-    powers = np.stack([radius**2, radius**3], axis=-1) / denominator[:, None]
-    a = np.linalg.lstsq(powers, moved, rcond=None)[0]
-    return np.concatenate([start[:4], a, b, start[9:]])
-
-
 def _nearest(
     fit: CameraFit,
     camera_of: Callable[[FloatArray], AnyCamera],
     start: FloatArray,
     spans: list[FloatArray],
     check: tuple[FloatArray, FloatArray],
-    other_start: FloatArray | None = None,
 ) -> Converted | None:
-    """The fit with the smallest largest deviation, each span fitted from where the last ended.
-
-    Where none is near, the last span is fitted from another start, too.
-    """
+    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
     best: Converted | None = None
     nearest = parameters = start
 
@@ -280,14 +253,6 @@ def _nearest(
             nearest, span = parameters, wider
         if best is not None and best.deviation_px < EXACT_PX:
             return best
-    if (
-        other_start is not None
-        and fit.possible(other_start)
-        and (best is None or best.deviation_px > _NEAR_PX)
-    ):
-        parameters = fit._replace(span=spans[-1]).fitted(other_start, _MANY_STEPS)
-        if keep(parameters):
-            nearest, span = parameters, spans[-1]
     keep(smallest_largest(fit._replace(span=span), nearest))
     return best
 
