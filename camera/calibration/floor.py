@@ -77,7 +77,7 @@ def place_on_floor(
     _check(pixels, floor)
     points = Points(floor, pixels, np.zeros(1, dtype=np.int64), camera.width, camera.height)
     intrinsics = intrinsics_of(camera)
-    start = Estimate(intrinsics, *board_poses(intrinsics, points))
+    start = board_poses(intrinsics, points)[0]
 
     def adjusted(start: Estimate, points: Points) -> Adjusted:
         # Not robust with few points: four, for example, leave too few residuals to find outliers.
