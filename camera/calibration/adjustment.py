@@ -48,10 +48,6 @@ _SMALLEST_DECREASE = 1e-10
 _SCALE_ROUNDS = 6
 
 
-class StartError(ValueError):
-    """A start from which nothing can be adjusted: it does not project all points."""
-
-
 @dataclass(frozen=True, eq=False)
 class Points:
     """Points of boards, where they were seen; all views one after the other.
@@ -208,8 +204,6 @@ def adjust(
     loss = Loss("huber", HUBER) if robust else Loss()
     problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
     for _ in range(_SCALE_ROUNDS if sigma_px is None else 1):
-        if not np.isfinite(problem.cost(estimate)):
-            raise StartError("the adjustment's start does not project all points")
         estimate = minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
         if sigma_px is not None:
             break

@@ -12,12 +12,12 @@ from camera.calibration.adjustment import (
     Adjusted,
     Estimate,
     Points,
-    StartError,
     adjust,
     project_estimate,
 )
 from camera.calibration.model import COUNT, brown_terms, coefficients, free_span, rotation_of
 from camera.distortion import one_to_one_radius, straightened
+from redetect.least_squares.solver import StartError
 
 FloatArray = NDArray[np.float64]
 

@@ -8,7 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.least_squares.solver import Block, Linear, Loss, minimise, robust_cost, stack
+from redetect.least_squares.solver import (
+    Block,
+    Linear,
+    Loss,
+    StartError,
+    minimise,
+    robust_cost,
+    stack,
+)
 
 FloatArray = NDArray[np.float64]
 Projection = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -33,9 +41,10 @@ class CameraFit(NamedTuple):
 
     def fitted(self, start: FloatArray, steps: int = _STEPS) -> FloatArray:
         """(P,) parameters, from a start on; all steps lead to possible ones."""
-        if not np.isfinite(self.cost(start)):
+        try:
+            return minimise(self, start, tolerance=1e-9, most_steps=steps, damping=1e-4).at
+        except StartError:
             return start
-        return minimise(self, start, tolerance=1e-9, most_steps=steps, damping=1e-4).at
 
     def cost(self, at: FloatArray) -> float:
         if not self.possible(at):

@@ -24,6 +24,10 @@ X = TypeVar("X")
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e10
 
 
+class StartError(ValueError):
+    """A start at which what is minimised is not defined."""
+
+
 class Loss(NamedTuple):
     """How much a residual counts: its square, or less beyond `scale` standard deviations."""
 
@@ -145,12 +149,12 @@ def stack(blocks: Sequence[Block], unknowns: int, shared: int) -> Linear:
         border.append(by_shared.reshape(n * d, shared))
         row = first_row + np.arange(n * d, dtype=np.int64).reshape(n, d, 1)
         for first, by in block.by:
-            free = first >= 0
-            width = np.arange(by.shape[2], dtype=np.int64)
-            shape = by[free].shape
-            values.append((by * root)[free].ravel())
-            rows.append(np.broadcast_to(row[free], shape).ravel())
-            columns.append(np.broadcast_to(first[free, None, None] + width, shape).ravel())
+            free = slice(None) if np.all(first >= 0) else first >= 0
+            some = by[free] * root[free]
+            column = first[free, None, None] + np.arange(by.shape[2], dtype=np.int64)
+            values.append(some.ravel())
+            rows.append(np.broadcast_to(row[free], some.shape).ravel())
+            columns.append(np.broadcast_to(column, some.shape).ravel())
         first_row += n * d
     places = (np.concatenate(rows), np.concatenate(columns))
     return Linear(
@@ -178,7 +182,9 @@ def factor(matrix: sparse.csc_array, damping: float = 0.0) -> SuperLU:
     Raises `numpy.linalg.LinAlgError` where it is singular.
     """
     if damping > 0.0:
-        matrix = (matrix + sparse.diags_array(damping * matrix.diagonal())).tocsc()
+        matrix = matrix.copy()
+        column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+        matrix.data[matrix.indices == column] *= 1.0 + damping
     options = {"SymmetricMode": True}
     try:
         return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
@@ -208,7 +214,6 @@ def minimise(
     ----------
     problem : Problem
     start : X
-        Where the cost must be finite.
     tolerance : float
         Stop at a step that lowers the cost by less than this share of it.
     most_steps : int
@@ -224,10 +229,14 @@ def minimise(
 
     Raises
     ------
+    StartError
+        If the cost is not finite at the start.
     numpy.linalg.LinAlgError
         If the residuals do not determine the unknowns.
     """
     at, lowest = start, problem.cost(start)
+    if not np.isfinite(lowest):
+        raise StartError("the cost is not finite at the start")
     costs = [lowest]
     for _ in range(most_steps):
         before = lowest

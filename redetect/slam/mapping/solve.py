@@ -18,6 +18,7 @@ from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import (
     Linear,
     NormalEquations,
+    StartError,
     factor,
     minimise,
     normal_equations,
@@ -119,10 +120,6 @@ def solve(
     """
     estimate = _with_unknowns(graph, start, weighting)
     problem = _MapProblem(graph, weighting)
-    if not np.isfinite(problem.cost(estimate)):
-        raise SlamError(
-            "least squares cannot begin: a disc lies where the camera as mounted cannot see it"
-        )
     try:
         found = minimise(
             problem,
@@ -131,6 +128,10 @@ def solve(
             most_steps=most_steps,
             refined=problem.with_best_positions,
         )
+    except StartError:
+        raise SlamError(
+            "least squares cannot begin: a disc lies where the camera as mounted cannot see it"
+        ) from None
     except np.linalg.LinAlgError:
         raise SlamError(
             "least squares: the measurements do not determine all poses and landmarks"
