@@ -6,13 +6,19 @@ gives the same bytes; a user's own matplotlib settings do not matter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.figure_file import picture
 from redetect.slam.recording import PICTURES
+from redetect.storage import OutputExistsError, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +37,8 @@ FloatArray = NDArray[np.float64]
 #: Central 95 % of chi squared with 3 degrees of freedom.
 NEES_BAND = (0.21579528262389785, 9.348403604496145)
 
+DPI = 120
+_WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
@@ -42,6 +50,36 @@ _MOST_NUMBERED = 40
 _MOST_ELLIPSES = 700
 # How far beyond path and discs a vertical may be and still be drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
+
+
+@contextmanager
+def picture(
+    png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
+) -> Iterator[Figure]:
+    """A figure to draw into (size in inches); at the end it is written and, on request, shown."""
+    if not overwrite and png.exists():  # before the work instead of after it
+        raise OutputExistsError(png)
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        if interactive:
+            if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
+                raise SlamError("no window can be opened here: expected a display for interactive")
+            figure = pyplot.figure(figsize=size, dpi=DPI, layout="constrained")
+        else:
+            figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+            FigureCanvasAgg(figure)
+        try:
+            yield figure
+            stream = io.BytesIO()
+            # Without the name and version of the program that made it: the same bytes everywhere.
+            figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
+            with write_whole(png, overwrite=overwrite) as file:
+                file.write(stream.getvalue())
+            if interactive:
+                pyplot.show()
+        finally:
+            if interactive:
+                pyplot.close(figure)
 
 
 def pose_errors(

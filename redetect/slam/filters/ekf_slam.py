@@ -23,17 +23,15 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.association import Associator, run_filter
-from redetect.slam.filters.delayed_lines import relative_range_sigma, start_line
+from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     FilterRun,
     FrameRows,
     RowCount,
-    unknown,
 )
 from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
-from redetect.slam.filters.views import View, WaitingLines
-from redetect.slam.recording import Recording
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -128,7 +126,7 @@ class EkfSlam:
         again: list[int] = []
         single: list[int] = []
         for k, number in enumerate(rows.disc_ids):
-            if unknown(number):
+            if number == UNKNOWN_ID:
                 self.count.left_out["disc without ID"] += 1
             elif number in self.disc_slots:
                 discs.append(k)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.recording import Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -153,8 +153,3 @@ class Filter(Protocol):
 
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame."""
-
-
-def unknown(number: int) -> bool:
-    """Whether an identifier says that the landmark is not known."""
-    return number == UNKNOWN_ID

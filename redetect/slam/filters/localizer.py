@@ -25,10 +25,9 @@ from redetect.slam.filters.frames import (
     FilterRun,
     FrameRows,
     RowCount,
-    unknown,
 )
 from redetect.slam.models.motion import move, move_jacobians
-from redetect.slam.recording import Recording
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -179,7 +178,7 @@ class Localizer:
         used_discs, used_lines = set(discs), set(lines)
         for k, number in enumerate(rows.disc_ids):
             if k not in used_discs:
-                reason = "disc without ID" if unknown(number) else "disc not in the map"
+                reason = "disc without ID" if number == UNKNOWN_ID else "disc not in the map"
                 self.count.left_out[reason] += 1
         for k, numbers in enumerate(rows.line_ids):
             if k not in used_lines:
