@@ -14,8 +14,7 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
-from camera.brown import NOT_TANGENTIAL
-from camera.distortion import NO_POLYNOMIAL
+from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
 from redetect.storage import write_whole

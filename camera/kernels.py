@@ -1,6 +1,6 @@
-"""The camera's projection for single points, compiled, for tables that need millions of them.
+"""Single points through a camera and back, compiled, for tables that need millions of them.
 
-`camera.model` is the definition; a test holds the two together.
+`camera.model` and `camera.distortion` are the definitions; tests hold both together.
 """
 
 from __future__ import annotations
@@ -11,14 +11,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from camera.brown_kernels import brown_shift_point
 from camera.model import Camera
+
+FloatArray = NDArray[np.float64]
 
 #: Length of the vector that `camera_numbers` returns.
 NUMBERS = 27
 
+_NEWTON_STEPS = 100
+_LAST_STEP = 1e-9
+_CONVERGED = 1e-12
+_SMALLEST_SHARE = 1e-6
 
-def camera_numbers(camera: Camera) -> NDArray[np.float64]:
+
+def camera_numbers(camera: Camera) -> FloatArray:
     """All that a projection needs, as one vector, the form in which kernels take a camera.
 
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
@@ -39,7 +45,7 @@ def camera_numbers(camera: Camera) -> NDArray[np.float64]:
     )
 
 
-def lens_numbers(camera: Camera) -> NDArray[np.float64]:
+def lens_numbers(camera: Camera) -> FloatArray:
     """The distortion alone, as `straightened_point` takes it.
 
     Order: a2, a3, b1, b2, b3; k1, k2, p1, p2, k3; r_max.
@@ -48,16 +54,120 @@ def lens_numbers(camera: Camera) -> NDArray[np.float64]:
 
 
 @njit(cache=True, error_model="numpy")
-def has_brown(terms: NDArray[np.float64]) -> bool:
+def brown_shift_point(
+    k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
+) -> tuple[float, float]:
+    """By how much Brown's terms move a point; all normalised."""
+    squared = x * x + y * y
+    along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
+    return along * x + squared * p2, along * y + squared * p1
+
+
+@njit(cache=True, error_model="numpy")
+def straightened_point(
+    lens: FloatArray, x_seen: float, y_seen: float, x: float, y: float
+) -> tuple[float, float]:
+    """Undistorted normalised coordinates of a distorted point, of a lens with Brown's terms.
+
+    Newton's method within the circle of r_max; a step that would leave it or raise the error is
+    halved. As the distortion is the gradient of a convex function there, that ends at the one
+    solution, if there is one.
+
+    Parameters
+    ----------
+    lens : (11,) float64
+        a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max (`camera.kernels.lens_numbers`).
+    x_seen, y_seen : float
+        The distorted point, normalised.
+    x, y : float
+        Where to begin: the radial inverse, or what a neighbour sees.
+
+    Returns
+    -------
+    x, y : float
+        Both NaN where nothing is seen.
+    """
+    a2, a3, b1, b2, b3 = lens[0], lens[1], lens[2], lens[3], lens[4]
+    k1, k2, p1, p2, k3, r_max = lens[5], lens[6], lens[7], lens[8], lens[9], lens[10]
+    polynomial = k1 != 0.0 or k2 != 0.0 or k3 != 0.0
+    r = math.sqrt(x * x + y * y)
+    if r > r_max:
+        x *= 0.999 * r_max / r
+        y *= 0.999 * r_max / r
+    # The residual where the last step began; at first none is worse.
+    least = math.inf
+    x_kept, y_kept, x_step, y_step = x, y, 0.0, 0.0
+    share = 1.0
+    last = False
+    for _ in range(_NEWTON_STEPS):
+        r = math.sqrt(x * x + y * y)
+        numerator = r * (a2 + r * a3)
+        denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+        squared = r * r
+        factor = 1.0 + numerator / denominator
+        if polynomial:
+            factor += squared * (k1 + squared * (k2 + squared * k3))
+        along = 2.0 * (p2 * x + p1 * y)
+        x_off = x_seen - (x * factor + along * x + squared * p2)
+        y_off = y_seen - (y * factor + along * y + squared * p1)
+        off = math.sqrt(x_off * x_off + y_off * y_off)
+        if r <= r_max and (off < least or last):
+            if last:
+                seen_radius = math.sqrt(x_seen * x_seen + y_seen * y_seen)
+                if off <= _CONVERGED * max(1.0, seen_radius):
+                    return x, y
+                return math.nan, math.nan
+            x_kept, y_kept, least, share = x, y, off, 1.0
+            slope = (
+                (a2 + 2.0 * a3 * r) * denominator - numerator * (b1 + r * (2.0 * b2 + 3.0 * b3 * r))
+            ) / (denominator * denominator)
+            per_r = slope / r if r > 0.0 else 0.0
+            if polynomial:
+                per_r += 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
+            xx = factor + per_r * x * x + along + 4.0 * p2 * x
+            xy = per_r * x * y + 2.0 * (p1 * x + p2 * y)
+            yy = factor + per_r * y * y + along + 4.0 * p1 * y
+            determinant = xx * yy - xy * xy
+            x_step = (yy * x_off - xy * y_off) / determinant
+            y_step = (xx * y_off - xy * x_off) / determinant
+            length = math.sqrt(x_step * x_step + y_step * y_step)
+            # Newton's error squares with each step: after one this small nothing is left to gain.
+            last = length <= _LAST_STEP * max(1.0, r)
+        else:
+            # Back, and less far.
+            share *= 0.5
+            last = False
+            if not share > _SMALLEST_SHARE:
+                break
+        x = x_kept + share * x_step
+        y = y_kept + share * y_step
+    return math.nan, math.nan
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def straighten_points(
+    lens: FloatArray,
+    seen: FloatArray,
+    start_radius: FloatArray,
+    straight: FloatArray,
+) -> None:
+    """`straightened_point` of many."""
+    for k in range(len(seen)):
+        x, y = seen[k, 0], seen[k, 1]
+        radius = math.sqrt(x * x + y * y)
+        ratio = start_radius[k] / radius if radius > 0.0 else 1.0
+        straight[k, 0], straight[k, 1] = straightened_point(lens, x, y, x * ratio, y * ratio)
+
+
+@njit(cache=True, error_model="numpy")
+def has_brown(terms: FloatArray) -> bool:
     """Whether any of k1, k2, p1, p2, k3 is not 0."""
     k1, k2, p1, p2, k3 = terms[0], terms[1], terms[2], terms[3], terms[4]
     return bool(k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0)
 
 
 @njit(cache=True, error_model="numpy")
-def project_direction(
-    numbers: NDArray[np.float64], dx: float, dy: float, dz: float
-) -> tuple[float, float]:
+def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> tuple[float, float]:
     """Pixel (u, v) of a direction in the robot frame; both NaN where it is undefined."""
     z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
     if not z > 0.0:
@@ -81,8 +191,6 @@ def project_direction(
 
 
 @njit(cache=True, error_model="numpy")
-def project_floor_point(
-    numbers: NDArray[np.float64], x_robot: float, y_robot: float
-) -> tuple[float, float]:
+def project_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> tuple[float, float]:
     """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
     return project_direction(numbers, x_robot - numbers[19], y_robot - numbers[20], -numbers[21])

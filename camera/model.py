@@ -22,21 +22,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera.brown import (
+from camera.distortion import (
+    NO_POLYNOMIAL,
     NOT_TANGENTIAL,
     Brown,
+    Coef,
+    Polynomial,
     Tangential,
     brown_of,
     brown_shift,
     distorted_jacobian,
     one_to_one_radius,
-    straightened,
-)
-from camera.distortion import (
-    NO_POLYNOMIAL,
-    Coef,
-    Polynomial,
     radial_factor,
+    straightened,
     undistorted_radius,
 )
 from camera.model_checks import (
@@ -80,9 +78,9 @@ class Camera:
     unknown : tuple of (key, text)
         Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
     tangential : 2 floats
-        p1, p2 of the distortion (see `camera.brown`); the data set's cameras have none.
+        p1, p2 of the distortion (see `camera.distortion`); the data set's cameras have none.
     polynomial : 3 floats
-        k1, k2, k3 of the distortion (see `camera.brown`); the data set's cameras have none.
+        k1, k2, k3 of the distortion (see `camera.distortion`); the data set's cameras have none.
     covariance : tuple of float, optional
         Of the calibration's parameters (`camera.uncertainty`): the lower triangle, row by row.
 
@@ -208,17 +206,9 @@ class Camera:
     # -- camera frame <-> pixels ------------------------------------------------------------
 
     def distort(self, normalised: ArrayLike) -> FloatArray:
-        """Pixels of undistorted normalised coordinates.
+        """(..., 2) pixels of (..., 2) undistorted normalised coordinates px/pz, py/pz.
 
-        Parameters
-        ----------
-        normalised : (..., 2) array
-            x = px/pz, y = py/pz.
-
-        Returns
-        -------
-        (..., 2) array
-            u, v; both NaN past the distortion's fold.
+        Both NaN past the distortion's fold.
         """
         xy = np.asarray(normalised, dtype=np.float64)
         radius = np.hypot(xy[..., 0], xy[..., 1])
@@ -232,17 +222,9 @@ class Camera:
         return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
-        """Undistorted normalised coordinates of pixels; the inverse of `distort`.
+        """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
 
-        Parameters
-        ----------
-        pixels : (..., 2) array
-            u, v in pixels; need not be integers nor inside the image.
-
-        Returns
-        -------
-        (..., 2) array
-            x, y; both NaN where the pixel sees nothing (past the fold).
+        Pixels need not be inside the image; both are NaN where nothing is seen (past the fold).
         """
         uv = np.asarray(pixels, dtype=np.float64)
         x = (uv[..., 0] - self.offset_x) / self.scale_x
@@ -255,17 +237,9 @@ class Camera:
         return np.stack([x / factor, y / factor], axis=-1)
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
-        """Pixels of points in the camera frame.
+        """(..., 2) pixels of (..., 3) points in the camera frame (m).
 
-        Parameters
-        ----------
-        points_camera : (..., 3) array
-            Points in the camera frame, metres.
-
-        Returns
-        -------
-        (..., 2) array
-            u, v; both NaN for points not in front of the camera or past the distortion's fold.
+        Both NaN for points not in front of the camera or past the distortion's fold.
         """
         p = np.asarray(points_camera, dtype=np.float64)
         depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
@@ -303,17 +277,9 @@ class Camera:
         return self.unproject(pixels) @ self.rotation.T
 
     def floor_from_pixel(self, pixels: ArrayLike) -> FloatArray:
-        """Where the rays of pixels meet the floor.
+        """(..., 2) places X, Y in the robot frame (m) where rays of (..., 2) pixels meet the floor.
 
-        Parameters
-        ----------
-        pixels : (..., 2) array
-            u, v in pixels.
-
-        Returns
-        -------
-        (..., 2) array
-            X, Y in the robot frame, metres; NaN where the ray does not come down to the floor.
+        NaN where the ray does not come down to the floor.
         """
         direction = self.directions_robot(pixels)
         down = np.where(direction[..., 2] * self.centre[2] < 0.0, direction[..., 2], np.nan)

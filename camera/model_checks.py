@@ -10,8 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera.brown import first_unseen, one_to_one_radius
-from camera.distortion import LARGEST_COEFFICIENT, fold_radius, largest_distorted_radius
+from camera.distortion import (
+    LARGEST_COEFFICIENT,
+    first_unseen,
+    fold_radius,
+    largest_distorted_radius,
+    one_to_one_radius,
+)
 from camera.errors import CameraError
 
 if TYPE_CHECKING:

@@ -16,20 +16,12 @@ BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 Format = Literal["auto", "cam", "opencv", "ros", "kalibr", "colmap"]
 
 
-@dataclass(frozen=True)
-class Calibrate:
-    """Calibrate a camera from photographs or a video of a board.
-
-    Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam
-
-    With the pose from a photograph of the same board on the floor, its middle 1.5 m ahead of the
-    robot: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025
-    --floor floor.jpg --floor-origin 0 -1.5 --floor-yaw 180 -o my.cam
+@dataclass(frozen=True, kw_only=True)
+class BoardFlags:
+    """A printed board.
 
     Parameters
     ----------
-    images : several Paths
-        Photographs, folders of them, or a video.
     board : str
         `checkerboard`, `charuco`, `circles` (in rows and columns) or `asymmetric-circles` (every
         other row moved by half a distance).
@@ -45,6 +37,59 @@ class Calibrate:
         Of a ChArUco board, as OpenCV names it.
     circle_m : float
         Diameter of the circles (m); with it, perspective no longer shifts their middles.
+    output : Path
+        The .cam file to write.
+    force : bool
+        Replace existing files.
+    """
+
+    output: Annotated[Path, arg(aliases=["-o"])]
+    columns: int
+    rows: int
+    square_m: float
+    board: BoardKind = "checkerboard"
+    marker_m: float = 0.0
+    dictionary: str = "DICT_5X5_100"
+    circle_m: float = 0.0
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardOnFloor(BoardFlags):
+    """A board that lies on the floor.
+
+    Parameters
+    ----------
+    floor_origin : two floats
+        Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
+    floor_yaw : float
+        By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
+        axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
+        back right, 180: at the front left. With 180 the board appears upright in the image.
+    pictures : Path
+        Folder for pictures to check by: the corners found and projected in each photograph; of the
+        floor's photograph its grid and the horizon, and the floor from above.
+    """
+
+    floor_origin: tuple[float, float] = (0.0, 0.0)
+    floor_yaw: float = 0.0
+    pictures: MaybePath = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate(BoardOnFloor):
+    """Calibrate a camera from photographs or a video of a board.
+
+    Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam
+
+    With the pose from a photograph of the same board on the floor, its middle 1.5 m ahead of the
+    robot: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025
+    --floor floor.jpg --floor-origin 0 -1.5 --floor-yaw 180 -o my.cam
+
+    Parameters
+    ----------
+    images : several Paths
+        Photographs, folders of them, or a video.
     half : bool
         Pictures are half-height: every second line of square pixels, as the data set's.
     free_aspect : bool
@@ -69,30 +114,11 @@ class Calibrate:
     floor : Path
         A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
         it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.
-    floor_origin : two floats
-        Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
-    floor_yaw : float
-        By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
-        axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
-        back right, 180: at the front left. With 180 the board appears upright in the image.
     output : Path
         The .cam file. Beside it: .json with everything, and pictures of residuals and coverage.
-    pictures : Path
-        Folder for pictures to check by: the corners found and projected in each photograph; of the
-        floor's photograph its grid and the horizon, and the floor from above.
-    force : bool
-        Replace existing files.
     """
 
     images: Positional[tuple[Path, ...]]
-    columns: int
-    rows: int
-    square_m: float
-    output: Annotated[Path, arg(aliases=["-o"])]
-    board: BoardKind = "checkerboard"
-    marker_m: float = 0.0
-    dictionary: str = "DICT_5X5_100"
-    circle_m: float = 0.0
     half: bool = False
     free_aspect: bool = True
     coefficients: Literal["auto", "0", "1", "2", "3", "4", "5"] = "auto"
@@ -102,14 +128,10 @@ class Calibrate:
     every: int = 15
     max_images: int = 60
     floor: MaybePath = None
-    floor_origin: tuple[float, float] = (0.0, 0.0)
-    floor_yaw: float = 0.0
-    pictures: MaybePath = None
-    force: bool = False
 
 
-@dataclass(frozen=True)
-class Board:
+@dataclass(frozen=True, kw_only=True)
+class Board(BoardFlags):
     """Print a calibration board, or discs, as a PDF at true scale.
 
     Example: camera board --columns 9 --rows 6 --square-m 0.025 -o board.pdf
@@ -122,40 +144,23 @@ class Board:
         As in `camera calibrate`, or `discs`: landmarks for the floor.
     columns : int
         As in `camera calibrate`; of discs, how many side by side.
-    rows : int
-        Likewise.
-    square_m : float
-        As in `camera calibrate`.
-    marker_m : float
-        As in `camera calibrate`.
-    dictionary : str
-        As in `camera calibrate`.
     circle_m : float
         Diameter of the circles or discs (m).
     page : str
         The paper, upright or not; `auto`: the smallest that it fits on.
     output : Path
         The PDF to write.
-    force : bool
-        Replace an existing file.
     """
 
-    output: Annotated[Path, arg(aliases=["-o"])]
-    board: Literal["checkerboard", "charuco", "circles", "asymmetric-circles", "discs"] = (
-        "checkerboard"
-    )
+    board: BoardKind | Literal["discs"] = "checkerboard"  # type: ignore[assignment]
     columns: int = 1
     rows: int = 1
     square_m: float = 0.025
-    marker_m: float = 0.0
-    dictionary: str = "DICT_5X5_100"
-    circle_m: float = 0.0
     page: Literal["auto", "A4", "A3", "A2", "A1", "A0"] = "auto"
-    force: bool = False
 
 
-@dataclass(frozen=True)
-class Floor:
+@dataclass(frozen=True, kw_only=True)
+class Floor(BoardOnFloor):
     """Give a calibrated camera its pose, from a board or known places on the floor.
 
     Example: camera floor my.cam floor.jpg --columns 9 --rows 6 --square-m 0.025
@@ -170,47 +175,13 @@ class Floor:
     floor : Path
         A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
         it (pixels; metres, X left and Y backward of the robot).
-    board : str
-        As in `camera calibrate`.
-    columns : int
-        As in `camera calibrate`.
-    rows : int
-        As in `camera calibrate`.
-    square_m : float
-        As in `camera calibrate`.
-    marker_m : float
-        As in `camera calibrate`.
-    dictionary : str
-        As in `camera calibrate`.
-    circle_m : float
-        As in `camera calibrate`.
-    floor_origin : two floats
-        Where the middle of the board's points lies: X (left) and Y (backward) of the robot, m.
-    floor_yaw : float
-        From the robot's X axis to the board's x axis, counterclockwise seen from above (degrees).
-    output : Path
-        The .cam file to write.
-    pictures : Path
-        Folder for pictures to check by: the floor's grid and the horizon in the photograph, and the
-        floor from above.
-    force : bool
-        Replace existing files.
     """
 
     camera: Positional[Path]
     floor: Positional[Path]
-    output: Annotated[Path, arg(aliases=["-o"])]
-    board: BoardKind = "checkerboard"
     columns: int = 0
     rows: int = 0
     square_m: float = 0.0
-    marker_m: float = 0.0
-    dictionary: str = "DICT_5X5_100"
-    circle_m: float = 0.0
-    floor_origin: tuple[float, float] = (0.0, 0.0)
-    floor_yaw: float = 0.0
-    pictures: MaybePath = None
-    force: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Bundle adjustment of one camera and many views of boards whose points are known.
 
-Levenberg-Marquardt on the normal equations, with the views' poses eliminated (Schur complement):
-views meet only in the intrinsics, so that a step costs a few small solves however many there are.
+Views meet only in the intrinsics, which they share; the solver is `redetect.least_squares`.
 """
 
 from __future__ import annotations
@@ -19,6 +18,19 @@ from camera.calibration.model import (
     project_points,
     rotation_of,
 )
+from redetect.least_squares.covariance import diagonal_blocks
+from redetect.least_squares.solver import (
+    Block,
+    Linear,
+    Loss,
+    minimise,
+    normal_equations,
+    robust_cost,
+    stack,
+)
+from redetect.least_squares.solver import (
+    robust as robustified,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -30,14 +42,10 @@ HUBER = 2.0
 #: leave open.
 PRIOR_SIGMA = 10.0
 
-_STEPS = 200
+_DAMPING = 1e-3
+
 _SMALLEST_DECREASE = 1e-10
-_LARGEST_DAMPING = 1e12
 _SCALE_ROUNDS = 6
-
-
-class StartError(ValueError):
-    """A start from which nothing can be adjusted: it does not project all points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,29 +106,15 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An `Estimate` that fits best, and how well.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    sigma_px : float
-        Noise of a coordinate that the residuals show (robust, by degrees of freedom).
-    residuals : (N, 2) float64
-        Seen less projected, pixels.
-    weights : (N, 2) float64
-        Robust weights, 1 where a residual counts in full.
-    covariance : (14, 14) float64
-        Of the intrinsics; zero for those held fixed.
-    pose_covariances : (V, 6, 6) float64
-        Of each view's rotation (perturbed from the left, in the camera frame, rad) and translation
-        (m), the intrinsics' uncertainty included.
-    """
+    """An `Estimate` that fits best, and how well."""
 
     estimate: Estimate
-    sigma_px: float
-    residuals: FloatArray
-    weights: FloatArray
-    covariance: FloatArray
+    sigma_px: float  # noise of a coordinate that the residuals show (robust, by degrees of freedom)
+    residuals: FloatArray  # (N, 2): seen less projected, pixels
+    weights: FloatArray  # (N, 2): robust weights, 1 where a residual counts in full
+    covariance: FloatArray  # (14, 14): of the intrinsics; zero for those held fixed
+    # (V, 6, 6): of each view's rotation (perturbed from the left, in the camera frame, rad) and
+    # translation (m), the intrinsics' uncertainty included.
     pose_covariances: FloatArray
 
     @property
@@ -130,14 +124,51 @@ class Adjusted:
 
 
 @dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal equations: intrinsics A (K, K), a (K,); mixed B (V, K, 6); poses C, c."""
+class _Problem:
+    """The reprojection error, and a weak prior of the distortion's coefficients."""
 
-    A: FloatArray
-    a: FloatArray
-    B: FloatArray
-    C: FloatArray
-    c: FloatArray
+    points: Points
+    span: FloatArray
+    sigma: float
+    loss: Loss
+
+    def residuals(self, at: Estimate) -> FloatArray:
+        """(N, 2) seen less projected (px)."""
+        return self.points.pixels - project_estimate(at, self.points)[0]
+
+    def cost(self, at: Estimate) -> float:
+        if not is_possible(at.intrinsics, self.points.width, self.points.height):
+            return float("inf")
+        with np.errstate(invalid="ignore"):
+            seen = self.residuals(at).reshape(-1, 1) / self.sigma
+            return robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
+
+    def linear(self, at: Estimate) -> Linear:
+        pixels, by_intrinsics, by_pose = project_estimate(at, self.points)
+        error = (pixels - self.points.pixels).reshape(-1, 1) / self.sigma
+        of_pose = np.repeat(6 * self.points.views, 2)
+        by_pose = by_pose.reshape(-1, 1, 6) / self.sigma
+        shared = (by_intrinsics @ self.span).reshape(len(error), 1, -1) / self.sigma
+        prior, weight = self._prior(at)
+        blocks = [
+            Block(error, [(of_pose, by_pose)], shared, self.loss),
+            Block(prior, [], (weight[:, None] * self.span)[:, None, :]),
+        ]
+        return stack(blocks, 6 * len(self.points.starts), self.span.shape[1])
+
+    def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
+        poses = step.reshape(-1, 6)
+        return Estimate(
+            at.intrinsics + self.span @ shared,
+            rotation_of(poses[:, :3]) @ at.rotations,
+            at.translations + poses[:, 3:],
+        )
+
+    def _prior(self, at: Estimate) -> tuple[FloatArray, FloatArray]:
+        """Residuals (14, 1) of the prior, and their weights (per unit of coefficient)."""
+        reach = corner_radius(at.intrinsics, self.points.width, self.points.height)
+        weight = np.concatenate([np.zeros(4), max(reach, 1e-3) ** POWERS / PRIOR_SIGMA])
+        return (weight * at.intrinsics)[:, None], weight
 
 
 def project_estimate(
@@ -145,13 +176,7 @@ def project_estimate(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of all points, and their derivatives.
 
-    Returns
-    -------
-    pixels : (N, 2) array
-    by_intrinsics : (N, 2, 14) array
-    by_pose : (N, 2, 6) array
-        By the rotation (from the left, about the board's origin) and the translation of the
-        point's own view.
+    Returns `pixels` (N, 2), `by_intrinsics` (N, 2, 14), `by_pose` (N, 2, 6).
     """
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
@@ -173,185 +198,50 @@ def adjust(
 ) -> Adjusted:
     """Fit intrinsics and poses by the reprojection error.
 
-    Parameters
-    ----------
-    start : Estimate
-        Must project all points.
-    points : Points
-    span : (14, K) array
-        Directions in which the intrinsics may change (`free_span`); K = 0 fits poses alone.
-    robust : bool
-        Huber's loss per coordinate, at `HUBER` standard deviations.
-    sigma_px : float, optional
-        Noise of a coordinate, if it is known; else it is found from the residuals.
-    tolerance : float
-        Relative decrease of the cost at which a fit ends.
-
-    Returns
-    -------
-    Adjusted
+    Takes `span` (14, K).
     """
     estimate = start
-    huber = HUBER if robust else np.inf
-    sigma = sigma_px if sigma_px is not None else _noise(points.pixels, estimate, points)
+    loss = Loss("huber", HUBER) if robust else Loss()
+    problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
     for _ in range(_SCALE_ROUNDS if sigma_px is None else 1):
-        estimate = _minimise(estimate, points, span, sigma, huber, tolerance)
+        estimate = minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
         if sigma_px is not None:
             break
-        found = _noise(points.pixels, estimate, points, span.shape[1])
-        done = abs(found - sigma) <= 0.02 * sigma
-        sigma = found
-        if done or not robust:
+        found, before = _noise(estimate, points, span.shape[1]), problem.sigma
+        problem = replace(problem, sigma=found)
+        if abs(found - before) <= 0.02 * before or not robust:
             break
-    return _summary(estimate, points, span, sigma, huber, sigma_known=sigma_px is not None)
+    return _summary(problem, estimate, sigma_known=sigma_px is not None)
 
 
-def _noise(seen: FloatArray, estimate: Estimate, points: Points, free: int = 0) -> float:
+def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
     """Standard deviation of a coordinate by the median of the residuals, which outliers spare."""
-    residuals = seen - project_estimate(estimate, points)[0]
+    residuals = points.pixels - project_estimate(estimate, points)[0]
     unknown = free + 6 * len(points.starts)
     share = max(1.0 - unknown / residuals.size, 0.1)
     return max(float(1.4826 * np.median(np.abs(residuals)) / np.sqrt(share)), 1e-9)
 
 
-def _minimise(
-    estimate: Estimate,
-    points: Points,
-    span: FloatArray,
-    sigma: float,
-    huber: float,
-    tolerance: float,
-) -> Estimate:
-    damping = 1e-3
-    cost = _cost(estimate, points, sigma, huber)
-    if not np.isfinite(cost):
-        raise StartError("the adjustment's start does not project all points")
-    for _ in range(_STEPS):
-        normal = _normal_equations(estimate, points, span, sigma, huber)[0]
-        while damping < _LARGEST_DAMPING:
-            trial = _stepped(estimate, span, *_solve(normal, damping))
-            trial_cost = _cost(trial, points, sigma, huber)
-            if trial_cost < cost:
-                break
-            damping *= 8.0
-        else:
-            return estimate
-        decrease = cost - trial_cost
-        estimate, cost = trial, trial_cost
-        damping = max(damping / 6.0, 1e-12)
-        if decrease <= tolerance * cost + 1e-18:
-            return estimate
-    return estimate
-
-
-def _prior(intrinsics: FloatArray, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Residuals of the coefficients' prior and their weights (per unit of coefficient)."""
-    reach = max(corner_radius(intrinsics, points.width, points.height), 1e-3)
-    weight = np.concatenate([np.zeros(4), reach**POWERS / PRIOR_SIGMA])
-    return weight * intrinsics, weight
-
-
-def _cost(estimate: Estimate, points: Points, sigma: float, huber: float) -> float:
-    if not is_possible(estimate.intrinsics, points.width, points.height):
-        return float("inf")
-    pixels = project_estimate(estimate, points)[0]
-    if np.any(np.isnan(pixels)):
-        return float("inf")
-    error = np.abs(points.pixels - pixels) / sigma
-    with np.errstate(invalid="ignore"):
-        loss = np.where(error <= huber, 0.5 * error**2, huber * (error - 0.5 * huber))
-    return float(np.sum(loss) + 0.5 * np.sum(_prior(estimate.intrinsics, points)[0] ** 2))
-
-
-def _normal_equations(
-    estimate: Estimate, points: Points, span: FloatArray, sigma: float, huber: float
-) -> tuple[_Normal, FloatArray, FloatArray]:
-    """Normal equations, the residuals (N, 2) in pixels and their weights (N, 2)."""
-    pixels, by_intrinsics, by_pose = project_estimate(estimate, points)
-    residuals = points.pixels - pixels
-    error = np.abs(residuals) / sigma
-    weights = np.minimum(1.0, huber / np.maximum(error, 1e-300))
-    root = (np.sqrt(weights) / sigma)[:, :, None]
-    J, P = root * (by_intrinsics @ span), root * by_pose
-    e = root[:, :, 0] * residuals
-    prior, prior_weight = _prior(estimate.intrinsics, points)
-    scaled = prior_weight[:, None] * span
-
-    def per_view(first: FloatArray, second: FloatArray) -> FloatArray:
-        products = first.swapaxes(1, 2) @ second
-        return np.asarray(np.add.reduceat(products, points.starts, axis=0))
-
-    flat = J.reshape(2 * len(J), J.shape[2])
-    normal = _Normal(
-        A=flat.T @ flat + scaled.T @ scaled,
-        a=flat.T @ e.ravel() - scaled.T @ prior,
-        B=per_view(J, P),
-        C=per_view(P, P),
-        c=per_view(P, e[:, :, None])[:, :, 0],
+def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adjusted:
+    points, span, sigma = problem.points, problem.span, problem.sigma
+    residuals = problem.residuals(estimate)
+    weights = robustified((residuals.ravel() / sigma) ** 2, problem.loss)[1].reshape(
+        residuals.shape
     )
-    return normal, residuals, weights
-
-
-def _solve(normal: _Normal, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Step of the free intrinsics (K,) and of the poses (V, 6)."""
-    six = np.arange(6)
-    C = normal.C.copy()
-    C[:, six, six] *= 1.0 + damping
-    inverse = np.linalg.inv(C)
-    A = normal.A.copy()
-    A[np.diag_indices_from(A)] *= 1.0 + damping
-    W = normal.B @ inverse
-    reduced = A - np.einsum("vik,vjk->ij", W, normal.B)
-    step = np.zeros(len(normal.a))
-    if len(step):
-        right = normal.a - np.einsum("vik,vk->i", W, normal.c)
-        step = _inverse(reduced) @ right
-    poses = np.einsum("vij,vj->vi", inverse, normal.c - np.einsum("vki,k->vi", normal.B, step))
-    return step, poses
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Pseudo-inverse of a positive semi-definite matrix whose parameters differ much in scale."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    both = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(matrix / both, 1e-14, hermitian=True) / both)
-
-
-def _stepped(estimate: Estimate, span: FloatArray, step: FloatArray, poses: FloatArray) -> Estimate:
-    return Estimate(
-        estimate.intrinsics + span @ step,
-        rotation_of(poses[:, :3]) @ estimate.rotations,
-        estimate.translations + poses[:, 3:],
-    )
-
-
-def _summary(
-    estimate: Estimate,
-    points: Points,
-    span: FloatArray,
-    sigma: float,
-    huber: float,
-    *,
-    sigma_known: bool,
-) -> Adjusted:
-    _, residuals, weights = _normal_equations(estimate, points, span, sigma, huber)
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.
-    plain = _normal_equations(estimate, points, span, sigma, np.inf)[0]
     psi = weights * residuals / sigma
     unknown = span.shape[1] + 6 * len(points.starts)
     freedom = max(residuals.size - unknown, 1) / residuals.size
     counted = max(float(np.mean(weights == 1.0)), 0.05)
     spread = 1.0 if sigma_known else float(np.mean(psi**2)) / freedom / counted**2
-    inverse = np.linalg.inv(plain.C)
-    W = plain.B @ inverse
-    free = _inverse(plain.A - np.einsum("vik,vjk->ij", W, plain.B))
-    shared = np.einsum("vki,kl,vlj->vij", W, free, W)
+    plain = normal_equations(replace(problem, loss=Loss()).linear(estimate))
+    (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.starts)))])
     return Adjusted(
         estimate=estimate,
         sigma_px=sigma * float(np.sqrt(spread)),
         residuals=residuals,
         weights=weights,
         covariance=spread * (span @ free @ span.T),
-        pose_covariances=spread * (inverse + shared),
+        pose_covariances=spread * poses,
     )

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.boards.board import Board
-from camera.calibration.adjustment import Adjusted, Estimate, Points, StartError, project_estimate
+from camera.calibration.adjustment import Adjusted, Estimate, Points, project_estimate
 from camera.calibration.checks import demand_different_views, demand_enough, warnings_of
 from camera.calibration.choice import choose_lens, of_views
 from camera.calibration.fit import circle_shifts, fit_points
 from camera.calibration.settings import CalibrationSettings, FreeLens
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg
 from camera.errors import CalibrationError
+from redetect.least_squares.solver import StartError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -35,27 +35,15 @@ _LARGEST_FILE_BYTES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class FloorPose:
-    """The camera's pose in the robot frame.
+    """The camera's pose in the robot frame."""
 
-    Attributes
-    ----------
-    robot_from_camera : (3, 4) float64
-    covariance : (6, 6) float64
-        Of the position (m, robot frame) and of a small rotation from the left (rad, about the
-        robot's axes), in this order; errors of the points and of the intrinsics.
-    residuals : (N, 2) float64
-        Seen less projected, pixels.
-    sigma_px : float
-        Noise of a coordinate that the residuals show.
-    by_intrinsics : (6, 14) float64
-        How the pose follows errors of the intrinsics.
-    """
-
-    robot_from_camera: FloatArray
+    robot_from_camera: FloatArray  # (3, 4)
+    # (6, 6): of the position (m, robot frame) and of a small rotation from the left (rad, about the
+    # robot's axes), in this order; errors of the points and of the intrinsics.
     covariance: FloatArray
-    residuals: FloatArray
-    sigma_px: float
-    by_intrinsics: FloatArray
+    residuals: FloatArray  # (N, 2): seen less projected, pixels
+    sigma_px: float  # noise of a coordinate that the residuals show
+    by_intrinsics: FloatArray  # (6, 14): how the pose follows errors of the intrinsics
 
     @property
     def rms_px(self) -> float:
@@ -83,34 +71,13 @@ def place_on_floor(
 ) -> FloorPose:
     """The camera's pose from points on the floor.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its intrinsics; its pose does not matter.
-    pixels : (N, 2) array
-        Where the points are seen.
-    floor_xy : (N, 2) array
-        Where they are, robot X and Y in metres.
-    intrinsics_covariance : (14, 14) array, optional
-        Of `calibration_model.INTRINSICS`; zero if not given.
-    radius_m : float
-        Where the points are the centroids of circles' images, the circles' radius: it takes off
-        what perspective and lens move them.
-
-    Returns
-    -------
-    FloorPose
-
-    Raises
-    ------
-    CalibrationError
-        If there are too few points, they lie in a line, or no pose above the floor sees them.
+    Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor)
     points = Points(floor, pixels, np.zeros(1, dtype=np.int64), camera.width, camera.height)
     intrinsics = intrinsics_of(camera)
-    start = Estimate(intrinsics, *board_poses(intrinsics, points))
+    start = board_poses(intrinsics, points)[0]
 
     def adjusted(start: Estimate, points: Points) -> Adjusted:
         # Not robust with few points: four, for example, leave too few residuals to find outliers.

@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from camera.brown import Brown, brown_shift, distorted_jacobian, one_to_one_radius
-from camera.distortion import Coef, fold_radius, radial_factor
+from camera.distortion import (
+    Brown,
+    Coef,
+    brown_shift,
+    distorted_jacobian,
+    fold_radius,
+    one_to_one_radius,
+    radial_factor,
+)
 from camera.model_checks import border_pixels
 
 FloatArray = NDArray[np.float64]
@@ -88,20 +95,8 @@ def project_points(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of points in the camera frame and their derivatives.
 
-    Parameters
-    ----------
-    intrinsics : (14,) array
-    points_camera : (N, 3) array
-        Metres.
-
-    Returns
-    -------
-    pixels : (N, 2) array
-        NaN for points that are not in front of the camera or past the distortion's fold.
-    by_intrinsics : (N, 2, 14) array
-        d(u, v) / d(intrinsics).
-    by_point : (N, 2, 3) array
-        d(u, v) / d(point), pixels per metre.
+    Takes `intrinsics` (14,), `points_camera` (N, 3); returns `pixels` (N, 2), `by_intrinsics` (N,
+    2, 14), `by_point` (N, 2, 3).
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
     coef = a2, a3, b1, b2, b3 = coefficients(intrinsics)

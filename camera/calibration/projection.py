@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration.model import COUNT, cross_matrices, project_points, rotation_of
+from camera.calibration.model import COUNT, cross_matrices, project_points
 from camera.model import Camera, Pose
 
 FloatArray = NDArray[np.float64]
@@ -58,28 +58,3 @@ def projection_sigma(
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(rows, columns))
-
-
-def projection_difference(
-    camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
-) -> FloatArray:
-    """How far apart two cameras project the same directions, (rows, columns) pixels.
-
-    NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
-    """
-    pixels = pixel_grid(camera.width, camera.height, columns, rows)
-    rays = camera.unproject(pixels)
-    rotation = np.eye(3)
-    intrinsics = intrinsics_of(other)
-    for _ in range(10 if rotate else 0):
-        turned = rays @ rotation.T
-        found, _, by_point = project_points(intrinsics, turned)
-        turn = -by_point @ cross_matrices(turned)
-        good = np.all(np.isfinite(found), axis=1)
-        error = (pixels - found)[good].ravel()
-        step = np.linalg.lstsq(turn[good].reshape(-1, 3), error, rcond=None)[0]
-        rotation = rotation_of(np.asarray(step, dtype=np.float64)) @ rotation
-        if np.abs(step).max() < 1e-12:
-            break
-    found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
-    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(rows, columns))

@@ -9,12 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.brown import NOT_TANGENTIAL, Tangential, brown_of, brown_shift
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.calibration.projection import UNPOSED, intrinsics_of, with_intrinsics
-from camera.distortion import NO_POLYNOMIAL
+from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import CameraError, ConversionError
-from camera.formats.conversion_fit import EXACT_PX, least_squares, smallest_largest
+from camera.formats.conversion_fit import EXACT_PX, CameraFit, smallest_largest
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
 from camera.model import Camera
 
@@ -28,32 +27,21 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-_MANY_STEPS = 200
 # The rational model's coefficients before those of the thin prism.
 _WITHOUT_PRISM = 8
-# A largest deviation after least squares from which on another start is tried.
+# A largest deviation after least squares from which on a fuller model is tried.
 _NEAR_PX = 0.02
-# b1, b2, b3 of a denominator that dips towards the image's corner, at radius 1.
-_DIP = (-2.5, 2.5, -0.85)
 
 
 @dataclass(frozen=True)
 class Converted:
-    """A converted camera.
-
-    Attributes
-    ----------
-    camera : Camera or ForeignCamera
-    deviation_px : float
-        Largest distance, over the image, between where a pixel's ray is seen by the source and by
-        the target (target's pixels).
-    at : (float, float)
-        The target's pixel where it is largest.
-    """
+    """A converted camera."""
 
     camera: AnyCamera
+    # Largest distance, over the image, between where a pixel's ray is seen by the source and by the
+    # target (target's pixels).
     deviation_px: float
-    at: tuple[float, float]
+    at: tuple[float, float]  # the target's pixel where it is largest
 
 
 def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
@@ -133,7 +121,8 @@ def convert_to_foreign(
 
     every = np.eye(len(start))
     spans = [every[:, : 4 + count] for count in _stages(model, number)]
-    best = _nearest(project, camera_of, start, spans, pixels, possible, check)
+    fit = CameraFit(project, every, pixels, possible)
+    best = _nearest(fit, camera_of, start, spans, check)
     if best is None:
         raise ConversionError(f"no {model} camera sees what the source sees")
     return best
@@ -218,16 +207,11 @@ def convert_to_camera(
         # Finally, the copied terms may compensate for what the radial part cannot follow.
         spans.append(free_span(5, None, tangential=True))
     together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
-    radius = np.hypot(rays[:, 0], rays[:, 1])
-    away = (pixels - start[2:4]) / start[:2] - brown_shift(
-        rays, brown_of(NO_POLYNOMIAL, _tangential(source))
-    )
-    moved = np.sum((away - rays) * rays, axis=1) / np.maximum(radius, 1e-9)
-    wavy = _wavy_start(start, radius, moved)
-    best = _nearest(project, camera_of, start, spans, pixels, possible, check, wavy)
+    fit = CameraFit(project, together, pixels, possible)
+    best = _nearest(fit, camera_of, start, spans, check)
     if best is None or best.deviation_px > _NEAR_PX:
         nearest = start if best is None else _intrinsics(best)
-        fuller = _nearest(project, camera_of, nearest, [together], pixels, possible, check)
+        fuller = _nearest(fit, camera_of, nearest, [together], check)
         if best is None or (fuller is not None and fuller.deviation_px < best.deviation_px):
             best = fuller
     if best is None:
@@ -240,34 +224,14 @@ def _intrinsics(found: Converted) -> FloatArray:
     return intrinsics_of(found.camera)
 
 
-def _wavy_start(start: FloatArray, radius: FloatArray, moved: FloatArray) -> FloatArray:
-    """Where a fit begins to a lens whose radial distortion changes its sign within the image.
-
-    Least squares does not get there from a lens without distortion: the denominator has to dip
-    towards the border. With the dip given, a2 and a3 are linear.
-    """
-    reach = float(radius.max())
-    b = np.array(_DIP) / reach ** np.array([1.0, 2.0, 3.0])
-    denominator = 1.0 + radius * (b[0] + radius * (b[1] + radius * b[2]))
-    powers = np.stack([radius**2, radius**3], axis=-1) / denominator[:, None]
-    a = np.linalg.lstsq(powers, moved, rcond=None)[0]
-    return np.concatenate([start[:4], a, b, start[9:]])
-
-
 def _nearest(
-    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    fit: CameraFit,
     camera_of: Callable[[FloatArray], AnyCamera],
     start: FloatArray,
     spans: list[FloatArray],
-    pixels: FloatArray,
-    possible: Callable[[FloatArray], bool],
     check: tuple[FloatArray, FloatArray],
-    other_start: FloatArray | None = None,
 ) -> Converted | None:
-    """The fit with the smallest largest deviation, each span fitted from where the last ended.
-
-    Where none is near, the last span is fitted from another start, too.
-    """
+    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
     best: Converted | None = None
     nearest = parameters = start
 
@@ -284,22 +248,12 @@ def _nearest(
 
     span = spans[0]
     for wider in spans:
-        parameters = least_squares(project, parameters, wider, pixels, possible)
+        parameters = fit._replace(span=wider).fitted(parameters)
         if keep(parameters):
             nearest, span = parameters, wider
         if best is not None and best.deviation_px < EXACT_PX:
             return best
-    if (
-        other_start is not None
-        and possible(other_start)
-        and (best is None or best.deviation_px > _NEAR_PX)
-    ):
-        parameters = least_squares(
-            project, other_start, spans[-1], pixels, possible, steps=_MANY_STEPS
-        )
-        if keep(parameters):
-            nearest, span = parameters, spans[-1]
-    keep(smallest_largest(project, nearest, span, pixels, possible))
+    keep(smallest_largest(fit._replace(span=span), nearest))
     return best
 
 

@@ -114,12 +114,6 @@ class ForeignCamera:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
 
         Newton's method, continued outwards from the centre to avoid branches past a fold.
-
-        Raises
-        ------
-        ConversionError
-            If a pixel sees nothing: the distortion folds inside the image, or the lens sees 90
-            degrees and more off its axis, where there are no such coordinates.
         """
         target = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
         xy = np.zeros_like(target)

@@ -18,30 +18,18 @@ from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 class AddedNoise:
     """Standard deviations of the added noise, independent for each number.
 
-    Attributes
-    ----------
-    disc_m : float
-        To x and y of a disc.
-    bearing_rad : float
-        To the bearing of a line. Its ends in the image stay as they are.
-    step_m : float
-        To dx and dy of a step.
-    turn_rad : float
-        To dphi of a step.
-    seed : int
-        Steps and landmarks draw from streams of their own, so that the files of discs and of lines
-        of one run get the same odometry.
-
     Raises
     ------
     SlamError
         If a standard deviation is negative or not finite, or the seed is negative.
     """
 
-    disc_m: float = 0.0
-    bearing_rad: float = 0.0
-    step_m: float = 0.0
-    turn_rad: float = 0.0
+    disc_m: float = 0.0  # to x and y of a disc
+    bearing_rad: float = 0.0  # to the bearing of a line. Its ends in the image stay as they are.
+    step_m: float = 0.0  # to dx and dy of a step
+    turn_rad: float = 0.0  # to dphi of a step
+    # Steps and landmarks draw from streams of their own, so that the files of discs and of lines of
+    # one run get the same odometry.
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -75,16 +63,6 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
 
     Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
     comment at the head says what was added. Without noise the rows come out as they are.
-
-    Parameters
-    ----------
-    rows : iterable of Row
-        As `redetect.landmarks.read_rows` gives them.
-    noise : AddedNoise
-
-    Yields
-    ------
-    Row
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])

@@ -6,13 +6,19 @@ gives the same bytes; a user's own matplotlib settings do not matter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.figure_file import picture
 from redetect.slam.recording import PICTURES
+from redetect.storage import OutputExistsError, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +37,8 @@ FloatArray = NDArray[np.float64]
 #: Central 95 % of chi squared with 3 degrees of freedom.
 NEES_BAND = (0.21579528262389785, 9.348403604496145)
 
+DPI = 120
+_WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
@@ -44,31 +52,42 @@ _MOST_ELLIPSES = 700
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
 
+@contextmanager
+def picture(
+    png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
+) -> Iterator[Figure]:
+    """A figure to draw into (size in inches); at the end it is written and, on request, shown."""
+    if not overwrite and png.exists():  # before the work instead of after it
+        raise OutputExistsError(png)
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        if interactive:
+            if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
+                raise SlamError("no window can be opened here: expected a display for interactive")
+            figure = pyplot.figure(figsize=size, dpi=DPI, layout="constrained")
+        else:
+            figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+            FigureCanvasAgg(figure)
+        try:
+            yield figure
+            stream = io.BytesIO()
+            # Without the name and version of the program that made it: the same bytes everywhere.
+            figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
+            with write_whole(png, overwrite=overwrite) as file:
+                file.write(stream.getvalue())
+            if interactive:
+                pyplot.show()
+        finally:
+            if interactive:
+                pyplot.close(figure)
+
+
 def pose_errors(
     path: Path2D, reference: ArrayLike
 ) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
     """Errors of a path's poses, their standard deviations, and the normalised error squared.
 
-    Parameters
-    ----------
-    path : Path2D
-        The estimate.
-    reference : (N, 3) array_like
-        True poses in the same map, one for each of the path's.
-
-    Returns
-    -------
-    error : (N, 3) float64
-        Estimate less truth: x, y (m), theta (rad, wrapped).
-    sigma : (N, 3) float64 or None
-        Standard deviations; None where the path has no covariance.
-    nees : (N,) float64 or None
-        Normalised estimation error squared; NaN where a covariance is singular, as a start's is.
-
-    Raises
-    ------
-    SlamError
-        If there is not one reference pose for each pose.
+    Takes `reference` (N, 3); returns `error` (N, 3), `sigma` (N, 3), `nees` (N,).
     """
     truth = np.asarray(reference, dtype=np.float64)
     if truth.shape != path.poses.shape:
@@ -90,19 +109,7 @@ def pose_errors(
 def ellipse_outlines(xy: ArrayLike, covariance: ArrayLike, sigmas: float = 3.0) -> FloatArray:
     """Outlines of covariance ellipses.
 
-    Parameters
-    ----------
-    xy : (M, 2) array_like
-        Centres (m).
-    covariance : (M, 2, 2) array_like
-        Positive semidefinite (m^2).
-    sigmas : float
-        Mahalanobis distance of the outline.
-
-    Returns
-    -------
-    (M, K, 2) float64
-        Points round each ellipse (m).
+    Takes `xy` (M, 2), `covariance` (M, 2, 2); returns (M, K, 2).
     """
     centre = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
     spread, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64).reshape(-1, 2, 2))
@@ -119,8 +126,7 @@ def draw_map(
     landmark_map: LandmarkMap,
     path: Path2D,
     *,
-    before: Path2D | None = None,
-    before_map: LandmarkMap | None = None,
+    before: tuple[LandmarkMap | None, Path2D] | None = None,
     reference: Path2D | None = None,
     title: str = "",
     overwrite: bool,
@@ -136,7 +142,7 @@ def draw_map(
         Discs and verticals. Verticals far outside are counted in the legend, not drawn.
     path : Path2D
         The robot's path.
-    before, before_map : Path2D, LandmarkMap, optional
+    before : (LandmarkMap or None, Path2D), optional
         The same before loops were closed: drawn in a panel of its own, to the same scale.
     reference : Path2D, optional
         The true path, or another to compare with; dashed.
@@ -157,7 +163,7 @@ def draw_map(
     panels: list[tuple[str, LandmarkMap | None, Path2D]] = [("", landmark_map, path)]
     if before is not None:
         panels = [
-            ("before closing loops", before_map, before),
+            ("before closing loops", *before),
             ("after closing loops", landmark_map, path),
         ]
     low, high = _extent([(m, p) for _, m, p in panels], reference)
@@ -201,26 +207,7 @@ def draw_errors(
 ) -> None:
     """Draw position and heading error over the steps, and the normalised error squared.
 
-    Parameters
-    ----------
-    png : Path
-        The picture's file.
-    path : Path2D
-        The estimate. Without covariance there is no band and no normalised error.
-    reference : (N, 3) array_like
-        True poses in the same map.
-    title : str
-        Drawn above the picture.
-    overwrite, interactive : bool
-        As for `draw_map`.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    SlamError
-        If there is not one reference pose for each pose, or `interactive` where no window can be
-        opened.
+    Takes `reference` (N, 3).
     """
     error, sigma, nees = pose_errors(path, reference)
     step = np.arange(len(error))
@@ -408,17 +395,7 @@ def picture_of_frame(folder: Path, prefix: str) -> Path | None:
 
 
 def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool = False) -> None:
-    """Draw parts of images side by side, a cross-hair with a gap in the middle of each.
-
-    Parameters
-    ----------
-    png : Path
-        The picture's file.
-    crops : sequence of Crop
-    title : str
-    overwrite : bool
-        Whether an existing file may be replaced.
-    """
+    """Draw parts of images side by side, a cross-hair with a gap in the middle of each."""
     rows = -(-len(crops) // _CROPS_ABREAST)
     size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
     with picture(png, size, overwrite=overwrite, interactive=False) as figure:

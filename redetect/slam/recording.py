@@ -117,27 +117,7 @@ class Recording:
 
 
 def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:
-    """The landmark file of a run folder.
-
-    Parameters
-    ----------
-    run : Path
-        Run folder.
-    suffix : str
-        ``.circles`` or ``.lines``.
-    stem : str, optional
-        Name of the file without its suffix; by default ``map`` (what a data set ships), and
-        ``detected`` where there is none.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    SlamError
-        If there is no such file.
-    """
+    """The landmark file of a run folder."""
     candidates = [run / f"{name}{suffix}" for name in ([stem] if stem else ["map", "detected"])]
     for path in candidates:
         if path.is_file():
@@ -151,23 +131,7 @@ def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:
 
 
 def demand_landmarks(path: Path) -> Path:
-    """A file that is named as a run, refused where it can't be one.
-
-    Parameters
-    ----------
-    path : Path
-        What the command line names instead of a run folder.
-
-    Returns
-    -------
-    Path
-        The same.
-
-    Raises
-    ------
-    SlamError
-        If there is no such file, or it is a picture or a calibration.
-    """
+    """A file that is named as a run, refused where it can't be one."""
     if not path.exists():
         raise SlamError(
             f"{path}: no such landmark file or folder: expected a run folder, or a .circles or "
@@ -240,26 +204,7 @@ def read_recording(
 def recording_of_frames(
     frames: Sequence[Frame], name: str, noise: OdometryNoise = ASSUMED
 ) -> Recording:
-    """Gather frames to arrays.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        The run in order.
-    name : str
-        What messages call the file.
-    noise : OdometryNoise
-        Of the steps that state no covariance: zeros.
-
-    Returns
-    -------
-    Recording
-
-    Raises
-    ------
-    SlamError
-        See `read_recording`.
-    """
+    """Gather frames to arrays."""
     if not frames:
         raise SlamError(f"{name}: no STEP row: expected a run")
     steps = [frame.step for frame in frames]

@@ -17,10 +17,9 @@ from camera.boards.board import Board
 from camera.boards.points import find_board
 from camera.calibration.floor import on_floor, place_on_floor, read_floor_points
 from camera.calibration.model import rotation_of
-from camera.calibration.projection import projection_difference
 from camera.cli import main
 from camera.errors import CalibrationError
-from tools.evaluation.boards import Rays, board_poses, rays_of, render_board
+from tools.evaluation.boards import Rays, board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.calibration import BOARDS, calibrate_rendered
 
 BOARD = Board("checkerboard", 9, 6, 0.04)

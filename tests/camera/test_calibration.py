@@ -27,13 +27,12 @@ from camera.calibration.model import (
 )
 from camera.calibration.projection import (
     intrinsics_of,
-    projection_difference,
     projection_sigma,
     with_intrinsics,
 )
 from camera.calibration.settings import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
-from tools.evaluation.boards import board_poses
+from tools.evaluation.boards import board_poses, projection_difference
 from tools.evaluation.calibration import monte_carlo
 
 FloatArray = NDArray[np.float64]

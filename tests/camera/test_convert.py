@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera, write_camera
-from camera.calibration.projection import projection_difference
 from camera.cli import main
 from camera.errors import ConversionError
 from camera.formats.colmap import (
@@ -27,6 +26,7 @@ from camera.formats.models import ForeignCamera
 from camera.formats.opencv import format_opencv, parse_opencv
 from camera.formats.plain_yaml import parse_yaml
 from camera.formats.ros import camera_from_message, format_ros, parse_ros
+from tools.evaluation.boards import projection_difference
 
 FloatArray = NDArray[np.float64]
 

@@ -12,19 +12,27 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from camera import Camera, CameraError, format_camera, parse_camera
-from camera.brown import brown_jacobian, brown_of, brown_shift, one_to_one_radius
-from camera.brown_kernels import brown_shift_point
 from camera.distortion import (
     RADIUS_LIMIT,
     Coef,
+    brown_jacobian,
+    brown_of,
+    brown_shift,
     fold_radius,
+    one_to_one_radius,
     radial_factor,
     radial_factor_derivative,
     undistorted_radius,
 )
 from camera.formats.conversion import convert_to_camera, convert_to_foreign
 from camera.formats.models import ForeignCamera
-from camera.kernels import camera_numbers, has_brown, lens_numbers, project_floor_point
+from camera.kernels import (
+    brown_shift_point,
+    camera_numbers,
+    has_brown,
+    lens_numbers,
+    project_floor_point,
+)
 from tests.camera.strategies import cameras, coefficients, pixel_grid
 
 POLYNOMIAL = (-0.05, 0.02, -0.004)

@@ -12,10 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera import Camera, CameraError, format_camera, parse_camera
-from camera.brown import brown_jacobian, brown_of, brown_shift, one_to_one_radius
-from camera.brown_kernels import brown_shift_point
-from camera.distortion import NO_POLYNOMIAL, Coef, fold_radius
-from camera.kernels import lens_numbers
+from camera.distortion import (
+    NO_POLYNOMIAL,
+    Coef,
+    brown_jacobian,
+    brown_of,
+    brown_shift,
+    fold_radius,
+    one_to_one_radius,
+)
+from camera.kernels import brown_shift_point, lens_numbers
 from camera.model_checks import border_pixels
 from tests.camera.strategies import coefficients
 

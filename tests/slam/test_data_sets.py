@@ -13,8 +13,7 @@ from scipy.io import savemat
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.cli import main
-from redetect.slam.formats.victoria_park import trees_of
-from redetect.slam.models.measurement import disc_of_range_and_bearing
+from redetect.slam.formats.data_sets import discs_of_ranges, trees_of
 from redetect.slam.models.motion import chain_steps
 from redetect.slam.recording import read_recording
 
@@ -210,6 +209,6 @@ def test_covariances_of_range_and_bearing_are_right() -> None:
         4.0 + 0.05 * rng.standard_normal(count),
         0.6 + 0.01 * rng.standard_normal(count),
     )
-    xy, _ = disc_of_range_and_bearing(reach, bearing, 0.05, 0.01)
-    _, covariance = disc_of_range_and_bearing([4.0], [0.6], 0.05, 0.01)
+    xy, _ = discs_of_ranges(reach, bearing, 0.05, 0.01)
+    _, covariance = discs_of_ranges([4.0], [0.6], 0.05, 0.01)
     assert np.cov(xy.T) == pytest.approx(covariance[0], rel=0.05, abs=5e-5)

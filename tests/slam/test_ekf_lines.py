@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.association import Associator
-from redetect.slam.filters.delayed_lines import start_line, triangulate
+from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.filters.views import MOST_KEPT_POSES
 from redetect.slam.models.measurement import (
     bearing_jacobians,
     bearing_of_vertical,

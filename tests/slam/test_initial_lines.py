@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.least_squares.solver import LossKind
 from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import Loss, Weighting
+from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import place_lines, triangulate, well_placed
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.models.measurement import bearing_of_vertical
@@ -73,7 +74,7 @@ def test_lines_that_bearings_do_not_place_are_found_at_an_estimate() -> None:
 
 @pytest.mark.parametrize("loss", ["none", "huber", "geman-mcclure"])
 def test_a_line_seen_from_one_place_does_not_spoil_the_map(
-    published_camera: Camera, loss: Loss
+    published_camera: Camera, loss: LossKind
 ) -> None:
     """Its rays are parallel but for one that is another line's."""
     run = small_run(3)

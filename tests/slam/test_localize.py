@@ -309,7 +309,7 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
-    from redetect.slam.commands.filter_input import camera_xy_of
+    from redetect.slam.commands.inputs import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
     from redetect.slam.models.motion import relative_pose
 

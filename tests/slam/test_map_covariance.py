@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.commands.inputs import camera_of_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.covariance_file import (
     covariance_file,
@@ -16,9 +16,9 @@ from redetect.slam.mapping.covariance_file import (
     read_joint_covariance,
     write_joint_covariance,
 )
-from redetect.slam.mapping.graph_terms import Weighting, linearise
+from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.mapping.solve import normal_equations
+from redetect.slam.mapping.solve import equations_at
 from redetect.slam.recording import read_recording
 from redetect.storage import OutputExistsError
 
@@ -32,7 +32,7 @@ def test_joint_covariance_is_the_inverse_of_the_normal_equations(
     weighting = Weighting(calibrate=calibrate)
     mapped = map_run(recording, camera, weighting)
     found = joint_covariance(mapped.graph, mapped.estimate, weighting)
-    equations = normal_equations(linearise(mapped.graph, mapped.estimate, weighting))
+    equations = equations_at(mapped.graph, mapped.estimate, weighting)
     whole = np.block(
         [[equations.matrix.toarray(), equations.border], [equations.border.T, equations.corner]]
     )

@@ -6,25 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from camera import Camera
+from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import (
-    Loss,
     RowErrors,
     Weighting,
     errors,
     layout_of,
     linearise,
-    robust,
 )
-from redetect.slam.mapping.marginal_kernels import filled_pattern
-from redetect.slam.mapping.marginals import inverse_blocks, marginals
-from redetect.slam.mapping.solve import moved, solve
+from redetect.slam.mapping.solve import marginals, moved, solve
 from redetect.slam.models.measurement import bearing_of_vertical
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
-from redetect.slam.models.mounting import mounting_change, rows_as_recorded
+from redetect.slam.models.mounting import mounting_change, rotation_exp
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, small_run
 
@@ -93,17 +88,6 @@ def test_jacobians_are_those_of_finite_differences(
         )
 
 
-@pytest.mark.parametrize("loss", ["none", "huber", "cauchy", "geman-mcclure"])
-def test_weight_of_a_loss_is_its_derivative(loss: Loss) -> None:
-    weighting = Weighting(loss=loss, loss_scale=2.0)
-    squared = np.array([0.0, 0.5, 3.9, 4.1, 25.0, 1e4])
-    h = 1e-6
-    above, weight = robust(squared + h, weighting)[0], robust(squared, weighting)[1]
-    np.testing.assert_allclose((above - robust(squared, weighting)[0]) / h, weight, atol=1e-4)
-    near, one = robust(np.array([1e-8]), weighting)
-    np.testing.assert_allclose((near[0], one[0]), (1e-8, 1.0), rtol=1e-6)
-
-
 def test_a_row_of_two_lines_measures_the_mean_of_their_bearings() -> None:
     graph, estimate = _problem()
     pairs = np.flatnonzero(np.bincount(graph.member_row) == 2)
@@ -116,21 +100,6 @@ def test_a_row_of_two_lines_measures_the_mean_of_their_bearings() -> None:
     assert errors(graph, estimate, Weighting()).lines[row] == pytest.approx(expected)
 
 
-def test_filled_pattern_is_that_of_a_dense_factor() -> None:
-    rng = np.random.default_rng(1)
-    root = sparse.random_array((40, 40), density=0.04, rng=rng).toarray()
-    matrix = root @ root.T + np.eye(40)
-    columns = sparse.csc_array(matrix)
-    indptr, indices = filled_pattern(
-        columns.indptr.astype(np.int64), columns.indices.astype(np.int64)
-    )
-    dense = np.abs(np.tril(np.linalg.cholesky(matrix), -1)) > 1e-14
-    for j in range(40):
-        inside = indices[indptr[j] : indptr[j + 1]]
-        assert set(np.flatnonzero(dense[:, j])) <= set(inside.tolist())
-        assert np.all(np.diff(inside) > 0)
-
-
 def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
     graph, estimate = _problem()
     problem = linearise(graph, estimate, Weighting())
@@ -140,17 +109,6 @@ def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
     dense = np.linalg.inv(matrix.toarray())
     for block, at in zip(found, first):
         np.testing.assert_allclose(block, dense[at : at + 3, at : at + 3], rtol=1e-8)
-
-
-def test_inverse_blocks_are_right_where_the_matrix_has_zeros() -> None:
-    matrix = np.diag([4.0, 3.0, 5.0, 2.0])
-    matrix[0, 3] = matrix[3, 0] = matrix[1, 3] = matrix[3, 1] = 1.0
-    (found,) = inverse_blocks(sparse.csc_array(matrix), [(2, np.array([0, 2]))])
-    dense = np.linalg.inv(matrix)
-    np.testing.assert_allclose(found[0], dense[:2, :2], rtol=1e-12)
-    np.testing.assert_allclose(found[1], dense[2:, 2:], rtol=1e-12)
-    (alone,) = inverse_blocks(sparse.csc_array(np.diag([4.0, 2.0, 8.0])), [(3, np.array([0]))])
-    np.testing.assert_allclose(alone[0], np.diag([0.25, 0.5, 0.125]))
 
 
 def test_marginals_with_mounting_are_those_of_the_dense_inverse(published_camera: Camera) -> None:
@@ -178,24 +136,6 @@ def test_mounting_change_is_what_was_applied(published_camera: Camera) -> None:
     found = mounting_change(published_camera, mounting)
     # The file's rotation has six digits.
     np.testing.assert_allclose(found, [*vector, -0.045], atol=1e-5)
-
-
-def test_rows_as_recorded_go_through_the_lens_and_back(published_camera: Camera) -> None:
-    rng = np.random.default_rng(2)
-    floor = np.column_stack([rng.uniform(-1, 1, 20), rng.uniform(-3.5, -1.2, 20)])
-    tilt = 0.02 * rng.standard_normal((20, 2))
-    turn, _ = rotation_exp(np.array([-0.04, 0.01, 0.002]))
-    centre = published_camera.centre + np.array([0.0, 0.0, -0.02])
-    geometry = Geometry(np.zeros((20, 3)), floor, turn @ published_camera.rotation, centre, tilt)
-    every = np.arange(20)
-    pixels, by = predict_pixels(published_camera, geometry, every, every)
-    mounting = np.column_stack([geometry.rotation, centre])
-    rows, by_rows = rows_as_recorded(published_camera, floor, mounting, tilt)
-    np.testing.assert_allclose(rows, published_camera.floor_from_pixel(pixels), atol=1e-5)
-    into = published_camera.floor_jacobian(pixels)
-    np.testing.assert_allclose(by_rows.mounting, into @ by.mounting, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_rows.tilt, into @ by.tilt, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_rows.floor, into @ by.disc, rtol=1e-4, atol=1e-4)
 
 
 def test_first_sight_places_each_disc_where_its_first_row_does() -> None:

@@ -77,9 +77,9 @@ def test_the_same_map_again_whatever_the_users_settings(tmp_path: Path) -> None:
     path = some_path()
     some = LandmarkMap(landmarks(path.poses[::6, :2] + 0.5), landmarks(path.poses[::9, :2] - 1.0))
     first, second = tmp_path / "1.png", tmp_path / "2.png"
-    draw_map(first, some, path, before=path, before_map=some, reference=path, overwrite=False)
+    draw_map(first, some, path, before=(some, path), reference=path, overwrite=False)
     with mpl.rc_context({"font.size": 23.0, "lines.linewidth": 9.0, "savefig.dpi": 30}):
-        draw_map(second, some, path, before=path, before_map=some, reference=path, overwrite=False)
+        draw_map(second, some, path, before=(some, path), reference=path, overwrite=False)
         assert mpl.rcParams["font.size"] == 23.0
     assert first.read_bytes() == second.read_bytes()
     assert b"atplotlib" not in first.read_bytes()
@@ -137,7 +137,7 @@ def test_a_vertical_far_outside_does_not_shrink_the_picture(tmp_path: Path) -> N
 def test_a_path_of_one_pose_is_drawn(tmp_path: Path) -> None:
     path = Path2D(("start",), np.zeros((1, 3)))
     nothing = LandmarkMap(no_landmarks(), no_landmarks())
-    draw_map(tmp_path / "m.png", nothing, path, before=path, overwrite=False)
+    draw_map(tmp_path / "m.png", nothing, path, before=(None, path), overwrite=False)
     perfect = Path2D(path.prefixes, path.poses, np.zeros((1, 3, 3)))
     draw_errors(tmp_path / "p.png", perfect, path.poses, overwrite=False)
     for name in ("m.png", "p.png"):

@@ -8,7 +8,8 @@ import numpy as np
 
 from camera import Camera
 from camera.boards.board import Board
-from camera.calibration.model import rotation_of
+from camera.calibration.model import cross_matrices, project_points, rotation_of
+from camera.calibration.projection import intrinsics_of, pixel_grid
 from tools.arrays import ByteArray, FloatArray, IntArray
 
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
@@ -153,3 +154,28 @@ def _corner_distance(pixels: FloatArray, size: IntArray) -> float:
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (size - 1)
     away = np.linalg.norm((pixels[:, None, :] - corners) / size, axis=-1)
     return float(away.min())
+
+
+def projection_difference(
+    camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
+) -> FloatArray:
+    """How far apart two cameras project the same directions, (rows, columns) pixels.
+
+    NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
+    """
+    pixels = pixel_grid(camera.width, camera.height, columns, rows)
+    rays = camera.unproject(pixels)
+    rotation = np.eye(3)
+    intrinsics = intrinsics_of(other)
+    for _ in range(10 if rotate else 0):
+        turned = rays @ rotation.T
+        found, _, by_point = project_points(intrinsics, turned)
+        turn = -by_point @ cross_matrices(turned)
+        good = np.all(np.isfinite(found), axis=1)
+        error = (pixels - found)[good].ravel()
+        step = np.linalg.lstsq(turn[good].reshape(-1, 3), error, rcond=None)[0]
+        rotation = rotation_of(np.asarray(step, dtype=np.float64)) @ rotation
+        if np.abs(step).max() < 1e-12:
+            break
+    found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
+    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(rows, columns))

@@ -21,7 +21,6 @@ from camera.calibration.model import INTRINSICS
 from camera.calibration.projection import (
     intrinsics_of,
     pixel_grid,
-    projection_difference,
     projection_sigma,
     with_intrinsics,
 )
@@ -31,7 +30,7 @@ from camera.errors import CalibrationError
 from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
 from camera.formats.models import ForeignCamera, Model
 from tools.arrays import FloatArray, IntArray
-from tools.evaluation.boards import board_poses, rays_of, render_board
+from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.tables import Table
 
 BOARDS = {

@@ -15,7 +15,7 @@ from tyro.conf import Positional
 
 from camera import Camera
 from redetect.landmarks import squared_mahalanobis
-from redetect.slam.commands.run_camera import camera_of_run
+from redetect.slam.commands.inputs import camera_of_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import RowErrors, Weighting, cost, errors
@@ -24,8 +24,7 @@ from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from redetect.slam.models.measurement import disc_in_robot
 from redetect.slam.models.motion import relative_pose
-from redetect.slam.models.mounted_discs import rotation_exp
-from redetect.slam.models.mounting import rows_through_mounting
+from redetect.slam.models.mounting import rotation_exp, rows_through_mounting
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
 from tools.arrays import BoolArray, FloatArray, IntArray
 from tools.evaluation.tables import Table

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from camera import Camera
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
+from redetect.slam.models.mounting import rotation_exp
 from tools.arrays import FloatArray, IntArray
 from tools.reenactment.fitting import mahalanobis, row_distances
+from tools.reenactment.mounted_discs import Geometry, predict_pixels
 from tools.reenactment.recording import Recording
 
 #: Discs of the data set have a radius of 0.10 m: two that are nearer than this would overlap.

@@ -1,7 +1,7 @@
 """Least squares over a recorded run: poses, discs, the camera's true mounting, the robot's tilt.
 
 The solver is that of `slam map` (`redetect.slam.mapping`); what a tilted, differently mounted
-camera makes of discs is `redetect.slam.models.mounted_discs`.
+camera makes of discs is `tools.reenactment.mounted_discs`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from redetect.slam.mapping.graph import Estimate, Graph, whitening
 from redetect.slam.mapping.graph_terms import Weighting as SlamWeighting
 from redetect.slam.mapping.solve import solve
 from redetect.slam.models.motion import relative_pose
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels
 from tools.arrays import BoolArray, FloatArray, IntArray
+from tools.reenactment.mounted_discs import Geometry, predict_pixels
 from tools.reenactment.recording import Recording
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera import Camera
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels
 from tools.arrays import FloatArray
 from tools.reenactment.associations import mend_associations
 from tools.reenactment.fitting import (
@@ -19,6 +18,7 @@ from tools.reenactment.fitting import (
     odometry_residuals,
     refit,
 )
+from tools.reenactment.mounted_discs import Geometry, predict_pixels
 from tools.reenactment.recording import Recording, start_from_odometry
 from tools.reenactment.world import World
 

@@ -9,8 +9,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.brown_kernels import brown_shift_point, straightened_point
-from camera.kernels import has_brown
+from camera.kernels import brown_shift_point, has_brown, straightened_point
 from tools.arrays import Float32Array, FloatArray
 from tools.simulator.ray_kernels import (
     CEILING,

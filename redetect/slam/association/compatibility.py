@@ -11,18 +11,15 @@ and m landmarks that may be in view, each measured by d numbers (2 for a disc, 1
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
-from redetect.slam.association.compatibility_kernels import (
-    individual_distances,
-    pair_nearest_first,
-    search_jointly,
-)
 from redetect.slam.errors import SlamError
 
 FloatArray = NDArray[np.float64]
@@ -34,22 +31,14 @@ MOST_NODES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """Rows and the landmarks they show.
+    """Rows and the landmarks they show."""
 
-    Attributes
-    ----------
-    landmark : (n,) int64
-        Index of each row's landmark, -1 where it shows none of them; none is there twice.
-    squared_distance : float
-        Squared Mahalanobis distance of all pairs: joint for `joint_compatible`, the sum of the
-        single ones for `nearest_compatible`.
-    complete : bool
-        Whether the search was finished: only then is no better pairing left.
-    """
-
+    # (n,): index of each row's landmark, -1 where it shows none of them; none is there twice.
     landmark: IntArray
+    # Squared Mahalanobis distance of all pairs: joint for `joint_compatible`, the sum of the single
+    # ones for `nearest_compatible`.
     squared_distance: float
-    complete: bool = True
+    complete: bool = True  # whether the search was finished: only then is no better pairing left
 
 
 def nearest_compatible(
@@ -61,26 +50,7 @@ def nearest_compatible(
 ) -> Pairing:
     """Nearest neighbour with Mahalanobis gate: closest pairs first, each row and landmark once.
 
-    Parameters
-    ----------
-    innovations : (n, m, d) array_like
-        Measurement of row i minus the prediction for landmark j (bearings wrapped by the caller).
-    predicted_covariance : (m d, m d) array_like
-        Of the predictions, H P H^T of all m landmarks stacked; only its diagonal d x d blocks
-        count here.
-    noise : (n, d, d) array_like
-        Covariance R of each row's measurement.
-    gate_probability : float
-        Share of right pairs that pass the gate, in (0, 1).
-
-    Returns
-    -------
-    Pairing
-
-    Raises
-    ------
-    SlamError
-        If the shapes do not fit or the probability is not in (0, 1).
+    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     width = innovation.shape[2]
@@ -100,31 +70,11 @@ def joint_compatible(
 ) -> Pairing:
     """The largest set of pairs that are compatible jointly; among equals the most likely one.
 
-    Branch and bound. Every pair must pass the individual gate, and all k pairs together the gate
-    of d k degrees of freedom. Unlike the published search, a branch is only given up where no set
+    Branch and bound. Every pair must pass the individual gate, and all k pairs together the gate of
+    d k degrees of freedom. Unlike the published search, a branch is only given up where no set
     below it can pass, so that the result does not depend on the order of the rows.
 
-    Parameters
-    ----------
-    innovations : (n, m, d) array_like
-        Measurement of row i minus the prediction for landmark j (bearings wrapped by the caller).
-    predicted_covariance : (m d, m d) array_like
-        Joint covariance of the predictions: H P H^T with the rows of H of all m landmarks stacked.
-    noise : (n, d, d) array_like
-        Covariance R of each row's measurement; rows are independent of each other.
-    gate_probability : float
-        Share of right sets of pairs that pass the gate, in (0, 1).
-    most_nodes : int
-        Pairs that are tried before the best set so far has to do.
-
-    Returns
-    -------
-    Pairing
-
-    Raises
-    ------
-    SlamError
-        If the shapes do not fit or the probability is not in (0, 1).
+    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
     innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
     n, _, width = innovation.shape
@@ -139,24 +89,7 @@ def joint_compatible(
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
     """Largest squared distances of 0, 1, 2, ... pairs that stay below with a probability.
 
-    Parameters
-    ----------
-    probability : float
-        In (0, 1).
-    width : int
-        Degrees of freedom of a pair.
-    most_pairs : int
-        Largest number of pairs to return.
-
-    Returns
-    -------
-    (max(most_pairs, 1) + 1,) float64
-        Entry k belongs to k pairs.
-
-    Raises
-    ------
-    SlamError
-        If the probability is not in (0, 1).
+    Returns (most_pairs, 1).
     """
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
@@ -185,3 +118,184 @@ def _checked(
             f"{(m * width, m * width)} and {(n, width, width)} with innovations {innovation.shape}"
         )
     return innovation, predicted, measured
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _append(
+    factor: FloatArray,
+    whitened: FloatArray,
+    size: int,
+    cross: FloatArray,
+    own: FloatArray,
+    innovation: FloatArray,
+) -> float:
+    """Extend a Cholesky factor and the whitened innovation by one pair's block, in place.
+
+    Returns what the pair adds to the squared distance; negative if the covariance is not positive
+    definite with it.
+    """
+    width = len(innovation)
+    added = 0.0
+    for a in range(width):
+        row = size + a
+        for column in range(row):
+            value = cross[a, column] if column < size else own[a, column - size]
+            for k in range(column):
+                value -= factor[row, k] * factor[column, k]
+            factor[row, column] = value / factor[column, column]
+        square = own[a, a]
+        rest = innovation[a]
+        for k in range(row):
+            square -= factor[row, k] ** 2
+            rest -= factor[row, k] * whitened[k]
+        if not square > 1e-12 * own[a, a]:
+            return -1.0
+        factor[row, row] = math.sqrt(square)
+        whitened[row] = rest / factor[row, row]
+        added += whitened[row] ** 2
+    return added
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def individual_distances(
+    innovations: FloatArray, predicted: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """Squared Mahalanobis distance of each row from each landmark (n, m).
+
+    Infinite where a covariance is not positive definite or an innovation is not finite.
+    """
+    n, m, width = innovations.shape
+    squared = np.full((n, m), np.inf)
+    factor = np.zeros((width, width))
+    whitened = np.zeros(width)
+    cross = np.zeros((width, 0))
+    own = np.zeros((width, width))
+    for i in range(n):
+        for j in range(m):
+            for a in range(width):
+                for b in range(width):
+                    own[a, b] = predicted[j * width + a, j * width + b] + noise[i, a, b]
+            value = _append(factor, whitened, 0, cross, own, innovations[i, j])
+            if value >= 0.0:
+                squared[i, j] = value
+    return squared
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pair_nearest_first(squared: FloatArray, gate: float) -> IntArray:
+    """Landmark of each row, -1 without: closest pairs first, each row and landmark once."""
+    n, m = squared.shape
+    partner = np.full(n, -1, dtype=np.int64)
+    taken = np.zeros(m, dtype=np.bool_)
+    order = np.argsort(squared.copy().reshape(-1), kind="mergesort")
+    for index in order:
+        i, j = index // m, index % m
+        if not squared[i, j] <= gate:
+            break
+        if partner[i] < 0 and not taken[j]:
+            partner[i] = j
+            taken[j] = True
+    return partner
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def search_jointly(
+    innovations: FloatArray,
+    predicted: FloatArray,
+    noise: FloatArray,
+    squared: FloatArray,
+    gates: FloatArray,
+    most_nodes: int,
+) -> tuple[IntArray, float, int]:
+    """Depth-first branch and bound over all ways to give rows landmarks.
+
+    Parameters are those of `joint_compatible`, and the
+    individual distances (n, m), the joint gate of k pairs `gates[k]` (n + 1), and how many pairs
+    may be tried.
+
+    Returns `partner` (n,), `squared distance`, `nodes`.
+    """
+    n, m, width = innovations.shape
+    # Rows with few candidates first: they decide most.
+    counts = np.zeros(n, dtype=np.int64)
+    candidates = np.zeros((n, m), dtype=np.int64)
+    for i in range(n):
+        order = np.argsort(squared[i], kind="mergesort")
+        for j in order:
+            if squared[i, j] <= gates[1]:
+                candidates[i, counts[i]] = j
+                counts[i] += 1
+    rows = np.argsort(counts, kind="mergesort")
+    first = 0
+    while first < n and counts[rows[first]] == 0:
+        first += 1
+    rows = rows[first:]
+    depth = len(rows)
+
+    best = np.full(n, -1, dtype=np.int64)
+    best_count, best_squared = 0, 0.0
+    partner = np.full(n, -1, dtype=np.int64)
+    taken = np.zeros(m, dtype=np.bool_)
+    factor = np.zeros((depth * width, depth * width))
+    whitened = np.zeros(depth * width)
+    cross = np.zeros((width, depth * width))
+    own = np.zeros((width, width))
+    chosen_row = np.zeros(depth, dtype=np.int64)  # of the pairs so far
+    total = np.zeros(depth + 1)  # squared distance after k pairs
+    choice = np.zeros(depth + 1, dtype=np.int64)  # next candidate to try at each level
+    paired = np.zeros(depth, dtype=np.bool_)  # whether the level holds a pair now
+    pairs, level, nodes = 0, 0, 0
+    while level >= 0:
+        if level < depth and paired[level]:  # back from below: undo this level's pair
+            paired[level] = False
+            pairs -= 1
+            taken[partner[rows[level]]] = False
+            partner[rows[level]] = -1
+        reachable = pairs + depth - level
+        if (
+            level == depth
+            or choice[level] > counts[rows[level]]
+            or reachable < best_count
+            or (reachable == best_count and total[pairs] >= best_squared)
+            or total[pairs] > gates[reachable]
+            or nodes >= most_nodes
+        ):
+            level -= 1
+            continue
+        row = rows[level]
+        index = choice[level]
+        choice[level] += 1
+        if index == counts[row]:  # this row shows none of the landmarks
+            level += 1
+            choice[level] = 0
+            continue
+        j = candidates[row, index]
+        if taken[j]:
+            continue
+        nodes += 1
+        size = pairs * width
+        for k in range(pairs):
+            other = partner[chosen_row[k]]
+            for a in range(width):
+                for b in range(width):
+                    cross[a, k * width + b] = predicted[j * width + a, other * width + b]
+        for a in range(width):
+            for b in range(width):
+                own[a, b] = predicted[j * width + a, j * width + b] + noise[row, a, b]
+        added = _append(factor, whitened, size, cross, own, innovations[row, j])
+        if added < 0.0 or total[pairs] + added > gates[reachable]:
+            continue
+        chosen_row[pairs] = row
+        total[pairs + 1] = total[pairs] + added
+        pairs += 1
+        paired[level] = True
+        partner[row] = j
+        taken[j] = True
+        if total[pairs] <= gates[pairs] and (
+            pairs > best_count or (pairs == best_count and total[pairs] < best_squared)
+        ):
+            best_count, best_squared = pairs, total[pairs]
+            best[:] = partner
+        level += 1
+        choice[level] = 0
+    return best, best_squared, nodes

@@ -91,26 +91,16 @@ class LocalSettings:
 
 @dataclass(frozen=True, eq=False)
 class LocalAssociation:
-    """Result of the association from frame to frame.
+    """Result of the association from frame to frame."""
 
-    Attributes
-    ----------
-    circle_labels, line_labels : (n,) int64
-        The landmark of each row, numbered from 0 in order of first sight.
-    line_places : (L, 2) float64
-        The last estimate of each line's position in the robot frame (m); NaN if that was behind the
-        camera or beyond 50 m.
-    line_frames : (L,) int64
-        After which step.
-    incomplete : int
-        Frames whose joint search was cut short.
-    """
-
+    # (n,): the landmark of each row, numbered from 0 in order of first sight.
     circle_labels: IntArray
     line_labels: IntArray
+    # (L, 2): the last estimate of each line's position in the robot frame (m); NaN if that was
+    # behind the camera or beyond 50 m.
     line_places: FloatArray
-    line_frames: IntArray
-    incomplete: int
+    line_frames: IntArray  # (L,): after which step
+    incomplete: int  # frames whose joint search was cut short
 
 
 def associate_locally(
@@ -120,23 +110,7 @@ def associate_locally(
     camera_xy: tuple[float, float] = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
 ) -> LocalAssociation:
-    """Label the rows of a run, frame by frame, ignoring IDs in the file.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    settings : LocalSettings, optional
-        By default as `LocalSettings` says.
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m): bearings of lines are from there.
-    progress : callable, optional
-        Called with the number of frames done.
-
-    Returns
-    -------
-    LocalAssociation
-    """
+    """Label the rows of a run, frame by frame, ignoring IDs in the file."""
     setting = settings or LocalSettings()
     circles, lines = recording.circles, recording.lines
     circle_labels = np.full(len(circles), -1, dtype=np.int64)

@@ -41,46 +41,23 @@ _FIRST_ROUNDS = 2
 
 @dataclass(frozen=True)
 class PointSettings:
-    """Settings of the search for points.
+    """Settings of the search for points."""
 
-    Attributes
-    ----------
-    heading_sigma_deg : tuple of float
-        Standard deviation of the path's heading in a single frame, for each round (degrees).
-    sigma_scale : float
-        Factor on the rows' standard deviations, which do not include the detector's errors at edges
-        that are close together.
-    path_sigma_scale : float
-        The same factor for rows that correct the path.
-    detected : float
-        Probability that a vertical in view gives a row.
-    gate_sigmas : float
-        A ray that passes farther from a point does not support it.
-    least_score : float
-        Least log likelihood ratio of the rows with a point to those without.
-    gaps : tuple of int
-        Numbers of steps between frames whose rays are intersected.
-    least_parallax_sigmas : float
-        Least angle between two rays that are intersected.
-    farthest_m : float
-        Intersections farther away are ignored.
-    window_frames : int
-        Number of frames before and after an intersection that are scored.
-    path_rows : int
-        Points of fewer rows do not correct the path.
-    """
-
+    # Standard deviation of the path's heading in a single frame, for each round (degrees).
     heading_sigma_deg: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    # Factor on the rows' standard deviations, which do not include the detector's errors at edges
+    # that are close together.
     sigma_scale: float = 1.5
-    path_sigma_scale: float = 2.0
-    detected: float = 0.7
-    gate_sigmas: float = 3.0
-    least_score: float = 4.0
+    path_sigma_scale: float = 2.0  # the same factor for rows that correct the path
+    detected: float = 0.7  # probability that a vertical in view gives a row
+    gate_sigmas: float = 3.0  # a ray that passes farther from a point does not support it
+    least_score: float = 4.0  # least log likelihood ratio of the rows with a point to those without
+    # Numbers of steps between frames whose rays are intersected.
     gaps: tuple[int, ...] = (2, 4, 7, 11)
-    least_parallax_sigmas: float = 4.0
-    farthest_m: float = 14.0
-    window_frames: int = 40
-    path_rows: int = 6
+    least_parallax_sigmas: float = 4.0  # least angle between two rays that are intersected
+    farthest_m: float = 14.0  # intersections farther away are ignored
+    window_frames: int = 40  # number of frames before and after an intersection that are scored
+    path_rows: int = 6  # points of fewer rows do not correct the path
 
     def __post_init__(self) -> None:
         demand(
@@ -112,29 +89,8 @@ def lines_by_points(
 ) -> tuple[IntArray, FloatArray]:
     """Labels of the rows of verticals, by the points in which they meet.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    path : (N + 1, 3) float64
-        Its poses, as the discs give them.
-    circle_labels : (n,) int64
-        Disc of each row.
-    line_labels : (m,) int64
-        Label of each row of a vertical as it was found frame to frame: that of rows for which no
-        point is found.
-    settings : PointSettings, optional
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-    disc_sigma_scale : float
-        Factor on the discs' standard deviations.
-
-    Returns
-    -------
-    labels : (m,) int64
-        From 0.
-    path : (N + 1, 3) float64
-        The path that the points helped to find.
+    Takes `path` (N + 1, 3), `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,); returns
+    `labels` (m,), `path` (N + 1, 3).
     """
     setting = settings or PointSettings()
     for _ in range(_FIRST_ROUNDS):
@@ -177,20 +133,7 @@ def rays_of(
 ) -> Rays:
     """The rows of verticals as rays in the map.
 
-    Parameters
-    ----------
-    recording : Recording
-    path : (N + 1, 3) float64
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-    sigma_scale : float
-        Factor on the rows' standard deviations.
-    heading_sigma_rad : float
-        Of the path's heading in a single frame.
-
-    Returns
-    -------
-    Rays
+    Takes `path` (N + 1, 3), `camera_xy` (2,).
     """
     lines = recording.lines
     row = np.lexsort((lines.bearing_rad, lines.frame))
@@ -212,17 +155,7 @@ def rays_of(
 def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArray]:
     """The points in which rays meet, the best first.
 
-    Parameters
-    ----------
-    rays : Rays
-    setting : PointSettings
-
-    Returns
-    -------
-    labels : (n,) int64
-        The point of each row, -1 without one.
-    points : (k, 2) float64
-        In the map (m).
+    Returns `labels` (n,), `points` (k, 2).
     """
     points, frames = crossings(
         rays,

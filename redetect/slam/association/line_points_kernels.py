@@ -16,61 +16,28 @@ BoolArray = NDArray[np.bool_]
 
 
 class Rays(NamedTuple):
-    """Rows of verticals in the map, by frame and bearing.
+    """Rows of verticals in the map, by frame and bearing."""
 
-    Attributes
-    ----------
-    row : (n,) int64
-        Which row of the run each ray is.
-    centre : (n, 2) float64
-        The camera's place (m).
-    angle, bearing : (n,) float64
-        Its direction in the map, and in the robot frame (rad).
-    sigma : (n,) float64
-        Of it (rad).
-    frame : (n,) int64
-        Ascending from 0.
-    start : (F + 1,) int64
-        Rays start[f] to start[f + 1] are those of frame f.
-    heading : (F, 2) float64
-        Cosine and sine of the robot's.
-    widest_rad : float
-        Half the field of view, below a right angle.
-    """
-
-    row: IntArray
-    centre: FloatArray
+    row: IntArray  # (n,): which row of the run each ray is
+    centre: FloatArray  # (n, 2): the camera's place (m)
+    # (n,): its direction in the map, and in the robot frame (rad).
     angle: FloatArray
     bearing: FloatArray
-    sigma: FloatArray
-    frame: IntArray
-    start: IntArray
-    heading: FloatArray
-    widest_rad: float
+    sigma: FloatArray  # (n,): of it (rad)
+    frame: IntArray  # (n,): ascending from 0
+    start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f
+    heading: FloatArray  # (F, 2): cosine and sine of the robot's
+    widest_rad: float  # half the field of view, below a right angle
 
 
 class Search(NamedTuple):
-    """How points are searched.
+    """How points are searched."""
 
-    Attributes
-    ----------
-    detected : float
-        Probability that a vertical in view gives a row.
-    gate : float
-        Standard deviations within which a ray may be that row.
-    window : int
-        Frames before and after a crossing that are considered.
-    least_score : float
-        Of a point.
-    widest_sigma : float
-        Of all rays (rad).
-    """
-
-    detected: float
-    gate: float
-    window: int
-    least_score: float
-    widest_sigma: float
+    detected: float  # probability that a vertical in view gives a row
+    gate: float  # standard deviations within which a ray may be that row
+    window: int  # frames before and after a crossing that are considered
+    least_score: float  # of a point
+    widest_sigma: float  # of all rays (rad)
 
 
 _NEAREST_M = 0.3
@@ -104,21 +71,7 @@ def crossings(
 ) -> tuple[FloatArray, IntArray]:
     """Where rays of frames that are some steps apart cross, ahead of both.
 
-    Parameters
-    ----------
-    rays : Rays
-    gaps : (g,) int64
-        Distances of frames that are tried.
-    least_parallax : float
-        Least angle between two rays, in standard deviations of it.
-    farthest_m : float
-        Crossings farther away than this do not count.
-
-    Returns
-    -------
-    points : (k, 2) float64
-    frames : (k,) int64
-        The first of the two frames.
+    Takes `gaps` (g,); returns `points` (k, 2), `frames` (k,).
     """
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
@@ -224,20 +177,7 @@ def take_points(
 ) -> tuple[IntArray, FloatArray]:
     """The best of all points with the rays that it takes, then the best by the other rays, ...
 
-    Parameters
-    ----------
-    points : (k, 2) float64
-    frames : (k,) int64
-        See `crossings`.
-    rays : Rays
-    search : Search
-
-    Returns
-    -------
-    labels : (n,) int64
-        The point of each ray, -1 without one.
-    found : (m, 2) float64
-        In the map (m).
+    Takes `points` (k, 2), `frames` (k,); returns `labels` (n,), `found` (m, 2).
     """
     # How much likelier a ray is from a vertical than from anywhere, as a logarithm.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)

@@ -29,25 +29,14 @@ _LEAST_INVERSE_DISTANCE = 0.02
 
 @dataclass(eq=False)
 class LocalMap:
-    """Landmarks in the frame of the robot.
+    """Landmarks in the frame of the robot."""
 
-    Attributes
-    ----------
-    mean : (m, 2) float64
-        Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
-    covariance : (2 m, 2 m) float64
-    is_line : (m,) bool
-    number : (m,) int64
-        Number of the landmark; discs and lines are counted separately.
-    last_frame : (m,) int64
-        When it was seen last.
-    """
-
+    # (m, 2): Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
     mean: FloatArray
-    covariance: FloatArray
-    is_line: NDArray[np.bool_]
-    number: IntArray
-    last_frame: IntArray
+    covariance: FloatArray  # (2 m, 2 m)
+    is_line: NDArray[np.bool_]  # (m,)
+    number: IntArray  # (m,): number of the landmark; discs and lines are counted separately
+    last_frame: IntArray  # (m,): when it was seen last
 
     @classmethod
     def empty(cls) -> LocalMap:
@@ -61,20 +50,7 @@ def moved(
 ) -> LocalMap:
     """The map in the frame of the robot after a step.
 
-    Parameters
-    ----------
-    local : LocalMap
-        In the frame before it.
-    step : (3,) float64
-        dx, dy (m), dphi (rad).
-    step_covariance : (3, 3) float64
-        Of it.
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    LocalMap
+    Takes `step` (3,), `step_covariance` (3, 3), `camera_xy` (2,).
     """
     m = len(local.mean)
     if m == 0:
@@ -128,17 +104,7 @@ def moved(
 def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
     """How a small tilt of the robot moves the places on the floor that a camera seems to see.
 
-    Parameters
-    ----------
-    disc_xy : (n, 2) float64
-        Places in the robot frame (m); the camera is taken to be above its origin.
-    height_m : float
-        Height of the camera (m).
-
-    Returns
-    -------
-    (n, 2, 2) float64
-        Derivatives of x, y by the turns about the robot's x and y axis (m/rad).
+    Takes `disc_xy` (n, 2); returns (n, 2, 2).
     """
     x, y = disc_xy.T
     rows = (x * y / height_m, -height_m - x**2 / height_m)
@@ -149,20 +115,7 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
 def kept(
     local: LocalMap, frame: int, *, forget_frames: int, forget_sigma_m: float, most_landmarks: int
 ) -> LocalMap:
-    """The map without landmarks that were not seen for long or have become too uncertain.
-
-    Parameters
-    ----------
-    local : LocalMap
-    frame : int
-        The frame now.
-    forget_frames, forget_sigma_m, most_landmarks
-        See `redetect.slam.association.frame_to_frame.LocalSettings`.
-
-    Returns
-    -------
-    LocalMap
-    """
+    """The map without landmarks that were not seen for long or have become too uncertain."""
     m = len(local.mean)
     if m == 0:
         return local
@@ -192,19 +145,7 @@ def line_places(
 ) -> tuple[FloatArray, IntArray]:
     """Positions of the lines seen in a frame.
 
-    Parameters
-    ----------
-    local : LocalMap
-        After that frame.
-    frame : int
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    places : (n, 2) float64
-        In the robot frame (m), of those before the camera and nearer than 50 m.
-    numbers : (n,) int64
+    Takes `camera_xy` (2,); returns `places` (n, 2), `numbers` (n,).
     """
     some = (
         local.is_line & (local.last_frame == frame) & (local.mean[:, 1] > _LEAST_INVERSE_DISTANCE)

@@ -33,15 +33,7 @@ _FARTHEST_M = 0.35
 def seen_together(frames: IntArray, labels: IntArray) -> set[tuple[int, int]]:
     """Pairs of labels that rows of one frame have: surely two landmarks, and never to be merged.
 
-    Parameters
-    ----------
-    frames, labels : (n,) int64
-        Of each row, by frame.
-
-    Returns
-    -------
-    set of (int, int)
-        The smaller label first.
+    Takes `frames, labels` (n,).
     """
     pairs: set[tuple[int, int]] = set()
     ends = np.flatnonzero(np.diff(frames)) + 1
@@ -56,20 +48,7 @@ def merge_labels(
 ) -> tuple[IntArray, int]:
     """Give labels that are one landmark the same number.
 
-    Parameters
-    ----------
-    frames, labels : (n,) int64
-        Of each row, by frame; labels from 0.
-    pairs : iterable of (int, int)
-        Labels that are one, the surest first. A pair whose groups were seen together in a frame is
-        left out.
-
-    Returns
-    -------
-    labels : (n,) int64
-        From 0 without gaps, in order of first row.
-    merged : int
-        How many labels fewer there are.
+    Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
     count = int(labels.max(initial=-1)) + 1
     apart: list[set[int]] = [set() for _ in range(count)]
@@ -101,13 +80,7 @@ def merge_labels(
 def in_order(labels: IntArray) -> IntArray:
     """Number labels from 0 without gaps, in the order of their first rows; -1 stays.
 
-    Parameters
-    ----------
-    labels : (n,) int64
-
-    Returns
-    -------
-    (n,) int64
+    Takes `labels` (n,); returns (n,).
     """
     names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     first[names < 0] = -1
@@ -117,16 +90,7 @@ def in_order(labels: IntArray) -> IntArray:
 
 
 def pairs_by_votes(matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """The pairs of labels of all matches, those that most matches agree on first.
-
-    Parameters
-    ----------
-    matches : sequence of Match
-
-    Returns
-    -------
-    list of (int, int)
-    """
+    """The pairs of labels of all matches, those that most matches agree on first."""
     votes: dict[tuple[int, int], int] = {}
     for match in matches:
         for a, b in match.pairs.tolist():
@@ -140,19 +104,7 @@ def pairs_in_place(
 ) -> list[tuple[int, int]]:
     """Pairs of labels that lie at the same position, in stretches known to be the same place.
 
-    Parameters
-    ----------
-    stretches : sequence of Stretch
-        By the present map and labels.
-    covariance : (M, 2, 2) float64
-        Of the labels' positions (m^2).
-    gate_probability : float
-        Share of the labels of one landmark that are compatible.
-
-    Returns
-    -------
-    list of (int, int)
-        The likeliest first.
+    Takes `covariance` (M, 2, 2).
     """
     labels = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.labels for s in stretches)]))
     if len(labels) < 2:
@@ -176,22 +128,12 @@ def pairs_in_place(
 def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
     """A path that satisfies the matches: where least squares over everything may start from.
 
-    Headings first, then places: each of the two problems is linear (L. Carlone, R. Aragues,
-    J. A. Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph
-    optimization", International Journal of Robotics Research 33, 2014). So it does not matter how
-    far off the path was.
+    Headings first, then places: each of the two problems is linear (L. Carlone, R. Aragues, J. A.
+    Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph optimization",
+    International Journal of Robotics Research 33, 2014). So it does not matter how far off the path
+    was.
 
-    Parameters
-    ----------
-    path : (N + 1, 3) float64
-        The path so far, theta not wrapped.
-    matches : sequence of Match
-        Found in the map that belongs to it.
-
-    Returns
-    -------
-    (N + 1, 3) float64
-        Starting at the same pose.
+    Takes `path` (N + 1, 3); returns (N + 1, 3).
     """
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)

@@ -39,45 +39,27 @@ SHARED_BY_ONE_PLACE = 3
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Settings of the search for loops.
+    """Settings of the search for loops."""
 
-    Attributes
-    ----------
-    stretch_frames : int
-        Frames whose landmarks form a constellation.
-    stride_frames : int
-        Frames from one constellation to the next.
-    length_tolerance_m : float
-        By how much the lengths of two pairs of landmarks may differ to vote.
-    least_length_m : float
-        Pairs shorter than this do not vote.
-    reach_m : float
-        Largest distance of landmarks that agree.
-    most_turn_rad, most_shift_m : float
-        Largest motion that brings one constellation onto the other.
-    least_agreeing : int
-        Least number of agreeing landmarks, whatever the number of false alarms.
-    false_alarms : float
-        Largest number of matches at least as good that are expected by chance in the whole search.
-    later_step, earlier_step : int
-        Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
-        `earlier_step`-th of these.
-    attached_frames : int
-        A stretch that shares landmarks with one at least this many frames earlier is part of the
-        map already and not matched again; 0 to match all.
-    """
-
-    stretch_frames: int = 50
-    stride_frames: int = 10
+    stretch_frames: int = 50  # frames whose landmarks form a constellation
+    stride_frames: int = 10  # frames from one constellation to the next
+    # By how much the lengths of two pairs of landmarks may differ to vote.
     length_tolerance_m: float = 0.08
-    least_length_m: float = 0.8
-    reach_m: float = 0.12
+    least_length_m: float = 0.8  # pairs shorter than this do not vote
+    reach_m: float = 0.12  # largest distance of landmarks that agree
+    # Largest motion that brings one constellation onto the other.
     most_turn_rad: float = 0.8
     most_shift_m: float = 8.0
+    # Least number of agreeing landmarks, whatever the number of false alarms.
     least_agreeing: int = 7
+    # Largest number of matches at least as good that are expected by chance in the whole search.
     false_alarms: float = 1e-3
+    # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
+    # `earlier_step`-th of these.
     later_step: int = 1
     earlier_step: int = 2
+    # A stretch that shares landmarks with one at least this many frames earlier is part of the map
+    # already and not matched again; 0 to match all.
     attached_frames: int = 0
 
     def __post_init__(self) -> None:
@@ -101,45 +83,26 @@ class LoopSettings:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Landmarks seen in a stretch of frames.
-
-    Attributes
-    ----------
-    middle_frame : int
-    labels : (n,) int64
-        Ascending.
-    xy : (n, 2) float64
-        Their places in the map (m).
-    """
+    """Landmarks seen in a stretch of frames."""
 
     middle_frame: int
-    labels: IntArray
-    xy: FloatArray
+    labels: IntArray  # (n,): ascending
+    xy: FloatArray  # (n, 2): their places in the map (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Two stretches that show one place.
+    """Two stretches that show one place."""
 
-    Attributes
-    ----------
-    earlier_frame, later_frame : int
-        Middle frames of the two.
-    pairs : (k, 2) int64
-        Labels of the earlier and of the later stretch that are one landmark.
-    turn_rad : float
-    shift : (2,) float64
-        Motion that brings the later stretch's landmarks, in the map, onto the earlier one's:
-        x -> R(turn) x + shift.
-    log10_false_alarms : float
-        Logarithm of the number of matches as good that chance would bring about.
-    """
-
+    # Middle frames of the two.
     earlier_frame: int
     later_frame: int
-    pairs: IntArray
+    pairs: IntArray  # (k, 2): labels of the earlier and of the later stretch that are one landmark
     turn_rad: float
+    # (2,): motion that brings the later stretch's landmarks, in the map, onto the earlier one's: x
+    # -> R(turn) x + shift.
     shift: FloatArray
+    # Logarithm of the number of matches as good that chance would bring about.
     log10_false_alarms: float
 
 
@@ -148,20 +111,7 @@ def stretches_of(
 ) -> list[Stretch]:
     """The constellations along a run.
 
-    Parameters
-    ----------
-    frames, labels : (n,) int64
-        Frame and landmark of each row, by frame.
-    xy : (M, 2) float64
-        Places of the landmarks by label (m); those that are NaN are left out.
-    count : int
-        Frames of the run.
-    settings : LoopSettings
-
-    Returns
-    -------
-    list of Stretch
-        Those with enough landmarks for a match.
+    Takes `frames, labels` (n,), `xy` (M, 2).
     """
     found = []
     for start in range(0, max(count - settings.stretch_frames // 2, 1), settings.stride_frames):
@@ -194,21 +144,8 @@ def find_matches(
 ) -> list[Match]:
     """All pairs of stretches that show one place more surely than by chance.
 
-    Landmarks that two stretches share already are left out; stretches that share three or more
-    need no match.
-
-    Parameters
-    ----------
-    stretches : list of Stretch
-        In the order of the run.
-    settings : LoopSettings
-    progress : callable, optional
-        Called with the progress of the search.
-
-    Returns
-    -------
-    list of Match
-        The surest first.
+    Landmarks that two stretches share already are left out; stretches that share three or more need
+    no match.
     """
     candidates: list[tuple[Stretch, Stretch, BoolArray, BoolArray, float, FloatArray]] = []
     tried = 0
@@ -267,16 +204,7 @@ def find_matches(
 def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]:
     """The rigid motion of least squares between paired points of the plane.
 
-    Parameters
-    ----------
-    moved, fixed : (n, 2) float64
-        Points and where they go (m).
-
-    Returns
-    -------
-    turn_rad : float
-    shift : (2,) float64
-        x -> R(turn) x + shift.
+    Takes `moved, fixed` (n, 2); returns `turn_rad`, `shift` (2,).
     """
     first, second = moved.mean(axis=0), fixed.mean(axis=0)
     a, b = moved - first, fixed - second
@@ -287,17 +215,7 @@ def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
     """Points of two sets that are each other's nearest, and near.
 
-    Parameters
-    ----------
-    first, second : (n, 2), (m, 2) float64
-        Points (m).
-    reach_m : float
-        Largest distance of a pair.
-
-    Returns
-    -------
-    (k, 2) int64
-        Indices into both.
+    Takes `first, second` (n, 2), (m, 2); returns (k, 2).
     """
     if len(first) == 0 or len(second) == 0:
         return np.zeros((0, 2), dtype=np.int64)
@@ -313,21 +231,6 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
 
     Two of the landmarks agree because the motion was made from them; of the others each agrees by
     chance with probability `chance`.
-
-    Parameters
-    ----------
-    agreeing : int
-        Landmarks that agree.
-    present : int
-        Landmarks that could have.
-    chance : float
-        Probability that a landmark at random falls near one of the other constellation.
-    tried : int
-        Number of motions tried.
-
-    Returns
-    -------
-    float
     """
     tail = float(binom.logsf(agreeing - 3, max(present - 2, 0), min(chance, 1.0)))
     return float(np.log10(max(tried, 1)) + tail / np.log(10.0))

@@ -57,35 +57,8 @@ def best_motion(
     Every pair of landmarks of the first with every pair of the second of the same length says what
     the motion would be; it is counted how many landmarks agree.
 
-    Parameters
-    ----------
-    moved : (n, 2) float64
-        Constellation that is moved (m).
-    fixed : (m, 2) float64
-        The other.
-    length_tolerance_m : float
-        By how much the lengths of two pairs may differ.
-    least_length_m : float
-        Shorter pairs say too little about the turn.
-    reach_m : float
-        Largest distance of a landmark that agrees.
-    most_turn_rad, most_shift_m : float
-        Larger motions are not tried; the shift is that of the first one's centroid.
-    least_agreeing : int
-        Motions with fewer agreeing landmarks may be missed.
-
-    Returns
-    -------
-    turn_rad : float
-        About the first constellation's centroid.
-    shift_x, shift_y : float
-        Of the centroid (m).
-    agreeing : int
-        How many landmarks of `moved` fall near one of `fixed`; 0 where they are too few.
-    squared : float
-        Sum of their squared distances (m^2).
-    tried : int
-        Number of motions tried.
+    Takes `moved` (n, 2), `fixed` (m, 2); returns `turn_rad`, `shift_x, shift_y`, `agreeing`,
+    `squared`, `tried`.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0

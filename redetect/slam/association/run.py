@@ -30,7 +30,7 @@ from redetect.slam.association.loop_closing import (
     pairs_by_votes,
     pairs_in_place,
 )
-from redetect.slam.association.loop_path import Solution, intersect_bearings, solve_path
+from redetect.slam.association.loop_path import LabelledMap, intersect_bearings, solve_path
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
 from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
@@ -93,29 +93,17 @@ class AssociateSettings:
 
 @dataclass(frozen=True, eq=False)
 class RunAssociation:
-    """Labels of a run's rows, numbered from 0 in the order of first sight.
+    """Labels of a run's rows, numbered from 0 in the order of first sight."""
 
-    Attributes
-    ----------
-    circle_labels, line_labels : (n,) int64
-        Of each row at the end; -1 where a row of a disc fits none, or none that is seen often.
-    local_circle_labels, local_line_labels : (n,) int64
-        From frame to frame only.
-    matches : tuple of Match
-        The loops that were closed.
-    path : (N + 1, 3) float64 or None
-        The path that goes with them; None without map level.
-    incomplete_frames : int
-        Frames whose joint search was cut short.
-    """
-
+    # (n,): of each row at the end; -1 where a row of a disc fits none, or none that is seen often.
     circle_labels: IntArray
     line_labels: IntArray
+    # (n,): from frame to frame only.
     local_circle_labels: IntArray
     local_line_labels: IntArray
-    matches: tuple[Match, ...]
-    path: FloatArray | None
-    incomplete_frames: int
+    matches: tuple[Match, ...]  # the loops that were closed
+    path: FloatArray | None  # (N + 1, 3): the path that goes with them; None without map level
+    incomplete_frames: int  # frames whose joint search was cut short
 
 
 def associate_run(
@@ -236,7 +224,7 @@ def _solved(
     path: FloatArray | None,
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
-) -> Solution:
+) -> LabelledMap:
     """Path and map by discs, or by lines where there are no discs."""
     line_xy = None
     if not by_discs:

@@ -15,57 +15,34 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AssociationScore:
-    """Labels against the file's IDs; rows without ID are left out.
+    """Labels against the file's IDs; rows without ID are left out."""
 
-    Attributes
-    ----------
-    rows : int
-        Rows that were scored.
-    unlabelled_rows : int
-        Of these, rows without a label: they count as landmarks seen once, and as no splits.
-    true_landmarks, found_landmarks : int
-        Different IDs, and different labels, among them.
-    pair_precision : float
-        Of the pairs of rows with one label, the share that shows one landmark; 1 without pairs.
-    pair_recall : float
-        Of the pairs of rows of one landmark, the share that has one label; 1 without pairs.
-    right_rows : float
-        Share of rows whose label is that of their landmark, where labels and landmarks are matched
-        one to one so that this share is largest. A row with several IDs may be any of them.
-    wrong_merges : int
-        Labels in excess: for each label how many landmarks it has taken in besides its first.
-    splits : int
-        For each landmark how many labels its rows have besides the first.
-    """
-
-    rows: int
+    rows: int  # rows that were scored
+    # Of these, rows without a label: they count as landmarks seen once, and as no splits.
     unlabelled_rows: int
+    # Different IDs, and different labels, among them.
     true_landmarks: int
     found_landmarks: int
+    # Of the pairs of rows with one label, the share that shows one landmark; 1 without pairs.
     pair_precision: float
+    # Of the pairs of rows of one landmark, the share that has one label; 1 without pairs.
     pair_recall: float
+    # Share of rows whose label is that of their landmark, where labels and landmarks are matched
+    # one to one so that this share is largest. A row with several IDs may be any of them.
     right_rows: float
+    # Labels in excess: for each label how many landmarks it has taken in besides its first.
     wrong_merges: int
-    splits: int
+    splits: int  # for each landmark how many labels its rows have besides the first
 
 
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:
     """Score labels.
 
-    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`,
-    and for the one-to-one matching, a row with several IDs counts as the one among them that most
-    rows of its label have.
+    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`, and
+    for the one-to-one matching, a row with several IDs counts as the one among them that most rows
+    of its label have.
 
-    Parameters
-    ----------
-    labels : (n,) int64
-        Labels found, at least 0; -1 for rows that were given none.
-    ids : sequence of n tuples of int
-        The file's IDs of each row; empty where unknown.
-
-    Returns
-    -------
-    AssociationScore
+    Takes `labels` (n,).
     """
     known = [k for k, listed in enumerate(ids) if listed]
     names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}

@@ -18,7 +18,7 @@ from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, wri
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
-from redetect.slam.commands.filter_input import read_run_of
+from redetect.slam.commands.inputs import read_run_of
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
@@ -31,13 +31,7 @@ Scores = dict[str, dict[str, AssociationScore]]
 
 
 def perform(options: Associate) -> int:
-    """Carry the command out; returns the exit code.
-
-    Raises
-    ------
-    SlamError, redetect.landmarks.LandmarkFileError, redetect.storage.OutputExistsError, OSError
-        If the run cannot be read, a setting makes no sense or an output exists.
-    """
+    """Carry the command out; returns the exit code."""
     demand(
         options,
         SlamError,
@@ -141,21 +135,7 @@ def score_run(recording: Recording, found: RunAssociation) -> Scores:
 
 
 def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
-    """The scores as lines of a table for the terminal.
-
-    Parameters
-    ----------
-    noise : float
-        Factor of the noise that was added.
-    seconds : float
-        What the association took.
-    scores : dict
-        See `score_run`.
-
-    Returns
-    -------
-    list of str
-    """
+    """The scores as lines of a table for the terminal."""
     lines = [f"noise {noise:g}: {seconds:.1f} s" + ("" if scores else ", no IDs to score against")]
     for kind, stages in scores.items():
         for stage, s in stages.items():
@@ -169,26 +149,7 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
 
 
 def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
-    """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        The file's.
-    found : RunAssociation
-        Its discs or lines, in the order of the file.
-    source : Path
-        The file, for the message.
-
-    Yields
-    ------
-    Row
-
-    Raises
-    ------
-    SlamError
-        If the file has other rows than those associated.
-    """
+    """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was."""
     counts = {
         kind: sum(isinstance(row.record, kind) for row in rows)
         for kind in (CircleLandmark, LineLandmark)

@@ -10,15 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect import slam
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
-from redetect.slam.commands.run_camera import camera_of_run
-from redetect.slam.commands.run_rows import recording_of
+from redetect.slam.commands.inputs import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
-from redetect.slam.models.mounted_discs import rotation_exp
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
@@ -69,21 +68,7 @@ def perform(options: Options) -> int:
 
 
 def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
-    """Rows of a file, those that contradict mended or left out; all other bytes as they were.
-
-    Parameters
-    ----------
-    rows : iterable of Row
-        The file's.
-    audit : Audit
-        Of its discs.
-    apply : "mend" or "drop"
-        Give rows their new identifier (-1 where nothing explains them), or leave them out.
-
-    Yields
-    ------
-    Row
-    """
+    """Rows of a file, those that contradict mended or left out; all other bytes as they were."""
     new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
     disc = -1
     for row in rows:
@@ -174,7 +159,8 @@ def _draw(
             file = picture_of_frame(images, frames[k].step.prefix)
             if file is not None:
                 # Levelled positions are turned back to where the camera saw them.
-                turn, _ = rotation_exp(np.array([*(frames[k].levelled_by or (0.0, 0.0)), 0.0]))
+                vector = [*(frames[k].levelled_by or (0.0, 0.0)), 0.0]
+                turn = Rotation.from_rotvec(vector).as_matrix()
                 u, v = camera.project_robot(np.array([disc.px, disc.py, 0.0]) @ turn)
                 crops.append(Crop(file, (float(u), float(v)), f"{k}"))
         if crops:

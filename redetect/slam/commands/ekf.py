@@ -6,8 +6,8 @@ from pathlib import Path
 
 from redetect import slam
 from redetect.landmarks.map_file import read_map, write_map, write_path
-from redetect.slam.commands.filter_input import default_output, read_reference, read_run_of
-from redetect.slam.commands.filter_output import (
+from redetect.slam.commands.inputs import default_output, read_reference, read_run_of
+from redetect.slam.commands.outputs import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,

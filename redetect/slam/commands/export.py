@@ -17,10 +17,9 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.slam.commands.run_camera import camera_of_run
-from redetect.slam.commands.run_rows import print_assumed, recording_of
+from redetect.slam.commands.inputs import camera_of_run, print_assumed, recording_of
 from redetect.slam.errors import SlamError
-from redetect.slam.formats import mrclam, victoria_park
+from redetect.slam.formats import data_sets
 from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.slam.formats.g2o import write_g2o
 from redetect.slam.formats.g2o_frames import (
@@ -30,7 +29,6 @@ from redetect.slam.formats.g2o_frames import (
     poses_of_run,
 )
 from redetect.slam.formats.g2o_reading import read_g2o
-from redetect.slam.formats.range_bearing import frames_of
 from redetect.slam.formats.tables import (
     identified_discs,
     identified_lines,
@@ -198,26 +196,26 @@ def _import_data_set(command: Import) -> int:
     """Of the UTIAS data set a robot's run, its true path or the landmarks; of Victoria Park all."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
     file, head = command.file, [_made_by(command.file)]
-    if file.name == mrclam.LANDMARKS:
-        landmark_map = mrclam.read_landmarks(file)
+    if file.name == data_sets.LANDMARKS:
+        landmark_map = data_sets.read_landmarks(file)
         write_map(command.output, landmark_map, head, overwrite=command.force)
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
         return 0
-    if file.name.endswith(mrclam.ODOMETRY) and command.output.suffix == ".csv":
-        path = mrclam.read_truth(file)
+    if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
+        path = data_sets.read_truth(file)
         write_path(command.output, path, head, overwrite=command.force)
         print(f"{command.output}: {len(path.poses)} poses")
         return 0
-    if file.name.endswith(mrclam.ODOMETRY):
-        run = mrclam.read_robot(file)
-    elif file.name == victoria_park.DRIVE:
-        run = victoria_park.read_drive(file)
+    if file.name.endswith(data_sets.ODOMETRY):
+        run = data_sets.read_robot(file)
+    elif file.name == data_sets.DRIVE:
+        run = data_sets.read_drive(file)
     else:
         raise SlamError(
-            f"{file}: expected a RobotN{mrclam.ODOMETRY} or {mrclam.LANDMARKS} of the UTIAS data "
-            f"set, or the {victoria_park.DRIVE} of Victoria Park"
+            f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "
+            f"data set, or the {data_sets.DRIVE} of Victoria Park"
         )
-    frames = frames_of(run, command.range_sigma, command.bearing_sigma)
+    frames = data_sets.frames_of(run, command.range_sigma, command.bearing_sigma)
     write_frames(command.output, frames, head=head[0], overwrite=command.force)
     print(f"{command.output}: {len(frames)} steps, {len(run.frame)} measurements")
     return 0

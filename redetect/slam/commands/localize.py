@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from redetect import slam
 from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
-from redetect.slam.commands.filter_input import (
+from redetect.slam.commands.inputs import (
     camera_xy_of,
     default_output,
     read_reference,
     read_run_of,
 )
-from redetect.slam.commands.filter_output import (
+from redetect.slam.commands.outputs import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,

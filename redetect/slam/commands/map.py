@@ -13,8 +13,7 @@ import numpy as np
 
 from redetect import slam
 from redetect.landmarks.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
-from redetect.slam.commands.run_camera import camera_of_run
-from redetect.slam.commands.run_rows import recording_of
+from redetect.slam.commands.inputs import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import as_json, table_lines
 from redetect.slam.mapping.covariance_file import (
@@ -193,8 +192,10 @@ def _draw(
         output / PICTURE_NAME,
         final,
         path,
-        before=path_of(recording, mapped.start, None),
-        before_map=LandmarkMap(discs=first.discs, lines=no_landmarks()),
+        before=(
+            LandmarkMap(discs=first.discs, lines=no_landmarks()),
+            path_of(recording, mapped.start, None),
+        ),
         title=command.run.resolve().name,
         overwrite=command.force,
         interactive=command.interactive,

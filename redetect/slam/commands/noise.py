@@ -11,13 +11,7 @@ from redetect.slam.recording import demand_landmarks, landmark_file
 
 
 def perform(options: Noise) -> int:
-    """Carry the command out; returns the exit code.
-
-    Raises
-    ------
-    SlamError, redetect.landmarks.LandmarkFileError, redetect.storage.OutputExistsError, OSError
-        If the file cannot be read or written, or a setting makes no sense.
-    """
+    """Carry the command out; returns the exit code."""
     noise = AddedNoise(
         disc_m=options.sigma,
         bearing_rad=options.bearing_sigma,

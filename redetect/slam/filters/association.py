@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import Path2D
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
     Pairing,
@@ -21,9 +22,10 @@ from redetect.slam.association.compatibility import (
     joint_compatible,
     nearest_compatible,
 )
-from redetect.slam.filters.frames import FrameRows
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.frames import Filter, FilterRun, FrameRows, frames_of
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.recording import UNKNOWN_ID
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -45,58 +47,20 @@ _NO_LINES = MeasuredLines(
 )
 
 
-class Estimate(Protocol):
-    """The part of a filter that pairing needs."""
-
-    disc_slots: dict[int, int]
-    line_slots: dict[int, int]
-    camera_xy: FloatArray
-
-    @property
-    def state(self) -> FloatArray:
-        """The pose, then landmarks, as the slots say."""
-
-    def block(self, index: IntArray) -> FloatArray:
-        """Rows and columns of the state's covariance."""
-
-
 @dataclass(frozen=True)
 class Associator:
-    """How rows are paired with landmarks.
+    """How rows are paired with landmarks."""
 
-    Attributes
-    ----------
-    method : str
-        `known`, `nearest` or `joint`.
-    gate_probability : float
-        Share of right rows that pass.
-    """
-
-    method: Association = "known"
-    gate_probability: float = DEFAULT_GATE_PROBABILITY
+    method: Association = "known"  # `known`, `nearest` or `joint`
+    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of right rows that pass
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)
 
     def identified(
-        self, rows: FrameRows, estimate: Estimate, new_id: Callable[[], int] | None = None
+        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None = None
     ) -> FrameRows:
-        """Rows with the identifiers of the landmarks they are found to show.
-
-        Parameters
-        ----------
-        rows : FrameRows
-            A frame's rows. Unless association is known, their identifiers are ignored.
-        estimate : Estimate
-            The filter, predicted to that frame.
-        new_id : callable, optional
-            Gives an unused identifier for a disc that is far from all known ones; without it such
-            rows stay unknown.
-
-        Returns
-        -------
-        FrameRows
-        """
+        """Rows with the identifiers of the landmarks they are found to show."""
         if self.method == "known":
             return rows
         discs = self._discs(rows, estimate, new_id) if rows.disc_ids else ()
@@ -104,7 +68,7 @@ class Associator:
         return rows.identified(discs, lines)
 
     def _discs(
-        self, rows: FrameRows, estimate: Estimate, new_id: Callable[[], int] | None
+        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None
     ) -> tuple[int, ...]:
         names, slots = _near_discs(rows.disc_xy, estimate)
         found = np.full(len(rows.disc_xy), UNKNOWN_ID, dtype=np.int64)
@@ -129,7 +93,7 @@ class Associator:
                 found[k] = new_id()
         return tuple(int(number) for number in found)
 
-    def _lines(self, rows: FrameRows, estimate: Estimate) -> tuple[tuple[int, ...], ...]:
+    def _lines(self, rows: FrameRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
         slots = np.array(list(estimate.line_slots.values()), dtype=np.int64)
         names = np.array(list(estimate.line_slots), dtype=np.int64)
         state = estimate.state
@@ -156,7 +120,37 @@ class Associator:
         return pair(innovation, predicted, noise, gate_probability=self.gate_probability)
 
 
-def _near_discs(seen_xy: FloatArray, estimate: Estimate) -> tuple[IntArray, IntArray]:
+def run_filter(
+    recording: Recording,
+    estimate: Filter,
+    pairing: Associator,
+    new_id: Callable[[], int] | None = None,
+) -> FilterRun:
+    """Take a filter through a run; a `SlamError` names the step."""
+    disc_ids: list[int] = []
+    line_ids: list[tuple[int, ...]] = []
+    poses = np.empty((len(recording) + 1, 3))
+    covariance = np.empty((len(recording) + 1, 3, 3))
+    poses[0], covariance[0] = estimate.state[:3], estimate.pose_covariance
+    for k, rows in enumerate(frames_of(recording)):
+        try:
+            estimate.predict(recording.steps[k], recording.step_covariance[k])
+            identified = pairing.identified(rows, estimate, new_id)
+            estimate.measure(identified)
+        except SlamError as error:
+            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
+        disc_ids.extend(identified.disc_ids)
+        line_ids.extend(identified.line_ids)
+        poses[k + 1], covariance[k + 1] = estimate.state[:3], estimate.pose_covariance
+    return FilterRun(
+        path=Path2D(("start", *recording.prefixes), poses, covariance),
+        count=estimate.count,
+        disc_ids=np.array(disc_ids, dtype=np.int64),
+        line_ids=tuple(line_ids),
+    )
+
+
+def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArray]:
     """Names and slots of the discs that any of the rows may show."""
     slots = np.array(list(estimate.disc_slots.values()), dtype=np.int64)
     names = np.array(list(estimate.disc_slots), dtype=np.int64)

@@ -1,5 +1,7 @@
 """Position of a vertical line from bearings at several poses: delayed initialisation.
 
+Until there is parallax, bearings wait, and the poses that they were seen from are kept.
+
 A line joins the state of EKF-SLAM with all the bearings that were kept of it at once. Their
 linearised equations, in standard deviations,
 
@@ -28,35 +30,111 @@ _CONVERGED_M = 1e-6
 _LEAST_DETERMINANT = 1e-6
 # Nearer to the camera than this a bearing says nothing (m).
 _NEAREST_M = 0.05
+# A line that was out of sight for this many frames is initialised again.
+LONGEST_ABSENCE_FRAMES = 50
+# Poses kept at most. If there are more, every other one is dropped: the span is what matters.
+MOST_KEPT_POSES = 24
+# Below this angle between its rays (rad) a line is not tried to be placed; and after it was, not
+# before the angle has grown by this factor.
+LEAST_PARALLAX_RAD, PARALLAX_GROWTH = 0.02, 1.05
+
+
+@dataclass(frozen=True)
+class View:
+    """A bearing that waits."""
+
+    frame: int  # its frame, whose pose is kept
+    # The row.
+    bearing_rad: float
+    sigma_rad: float
+
+
+class WaitingLines:
+    """Views of lines that are not in the state yet.
+
+    Attributes
+    ----------
+    slots : dict of int to int
+        Where in the state the pose of a frame is kept.
+    """
+
+    def __init__(self) -> None:
+        self.slots: dict[int, int] = {}
+        self._views: dict[int, list[View]] = {}
+        self._tried_rad: dict[int, float] = {}
+
+    def worth_trying(self, number: int, parallax_rad: float) -> bool:
+        """Whether the rays of a line differ more than when it was last tried to be placed."""
+        if parallax_rad < self._tried_rad.get(number, LEAST_PARALLAX_RAD):
+            return False
+        self._tried_rad[number] = PARALLAX_GROWTH * parallax_rad
+        return True
+
+    def views(self, number: int) -> list[View]:
+        """The stored views of a line, in the order of the frames."""
+        return self._views.get(number, [])
+
+    def keep(self, number: int, view: View) -> None:
+        """Keep a row; the pose of its frame must be kept as well."""
+        self._views.setdefault(number, []).append(view)
+
+    def take(self, number: int) -> None:
+        """Forget a line: it joined the state."""
+        self._views.pop(number, None)
+        self._tried_rad.pop(number, None)
+
+    def forget_absent(self, frame: int) -> int:
+        """Forget lines that are out of sight for long; returns how many views were dropped."""
+        absent = [
+            number
+            for number, views in self._views.items()
+            if frame - views[-1].frame > LONGEST_ABSENCE_FRAMES
+        ]
+        for number in absent:
+            self._tried_rad.pop(number, None)
+        return sum(len(self._views.pop(number)) for number in absent)
+
+    def forget_all(self) -> int:
+        """Forget all lines; returns how many views were dropped."""
+        given_up = sum(map(len, self._views.values()))
+        self._views.clear()
+        return given_up
+
+    def thin(self) -> int:
+        """Drop every other pose if there are too many; returns how many views were dropped, too."""
+        if len(self.slots) <= MOST_KEPT_POSES:
+            return 0
+        given_up = set(sorted(self.slots)[1:-1:2])
+        before = sum(map(len, self._views.values()))
+        kept = {
+            number: [view for view in views if view.frame not in given_up]
+            for number, views in self._views.items()
+        }
+        self._views = {number: views for number, views in kept.items() if views}
+        return before - sum(map(len, self._views.values()))
+
+    def release(self) -> list[int]:
+        """Slots of poses that no view needs any more; they may be used for others."""
+        needed = {view.frame for views in self._views.values() for view in views}
+        free = [frame for frame in self.slots if frame not in needed]
+        return [self.slots.pop(frame) for frame in free]
 
 
 @dataclass(frozen=True, eq=False)
 class LineStart:
-    """A line that joins the state, and what its bearings say of the poses.
+    """A line that joins the state, and what its bearings say of the poses."""
 
-    Attributes
-    ----------
-    xy : (2,) float64
-        Its most likely position in the map (m); the equations are linearised there.
-    correction : (2,) float64
-        What the place is off from where Q1's two equations alone have it (m): to be added to it
-        before the residual is used, which takes it back.
-    by_poses : (2, 3 k) float64
-        Its derivative by the k poses.
-    noise : (2, 2) float64
-        Covariance that the bearings add (m^2).
-    residual : (k - 2,) float64
-        Measured less predicted, in standard deviations, of what the bearings say of the poses.
-    residual_by_poses : (k - 2, 3 k) float64
-        Jacobian of that.
-    """
-
+    # (2,): its most likely position in the map (m); the equations are linearised there.
     xy: FloatArray
+    # (2,): what the place is off from where Q1's two equations alone have it (m): to be added to it
+    # before the residual is used, which takes it back.
     correction: FloatArray
-    by_poses: FloatArray
-    noise: FloatArray
+    by_poses: FloatArray  # (2, 3 k): its derivative by the k poses
+    noise: FloatArray  # (2, 2): covariance that the bearings add (m^2)
+    # (k - 2,): measured less predicted, in standard deviations, of what the bearings say of the
+    # poses.
     residual: FloatArray
-    residual_by_poses: FloatArray
+    residual_by_poses: FloatArray  # (k - 2, 3 k): Jacobian of that
 
 
 def triangulate(
@@ -68,21 +146,8 @@ def triangulate(
 ) -> FloatArray | None:
     """The most likely place of a line that bearings from several poses show.
 
-    Parameters
-    ----------
-    poses : (k, 3) float64
-        Poses of the robot in the map, two or more.
-    bearing_rad, sigma_rad : (k,) float64
-        Bearings and their standard deviations.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-    pose_covariance : (3 k, 3 k) float64, optional
-        Of the poses; by default they are exact.
-
-    Returns
-    -------
-    (2,) float64, or None
-        None if the rays have no parallax, or do not meet in front of the camera.
+    Takes `poses` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,), `pose_covariance` (3 k, 3
+    k); returns (2,).
     """
     origin = disc_in_map(poses, camera_xy)
     angle = poses[:, 2] + bearing_rad
@@ -131,20 +196,8 @@ def bearing_rows(
 ) -> tuple[FloatArray, FloatArray]:
     """Jacobians of one line's bearings by the poses and by its place.
 
-    Parameters
-    ----------
-    poses, line_xy : (k, 3), (2,) float64
-        Latest estimates.
-    poses_at, line_at : (k, 3), (2,) float64
-        Where the offset of the line from the robot, which the heading turns, is taken from: the
-        same, or first estimates.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    by_pose : (k, 3) float64
-    by_line : (k, 2) float64
+    Takes `poses, line_xy` (k, 3), (2,), `poses_at, line_at` (k, 3), (2,), `camera_xy` (2,); returns
+    `by_pose` (k, 3), `by_line` (k, 2).
     """
     seen = disc_in_robot(poses, line_xy) - camera_xy
     by_seen = np.stack([-seen[:, 1], seen[:, 0]], axis=-1) / np.sum(seen**2, axis=1)[:, None]
@@ -168,21 +221,8 @@ def start_line(
 ) -> LineStart | None:
     """Place a line by bearings from several poses.
 
-    Parameters
-    ----------
-    poses, poses_at : (k, 3) float64
-        Latest estimates of the poses, and where Jacobians are evaluated.
-    bearing_rad, sigma_rad : (k,) float64
-        The bearings.
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-    pose_covariance : (3 k, 3 k) float64
-        Of the poses.
-
-    Returns
-    -------
-    LineStart, or None
-        None if they do not meet; see `triangulate`.
+    Takes `poses, poses_at` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,),
+    `pose_covariance` (3 k, 3 k).
     """
     xy = triangulate(poses, bearing_rad, sigma_rad, camera_xy, pose_covariance)
     if xy is None:
@@ -205,16 +245,7 @@ def start_line(
 def relative_range_sigma(pose: FloatArray, line_xy: FloatArray, covariance: FloatArray) -> float:
     """Standard deviation of a line's distance from the robot, over that distance.
 
-    Parameters
-    ----------
-    pose, line_xy : (3,), (2,) float64
-        Of the robot and of the line.
-    covariance : (5, 5) float64
-        Of both.
-
-    Returns
-    -------
-    float
+    Takes `pose, line_xy` (3,), (2,), `covariance` (5, 5).
     """
     offset = line_xy - pose[:2]
     distance = float(np.hypot(*offset))

@@ -20,21 +20,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
-from redetect.slam.filters.delayed_lines import relative_range_sigma, start_line
+from redetect.slam.filters.association import Associator, run_filter
+from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     FilterRun,
     FrameRows,
     RowCount,
-    frames_of,
-    unknown,
 )
 from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
-from redetect.slam.filters.views import View, WaitingLines
-from redetect.slam.recording import Recording
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -92,6 +89,11 @@ class EkfSlam:
         self._free_slots: list[int] = []
 
     @property
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3)."""
+        return self.covariance.pose()
+
+    @property
     def state(self) -> FloatArray:
         """The pose, then landmarks and kept poses, as the slots say: (n,)."""
         return self._state[: self.covariance.size]
@@ -101,15 +103,7 @@ class EkfSlam:
         return self.covariance.block(index)
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step.
-
-        Parameters
-        ----------
-        step : (3,) array
-            dx, dy (m), dphi (rad).
-        noise : (3, 3) array
-            Its covariance.
-        """
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
         state, at = self._state, self._linearised
         cos, sin = np.cos(state[2]), np.sin(state[2])
         x = state[0] + cos * step[0] - sin * step[1]
@@ -126,17 +120,13 @@ class EkfSlam:
 
         Rows without ID are left out, and so are rows of several lines of which not all are in the
         map yet. A row of several lines measures the mean of their bearings.
-
-        Parameters
-        ----------
-        rows : FrameRows
         """
         discs, lines = [], []
         new_discs: dict[int, int] = {}
         again: list[int] = []
         single: list[int] = []
         for k, number in enumerate(rows.disc_ids):
-            if unknown(number):
+            if number == UNKNOWN_ID:
                 self.count.left_out["disc without ID"] += 1
             elif number in self.disc_slots:
                 discs.append(k)
@@ -346,26 +336,6 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
             f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
             "only; expected known association, or a run without lines"
         )
-    new_id = count(1).__next__
-    disc_ids: list[int] = []
-    line_ids: list[tuple[int, ...]] = []
-    poses = np.empty((len(recording) + 1, POSE_SIZE))
-    covariance = np.empty((len(recording) + 1, POSE_SIZE, POSE_SIZE))
-    poses[0], covariance[0] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
-    for k, rows in enumerate(frames_of(recording)):
-        try:
-            ekf.predict(recording.steps[k], recording.step_covariance[k])
-            identified = pairing.identified(rows, ekf, new_id)
-            ekf.measure(identified)
-        except SlamError as error:
-            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
-        disc_ids.extend(identified.disc_ids)
-        line_ids.extend(identified.line_ids)
-        poses[k + 1], covariance[k + 1] = ekf.state[:POSE_SIZE], ekf.covariance.pose()
+    filtered = run_filter(recording, ekf, pairing, count(1).__next__)
     ekf.finish()
-    return FilterRun(
-        path=Path2D(("start", *recording.prefixes), poses, covariance),
-        count=ekf.count,
-        disc_ids=np.array(disc_ids, dtype=np.int64),
-        line_ids=tuple(line_ids),
-    )
+    return filtered

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.recording import Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -21,27 +22,14 @@ NO_CAMERA = np.zeros(2)
 
 @dataclass(frozen=True, eq=False)
 class FrameRows:
-    """Measurements of one frame.
+    """Measurements of one frame."""
 
-    Attributes
-    ----------
-    disc_ids : tuple of d int
-        -1 where unknown.
-    disc_xy : (d, 2) float64
-        In the robot frame (m).
-    disc_covariance : (d, 2, 2) float64
-    line_ids : tuple of l tuples of int
-        All lines that a row shows; empty where unknown.
-    bearing_rad : (l,) float64
-    sigma_rad : (l,) float64
-    """
-
-    disc_ids: tuple[int, ...]
-    disc_xy: FloatArray
-    disc_covariance: FloatArray
-    line_ids: tuple[tuple[int, ...], ...]
-    bearing_rad: FloatArray
-    sigma_rad: FloatArray
+    disc_ids: tuple[int, ...]  # -1 where unknown
+    disc_xy: FloatArray  # (d, 2): in the robot frame (m)
+    disc_covariance: FloatArray  # (d, 2, 2)
+    line_ids: tuple[tuple[int, ...], ...]  # all lines that a row shows; empty where unknown
+    bearing_rad: FloatArray  # (l,)
+    sigma_rad: FloatArray  # (l,)
 
     def identified(
         self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
@@ -63,21 +51,7 @@ class FrameRows:
     ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
         """Innovation of some of the rows.
 
-        Parameters
-        ----------
-        discs, lines : sequences of int
-            The rows, by their places here; all of known landmarks.
-        disc_slots, line_slots : mappings of int to int
-            Where in the state each landmark begins.
-        state, linearised_at : (n,) float64
-            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
-        camera_xy : (2,) float64
-            The camera's centre in the robot frame (m).
-
-        Returns
-        -------
-        innovation, jacobian, noise, index
-            See `redetect.slam.filters.innovation_kernels.frame_innovation`.
+        Takes `state, linearised_at` (n,), `camera_xy` (2,).
         """
         line_ids = [self.line_ids[k] for k in lines]
         return frame_innovation(
@@ -100,24 +74,15 @@ class FrameRows:
 
 @dataclass
 class RowCount:
-    """How a run's rows were used.
+    """How a run's rows were used."""
 
-    Attributes
-    ----------
-    discs, lines : int
-        Rows that were used.
-    left_out : Counter of str
-        Rows that were not, by the reason.
-    innovation_squared : float
-        Sum of the squared innovations, normalised by their covariances.
-    innovation_numbers : int
-        Their degrees of freedom: if the covariances are right, what the sum is expected to be.
-    """
-
+    # Rows that were used.
     discs: int = 0
     lines: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
+    # Sum of the squared innovations, normalised by their covariances.
     innovation_squared: float = 0.0
+    # Their degrees of freedom: if the covariances are right, what the sum is expected to be.
     innovation_numbers: int = 0
 
 
@@ -164,6 +129,27 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
         )
 
 
-def unknown(number: int) -> bool:
-    """Whether an identifier says that the landmark is not known."""
-    return number == UNKNOWN_ID
+class Filter(Protocol):
+    """A filter that is taken through a run."""
+
+    disc_slots: dict[int, int]
+    line_slots: dict[int, int]
+    camera_xy: FloatArray
+    count: RowCount
+
+    @property
+    def state(self) -> FloatArray:
+        """The pose, then landmarks, as the slots say."""
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3)."""
+
+    def block(self, index: IntArray) -> FloatArray:
+        """Rows and columns of the state's covariance."""
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> None:
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
+
+    def measure(self, rows: FrameRows) -> None:
+        """Update with the rows of a frame."""

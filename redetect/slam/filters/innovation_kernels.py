@@ -33,20 +33,12 @@ class MeasuredDiscs(NamedTuple):
 
 
 class MeasuredLines(NamedTuple):
-    """Rows of l lines, each of which may be that of several of e lines of the state.
+    """Rows of l lines, each of which may be that of several of e lines of the state."""
 
-    Attributes
-    ----------
-    slot : (e,) int64
-        Where in the state the lines of the rows begin.
-    start : (l + 1,) int64
-        Row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
-    bearing_rad, sigma_rad : (l,) float64
-        Measured.
-    """
-
-    slot: IntArray
+    slot: IntArray  # (e,): where in the state the lines of the rows begin
+    # (l + 1,): row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
     start: IntArray
+    # (l,): measured.
     bearing_rad: FloatArray
     sigma_rad: FloatArray
 
@@ -61,28 +53,8 @@ def frame_innovation(
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Measured minus predicted, its Jacobian and its noise, for all rows of a frame.
 
-    Parameters
-    ----------
-    state : (n,) float64
-        Pose, then landmarks; predictions are made from it.
-    linearised_at : (n,) float64
-        Where the offset of landmarks from the robot, which the heading turns, is taken from:
-        usually the same. With first estimates a frame turned as a whole is no innovation.
-    discs : MeasuredDiscs
-    lines : MeasuredLines
-    camera_xy : (2,) float64
-        The camera's centre in the robot frame (m).
-
-    Returns
-    -------
-    innovation : (m,) float64
-        m = 2 d + l; bearings wrapped.
-    jacobian : (m, 3 + 2 d + 2 e) float64
-        By the numbers of the state that `index` names.
-    noise : (m, m) float64
-        Covariance of the measurements.
-    index : (3 + 2 d + 2 e,) int64
-        Into the state. A landmark that several rows show is included several times.
+    Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
+    `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
     """
     disc_count, line_count = len(discs.slot), len(lines.bearing_rad)
     rows = 2 * disc_count + line_count

@@ -20,11 +20,6 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.joint_covariance_kernels import (
-    set_symmetric_rows,
-    symmetric_block,
-    symmetric_columns,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,7 +56,8 @@ class JointCovariance:
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns `index` of the covariance: (k, k)."""
         factor = self._factor[index, : self._pending]
-        return np.asarray(symmetric_block(self._base, index) - factor @ factor.T)
+        low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
+        return np.asarray(self._base[high, low] - factor @ factor.T)
 
     def pose(self) -> FloatArray:
         """Covariance of the pose: (3, 3)."""
@@ -85,9 +81,7 @@ class JointCovariance:
 
     def projected(self, index: IntArray, jacobian: FloatArray) -> FloatArray:
         """Covariance of the state with a measurement: P[:, index] @ jacobian.T, (size, m)."""
-        columns = np.empty((self.size, len(index)), order="F")
-        symmetric_columns(self._base, self.size, index, columns)
-        product = columns @ jacobian.T
+        product = self._columns(index) @ jacobian.T
         if self._pending:
             factor = self._factor[: self.size, : self._pending]
             product -= factor @ (factor[index].T @ jacobian.T)
@@ -96,12 +90,7 @@ class JointCovariance:
     def move_pose(self, by_pose: FloatArray, noise: FloatArray) -> None:
         """The pose moves: P becomes F P F^T + Q, F the identity except for the pose.
 
-        Parameters
-        ----------
-        by_pose : (3, 3) array
-            F's block of the pose.
-        noise : (3, 3) array
-            Q's block of the pose.
+        Takes `by_pose` (3, 3), `noise` (3, 3).
         """
         base, size = self._base, self.size
         base[POSE_SIZE:size, :POSE_SIZE] = base[POSE_SIZE:size, :POSE_SIZE] @ by_pose.T
@@ -115,26 +104,8 @@ class JointCovariance:
     ) -> tuple[FloatArray, float]:
         """Subtract K S K^T.
 
-        Parameters
-        ----------
-        projected : (size, m) array
-            P H^T, see `projected`.
-        innovation_covariance : (m, m) array
-            S = H P H^T + R.
-        innovation : (m,) array
-            Measured minus predicted.
-
-        Returns
-        -------
-        change : (size,) float64
-            K times the innovation: what the state changes by.
-        squared : float
-            The innovation squared, normalised by S.
-
-        Raises
-        ------
-        SlamError
-            If S is not positive definite.
+        Takes `projected` (size, m), `innovation_covariance` (m, m), `innovation` (m,); returns
+        `change`, `squared`.
         """
         try:
             root = np.linalg.cholesky(innovation_covariance)
@@ -159,19 +130,7 @@ class JointCovariance:
     def append(self, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> int:
         """Add numbers that depend on the state and on a measurement.
 
-        Parameters
-        ----------
-        index : (k,) int64 array
-            Indices of the state that they depend on.
-        jacobian : (d, k) array
-            Their derivative by that.
-        noise : (d, d) array
-            Covariance that the measurement adds.
-
-        Returns
-        -------
-        int
-            Where they begin in the state.
+        Takes `index` (k,), `jacobian` (d, k), `noise` (d, d).
         """
         first = self.size
         self._make_room(first + len(jacobian))
@@ -181,15 +140,23 @@ class JointCovariance:
 
     def replace(self, first: int, index: IntArray, jacobian: FloatArray, noise: FloatArray) -> None:
         """Replace numbers from `first` on by others; see `append`."""
-        count, size = len(jacobian), self.size
-        columns = np.empty((size, len(index)), order="F")
-        symmetric_columns(self._base, size, index, columns)
-        rows = jacobian @ columns.T
+        count = len(jacobian)
+        rows = jacobian @ self._columns(index).T
         own = rows[:, index] @ jacobian.T + noise
         rows[:, first : first + count] = 0.5 * (own + own.T)
-        set_symmetric_rows(self._base, size, first, rows)
+        for r, row in enumerate(rows, first):
+            self._base[r, : r + 1] = row[: r + 1]
+            self._base[r + 1 : self.size, r] = row[r + 1 :]
         factor = self._factor[:, : self._pending]
         factor[first : first + count] = jacobian @ factor[index]
+
+    def _columns(self, index: IntArray) -> FloatArray:
+        """Columns of B: (size, k)."""
+        columns = np.empty((self.size, len(index)), order="F")
+        for k, c in enumerate(index.tolist()):
+            columns[:c, k] = self._base[c, :c]
+            columns[c:, k] = self._base[c : self.size, c]
+        return columns
 
     def _settle(self) -> None:
         """Subtract W W^T from B."""

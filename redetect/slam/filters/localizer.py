@@ -17,19 +17,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.landmarks.map_file import LandmarkMap, Path2D
+from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
+from redetect.slam.filters.association import Associator, run_filter
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     FilterRun,
     FrameRows,
     RowCount,
-    frames_of,
-    unknown,
 )
 from redetect.slam.models.motion import move, move_jacobians
-from redetect.slam.recording import Recording
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -108,14 +106,7 @@ class Localizer:
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns of the joint covariance of pose and map.
 
-        Parameters
-        ----------
-        index : (3 + 2 k,) int64 array
-            The pose, and then landmarks, of which each may be there several times.
-
-        Returns
-        -------
-        (3 + 2 k, 3 + 2 k) float64
+        Takes `index` (3 + 2 k,); returns (3 + 2 k, 3 + 2 k).
         """
         landmarks = index[_POSE_SIZE:] - _POSE_SIZE
         cross = self._cross[:, landmarks]
@@ -123,15 +114,7 @@ class Localizer:
         return np.block([[self.pose_covariance, cross], [cross.T, own]])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step.
-
-        Parameters
-        ----------
-        step : (3,) array
-            dx, dy (m), dphi (rad).
-        noise : (3, 3) array
-            Its covariance.
-        """
+        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
         by_pose, by_step = move_jacobians(self.pose, step)
         self._state[:_POSE_SIZE] = move(self.pose, step)
         if self._map_errors == "considered":
@@ -148,15 +131,6 @@ class Localizer:
         """Use the rows of a frame whose landmarks are in the map; the others are left out.
 
         A row of several lines measures the mean of their bearings.
-
-        Parameters
-        ----------
-        rows : FrameRows
-
-        Raises
-        ------
-        SlamError
-            If the covariance of the innovation is not positive definite.
         """
         discs = [k for k, number in enumerate(rows.disc_ids) if number in self.disc_slots]
         lines = [
@@ -204,7 +178,7 @@ class Localizer:
         used_discs, used_lines = set(discs), set(lines)
         for k, number in enumerate(rows.disc_ids):
             if k not in used_discs:
-                reason = "disc without ID" if unknown(number) else "disc not in the map"
+                reason = "disc without ID" if number == UNKNOWN_ID else "disc not in the map"
                 self.count.left_out[reason] += 1
         for k, numbers in enumerate(rows.line_ids):
             if k not in used_lines:
@@ -238,25 +212,4 @@ def run_localizer(
     SlamError
         If an update is not possible; the message names the step.
     """
-    pairing = associator or Associator()
-    poses = np.empty((len(recording) + 1, _POSE_SIZE))
-    covariance = np.empty((len(recording) + 1, _POSE_SIZE, _POSE_SIZE))
-    poses[0], covariance[0] = localizer.pose, localizer.pose_covariance
-    disc_ids: list[int] = []
-    line_ids: list[tuple[int, ...]] = []
-    for k, rows in enumerate(frames_of(recording)):
-        try:
-            localizer.predict(recording.steps[k], recording.step_covariance[k])
-            identified = pairing.identified(rows, localizer)
-            localizer.measure(identified)
-        except SlamError as error:
-            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
-        disc_ids.extend(identified.disc_ids)
-        line_ids.extend(identified.line_ids)
-        poses[k + 1], covariance[k + 1] = localizer.pose, localizer.pose_covariance
-    return FilterRun(
-        path=Path2D(("start", *recording.prefixes), poses, covariance),
-        count=localizer.count,
-        disc_ids=np.array(disc_ids, dtype=np.int64),
-        line_ids=tuple(line_ids),
-    )
+    return run_filter(recording, localizer, associator or Associator())

@@ -51,24 +51,7 @@ def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
 
 
 def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
-    """How far landmarks are from those of another map with the same identifiers.
-
-    Parameters
-    ----------
-    landmark_map, reference : LandmarkMap
-        Both in one frame.
-
-    Returns
-    -------
-    dict of str to float
-        Landmarks that are in both; root mean square, median and largest distance (m); and the
-        mean of the squared distance, normalised by the covariance of `landmark_map` alone, over 2.
-
-    Raises
-    ------
-    SlamError
-        If no landmark is in both.
-    """
+    """How far landmarks are from those of another map with the same identifiers."""
     offsets, covariances = [], []
     for some, others in (
         (landmark_map.discs, reference.discs),
@@ -91,20 +74,7 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
 
 
 def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) -> dict[str, object]:
-    """Content of the command's .json file.
-
-    Parameters
-    ----------
-    run : FilterRun
-    settings : dataclass
-        The command's flags.
-    distance : dict or None
-        See `path_distance`.
-
-    Returns
-    -------
-    dict
-    """
+    """Content of the command's .json file."""
     count = run.count
     figures: dict[str, object] = {
         "steps": len(run.path.poses) - 1,

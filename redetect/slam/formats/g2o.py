@@ -43,39 +43,17 @@ FRAME_COMMENT = "# FRAME"
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """A run with estimates of its poses and discs, in the data set's axes.
+    """A run with estimates of its poses and discs, in the data set's axes."""
 
-    Attributes
-    ----------
-    prefixes : tuple of N + 1 str
-        Name of each pose; of the start ``start``.
-    poses : (N + 1, 3) float64
-        Estimates: x, y (m), theta (rad).
-    disc_ids : (M,) int64
-        Identifiers, ascending.
-    discs : (M, 2) float64
-        Estimates (m).
-    steps : (N, 3) float64
-        dx, dy (m), dphi (rad) in the robot frame before each step.
-    step_covariance : (N, 3, 3) float64
-        Of `steps`.
-    circles : CircleRows
-        Measurements of discs, all with an identifier.
-    quality : (n,) float64
-        Of those rows; NaN where it is unknown.
-    unstated_steps : int
-        Steps whose covariance is an assumed one.
-    """
-
-    prefixes: tuple[str, ...]
-    poses: FloatArray
-    disc_ids: IntArray
-    discs: FloatArray
-    steps: FloatArray
-    step_covariance: FloatArray
-    circles: CircleRows
-    quality: FloatArray
-    unstated_steps: int = 0
+    prefixes: tuple[str, ...]  # name of each pose; of the start ``start``
+    poses: FloatArray  # (N + 1, 3): Estimates: x, y (m), theta (rad)
+    disc_ids: IntArray  # (M,): identifiers, ascending
+    discs: FloatArray  # (M, 2): estimates (m)
+    steps: FloatArray  # (N, 3): dx, dy (m), dphi (rad) in the robot frame before each step
+    step_covariance: FloatArray  # (N, 3, 3): of `steps`
+    circles: CircleRows  # measurements of discs, all with an identifier
+    quality: FloatArray  # (n,): of those rows; NaN where it is unknown
+    unstated_steps: int = 0  # steps whose covariance is an assumed one
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:
@@ -86,16 +64,7 @@ def first_disc_vertex(last_pose_vertex: int) -> int:
 def end_covariance(steps: FloatArray, covariance: FloatArray) -> FloatArray:
     """Covariances of steps in the axes at their end, as errors of SE(2) edges are measured.
 
-    Parameters
-    ----------
-    steps : (N, 3) float64
-        dx, dy (m), dphi (rad).
-    covariance : (N, 3, 3) float64
-        Of dx, dy in the axes before the step, and dphi.
-
-    Returns
-    -------
-    (N, 3, 3) float64
+    Takes `steps` (N, 3), `covariance` (N, 3, 3); returns (N, 3, 3).
     """
     return _in_turned_axes(covariance, steps[:, 2])
 
@@ -113,28 +82,7 @@ def write_g2o(
     comments: Sequence[str] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write a graph; numbers in full precision.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    graph : RunGraph
-        What is written.
-    axes : str
-        The axes to write it in.
-    comments : sequence of str
-        Lines for the file's end.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    SlamError
-        If a covariance cannot be inverted, or a disc's identifier is negative or too large.
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
+    """Write a graph; numbers in full precision."""
     write_text(path, list(_rows(graph, axes, comments)), overwrite=overwrite)
 
 
@@ -226,22 +174,8 @@ def covariances_of_graph(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariances in the data set's axes of the information matrices of a graph's edges.
 
-    Parameters
-    ----------
-    steps : (N, 3) float64
-        Steps in the graph's axes.
-    of_steps : (N, 3, 3) float64
-        Their information.
-    of_rows : (n, 2, 2) float64
-        Information of the measurements of discs.
-    axes : str
-        The graph's axes.
-
-    Returns
-    -------
-    step_covariance : (N, 3, 3) float64
-    covariance : (n, 2, 2) float64
-        Of the measurements.
+    Takes `steps` (N, 3), `of_steps` (N, 3, 3), `of_rows` (n, 2, 2); returns `step_covariance` (N,
+    3, 3), `covariance` (n, 2, 2).
     """
     spread = covariance_to_dataset(start_covariance(steps, inverse_of_3x3(of_steps)), axes)
     return spread, covariance_to_dataset(inverse_of_2x2(of_rows), axes)

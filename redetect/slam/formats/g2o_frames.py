@@ -37,29 +37,7 @@ def graph_of_frames(
     solution: Path | None = None,
     noise: OdometryNoise = ASSUMED,
 ) -> RunGraph:
-    """A run's steps and identified discs with estimates of poses and discs.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        The run. Of a row with several identifiers the first that is known counts.
-    name : str
-        What messages call its file.
-    solution : Path, optional
-        Folder with path.csv and map.csv; by default poses are odometry's, and each disc lies where
-        it was first seen.
-    noise : OdometryNoise
-        Of the steps that state no covariance.
-
-    Returns
-    -------
-    RunGraph
-
-    Raises
-    ------
-    SlamError
-        If a covariance is not positive definite, or the solution is not of this run.
-    """
+    """A run's steps and identified discs with estimates of poses and discs."""
     recording = recording_of_frames(frames, name, noise)
     if len(recording.lines):
         raise SlamError(
@@ -101,22 +79,7 @@ def graph_of_frames(
 
 
 def frames_of_graph(graph: RunGraph) -> list[Frame]:
-    """The rows of a graph's steps and measurements; a quality that is unknown becomes 1.
-
-    Parameters
-    ----------
-    graph : RunGraph
-        The graph.
-
-    Returns
-    -------
-    list of Frame
-
-    Raises
-    ------
-    redetect.landmarks.LandmarkError
-        If a number is not finite.
-    """
+    """The rows of a graph's steps and measurements; a quality that is unknown becomes 1."""
     spread = graph.step_covariance.copy()
     spread[np.abs(spread) < _LEAST_STEP_COVARIANCE] = 0.0
     rows = graph.circles
@@ -138,20 +101,7 @@ def frames_of_graph(graph: RunGraph) -> list[Frame]:
 
 
 def demand_readable(frames: Sequence[Frame], name: str) -> None:
-    """Refuse values that the digits of a landmark file cannot represent.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        What is to be written.
-    name : str
-        What messages call its source.
-
-    Raises
-    ------
-    SlamError
-        If the rows as written could not be worked on: a covariance is no longer positive definite.
-    """
+    """Refuse values that the digits of a landmark file cannot represent."""
     again = []
     for frame in frames:
         step = parse_record(format_record(frame.step))
@@ -165,24 +115,7 @@ def demand_readable(frames: Sequence[Frame], name: str) -> None:
 
 
 def poses_of_run(recording: Recording, solution: Path | None) -> Path2D:
-    """Poses of a run: odometry's, or those of a solution.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    solution : Path, optional
-        Folder with path.csv.
-
-    Returns
-    -------
-    Path2D
-
-    Raises
-    ------
-    SlamError
-        If the solution is not of this run.
-    """
+    """Poses of a run: odometry's, or those of a solution."""
     prefixes = ("start", *recording.prefixes)
     if solution is None:
         return Path2D(prefixes, chain_steps(recording.steps))

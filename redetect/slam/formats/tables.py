@@ -44,26 +44,7 @@ def write_odometry(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a run's steps: columns as `ODOMETRY_COLUMNS`, steps counted from 1.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    recording : Recording
-        The run, in the data set's axes.
-    axes : str
-        The axes to write it in.
-    comments : sequence of str
-        Lines for the head.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
+    """Write a run's steps: columns as `ODOMETRY_COLUMNS`, steps counted from 1."""
     steps = from_dataset(recording.steps, axes)
     before = covariance_from_dataset(recording.step_covariance, axes)
     triangle = np.triu_indices(3)
@@ -109,20 +90,7 @@ def write_bearings(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write the bearings of verticals that have identifiers: columns as `BEARING_COLUMNS`.
-
-    Parameters
-    ----------
-    path, recording, axes, comments, overwrite
-        As for `write_odometry`.
-    camera_xy : (2,) array_like
-        Where in the robot frame, in the data set's axes, bearings are taken from (m).
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
+    """Write the bearings of verticals that have identifiers: columns as `BEARING_COLUMNS`."""
     some = recording.lines
     camera = from_dataset(camera_xy, axes).tolist()
     rows = [

@@ -33,13 +33,7 @@ def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: 
 
 
 def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
-    """Rows of a text file with their line numbers, without blank ones; comments are among them.
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read or is too large, or a row is too long.
-    """
+    """Rows of a text file with their line numbers, without blank ones; comments are among them."""
     place = Path(path)
     try:
         if place.stat().st_size > _LARGEST_FILE_BYTES:

@@ -35,29 +35,7 @@ def write_tum(
     comments: Sequence[str] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write a path as a TUM trajectory.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    poses : Path2D
-        The path, in the data set's axes. Its covariance has no place in the format.
-    times : mapping of str to float, optional
-        Times of the poses (s), by their names; the others, like the start, are left out. By default
-        t is the number of the step.
-    axes : str
-        The axes to write it in.
-    comments : sequence of str
-        Lines for the head.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
+    """Write a path as a TUM trajectory."""
     rows = [
         *(f"# {comment}" for comment in comments),
         f"{AXES_COMMENT} {axes} ({MEANING[axes]})",
@@ -75,22 +53,7 @@ def write_tum(
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Read a file of times.
-
-    Parameters
-    ----------
-    path : path
-        Rows ``name seconds`` between blanks or commas.
-
-    Returns
-    -------
-    dict of str to float
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read or has other rows.
-    """
+    """Read a file of times."""
     times = {}
     for line, text in text_rows(path):
         words = text.partition("#")[0].replace(",", " ").split()

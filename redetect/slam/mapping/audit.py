@@ -19,12 +19,13 @@ from scipy.sparse.linalg import SuperLU
 from scipy.stats import chi2
 
 from camera import Camera
+from redetect.least_squares.solver import factor
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
 from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.mapping.solve import factor, normal_equations, solve
+from redetect.slam.mapping.solve import equations_at, solve
 from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
@@ -46,51 +47,27 @@ _LEAST_PROBABILITY = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Rows of one identifier in neighbouring frames that contradict the rest.
+    """Rows of one identifier in neighbouring frames that contradict the rest."""
 
-    Attributes
-    ----------
-    rows : (k,) int64
-        Which rows of the recording's discs.
-    id : int
-        Their identifier in the file.
-    kind : "exchange", "split" or "drop"
-        Whether they show another landmark, one of their own, or nothing that could be said.
-    new_id : int
-        That landmark; -1 for `drop`.
-    xy : (k, 2) float64
-        Where the rows lie in the map (m).
-    own_m : float
-        How far the median of these is from the landmark of that identifier.
-    row_chi_squared : (k,) float64
-        Squared error of each row against the map without any of the suspects.
-    chi_squared, mended_chi_squared : float
-        Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
-    """
-
-    rows: IntArray
-    id: int
+    rows: IntArray  # (k,): which rows of the recording's discs
+    id: int  # their identifier in the file
+    # Whether they show another landmark, one of their own, or nothing that could be said.
     kind: Kind
-    new_id: int
-    xy: FloatArray
-    own_m: float
+    new_id: int  # that landmark; -1 for `drop`
+    xy: FloatArray  # (k, 2): where the rows lie in the map (m)
+    own_m: float  # how far the median of these is from the landmark of that identifier
+    # (k,): squared error of each row against the map without any of the suspects.
     row_chi_squared: FloatArray
+    # Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
     chi_squared: float
     mended_chi_squared: float
 
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """What contradicts, and chi-squared with all rows, without those, and with identifiers mended.
+    """What contradicts; chi-squared with all rows, without those, with mended identifiers."""
 
-    Attributes
-    ----------
-    groups : tuple of Group
-        By frame.
-    before, dropped, mended : ChiSquared
-    """
-
-    groups: tuple[Group, ...]
+    groups: tuple[Group, ...]  # by frame
     before: ChiSquared
     dropped: ChiSquared
     mended: ChiSquared
@@ -115,30 +92,7 @@ def audit_run(
     gate: float = 100.0,
     name: str = "run",
 ) -> Audit:
-    """Find the rows whose identifier contradicts the rest.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run, without lines.
-    camera : Camera, optional
-        As calibrated.
-    calibrate : bool
-        Estimate the camera's mounting as well.
-    gate : float
-        Squared error, in units of its covariance, from which on a row contradicts.
-    name : str
-        What messages call the run.
-
-    Returns
-    -------
-    Audit
-
-    Raises
-    ------
-    SlamError
-        If the run has lines; else as `map_run`.
-    """
+    """Find the rows whose identifier contradicts the rest."""
     if len(recording.lines):
         raise SlamError(f"{name}: has lines: expected discs, the only ones that are audited")
     plain = Weighting(calibrate=calibrate, row_errors="recorded")
@@ -189,7 +143,7 @@ def _fit(
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
     estimate = solve(graph, first, weighting, tolerance=1e-7).estimate
-    equations = normal_equations(linearise(graph, estimate, weighting))
+    equations = equations_at(graph, estimate, weighting)
     table = chi_squared(graph, estimate, weighting)
     return _Fit(graph, estimate, weighting, factor(equations.matrix), table)
 

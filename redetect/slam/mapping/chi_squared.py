@@ -13,61 +13,28 @@ from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, erro
 
 @dataclass(frozen=True)
 class ChiSquared:
-    """How large the errors are, and how large they should be.
+    """How large the errors are, and how large they should be."""
 
-    Attributes
-    ----------
-    poses : int
-        p: the start and one per step.
-    landmarks : int
-        n: discs and lines.
-    steps : int
-        t: odometry measurements, the start's pose counted as one.
-    measurements : int
-        m: landmark rows used.
-    odometry, discs, lines, tilt : float
-        Parts of chi-squared.
-    chi_squared : float
-        Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
-    expected : int
-        dim(z) - dim(x): numbers measured less numbers estimated.
-    factor : float
-        chi_squared / expected: the variances' factor that would make both equal; NaN where nothing
-        is measured twice.
-    root : float
-        Its root: the standard deviations' factor.
-    """
-
-    poses: int
-    landmarks: int
-    steps: int
-    measurements: int
+    poses: int  # p: the start and one per step
+    landmarks: int  # n: discs and lines
+    steps: int  # t: odometry measurements, the start's pose counted as one
+    measurements: int  # m: landmark rows used
+    # Parts of chi-squared.
     odometry: float
     discs: float
     lines: float
     tilt: float
+    # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
     chi_squared: float
-    expected: int
+    expected: int  # dim(z) - dim(x): numbers measured less numbers estimated
+    # chi_squared / expected: the variances' factor that would make both equal; NaN where nothing is
+    # measured twice.
     factor: float
-    root: float
+    root: float  # its root: the standard deviations' factor
 
 
 def chi_squared(graph: Graph, estimate: Estimate, weighting: Weighting) -> ChiSquared:
-    """Tabulate the squared errors of an estimate.
-
-    Parameters
-    ----------
-    graph : Graph
-        The measurements.
-    estimate : Estimate
-        Where to evaluate them.
-    weighting : Weighting
-        What was unknown. Its loss does not matter: every row counts in full.
-
-    Returns
-    -------
-    ChiSquared
-    """
+    """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
     parts = [
         float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines, error.tilt)

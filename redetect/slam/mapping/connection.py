@@ -21,15 +21,7 @@ FEWEST_SHARED = 2
 def lost_steps(step_covariance: FloatArray) -> IntArray:
     """Steps whose odometry gives no information.
 
-    Parameters
-    ----------
-    step_covariance : (N, 3, 3) float64
-        Of (dx, dy, dphi).
-
-    Returns
-    -------
-    (L,) int64
-        Ascending from 0.
+    Takes `step_covariance` (N, 3, 3); returns (L,).
     """
     way = np.linalg.eigvalsh(step_covariance[:, :2, :2])[:, -1]
     lost = (way > MOST_STEP_SIGMA_M**2) | (step_covariance[:, 2, 2] > MOST_STEP_SIGMA_RAD**2)
@@ -37,20 +29,7 @@ def lost_steps(step_covariance: FloatArray) -> IntArray:
 
 
 def check_connected(recording: Recording, name: str) -> None:
-    """See that landmarks join the parts between which odometry is lost.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    name : str
-        What messages call it.
-
-    Raises
-    ------
-    SlamError
-        If a part shares fewer than two landmarks with the others.
-    """
+    """See that landmarks join the parts between which odometry is lost."""
     lost = lost_steps(recording.step_covariance)
     if len(lost) == 0:
         return

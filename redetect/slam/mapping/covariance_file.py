@@ -14,17 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.landmarks.map_file import LandmarkMap
+from redetect.least_squares.covariance import chosen_covariance
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.mapping.graph_terms import Weighting, layout_of, linearise
-from redetect.slam.mapping.solve import factor, normal_equations
+from redetect.slam.mapping.graph_terms import Weighting, layout_of
+from redetect.slam.mapping.solve import equations_at
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_plain_array
 
 FloatArray = NDArray[np.float64]
 
-# Columns of the inverse that are computed at once.
-_CHUNK = 128
 # Both files are written in full precision; sums may be in another order.
 _SMALL_BYTES = 1 << 20
 _SAME = 1e-6
@@ -129,22 +128,10 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
         If the measurements do not determine the unknowns.
     """
     layout = layout_of(graph, weighting)
-    equations = normal_equations(linearise(graph, estimate, weighting))
-    wanted = np.arange(layout.first_disc, layout.size)
-    covariance = np.empty((len(wanted), len(wanted)))
+    landmarks = np.arange(layout.first_disc, layout.size)
     try:
-        factored = factor(equations.matrix)
-        for first in range(0, len(wanted), _CHUNK):
-            some = wanted[first : first + _CHUNK]
-            unit = np.zeros((layout.size, len(some)))
-            unit[some, np.arange(len(some))] = 1.0
-            covariance[:, first : first + len(some)] = factored.solve(unit)[wanted]
-        if equations.corner.size:
-            eliminated = factored.solve(equations.border)
-            mounting = np.linalg.inv(equations.corner - equations.border.T @ eliminated)
-            covariance += eliminated[wanted] @ mounting @ eliminated[wanted].T
-    except (RuntimeError, np.linalg.LinAlgError):
+        return chosen_covariance(equations_at(graph, estimate, weighting), landmarks)
+    except np.linalg.LinAlgError:
         raise SlamError(
             "covariances: the measurements do not determine all poses and landmarks"
         ) from None
-    return np.asarray(0.5 * (covariance + covariance.T))

@@ -47,6 +47,8 @@ class Graph:
         Where in the robot frame bearings are taken from (m).
     camera : Camera or None
         As calibrated; it is needed where the mounting or a tilt is estimated.
+    line_prior : (K, 2) float64 or None
+        Where lines are believed to be (m): it bounds those that bearings leave open.
     """
 
     steps: FloatArray
@@ -64,6 +66,7 @@ class Graph:
     member_line: IntArray
     camera_xy: FloatArray
     camera: Camera | None = None
+    line_prior: FloatArray | None = None
 
     @property
     def disc_row_counts(self) -> IntArray:
@@ -158,19 +161,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
 def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
     """The problem with the bearings of some lines.
 
-    Parameters
-    ----------
-    graph : Graph
-        Without lines.
-    rows : LineRows
-        All rows of lines. One that shows a line other than those to be estimated, or none that is
-        known, is left out.
-    line_ids : (K,) int64
-        The lines to be estimated, ascending.
-
-    Returns
-    -------
-    Graph
+    Takes `line_ids` (K,).
     """
     place = {int(number): k for k, number in enumerate(line_ids)}
     usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from redetect.landmarks import wrap_angle
+from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.models.measurement import (
@@ -33,12 +32,13 @@ from redetect.storage.bounds import ABOVE_0, Bounds, demand
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Loss = Literal["none", "huber", "cauchy", "geman-mcclure"]
 RowErrors = Literal["corrected", "recorded"]
 
 #: Rotation about robot x, y, z, and height.
 MOUNTING_UNKNOWNS = 4
 
+#: Standard deviation of where lines are believed to be, if anywhere (m).
+LINE_PRIOR_M = 3.0
 
 _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
 
@@ -65,7 +65,7 @@ class Weighting:
         are compared as recorded.
     """
 
-    loss: Loss = "none"
+    loss: LossKind = "none"
     loss_scale: float = 3.0
     calibrate: bool = False
     row_errors: RowErrors = "corrected"
@@ -122,28 +122,22 @@ class Errors:
         NaN where a disc would be out of the camera's sight.
     lines : (q,) float64
     tilt : (N, 2) or (0, 2) float64
+    prior : (K, 2) or (0, 2) float64
+        Lines less where they are believed to be.
     """
 
     odometry: FloatArray
     discs: FloatArray
     lines: FloatArray
     tilt: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Blocks:
-    """Dense pieces (b, h, w) of a Jacobian at rows and columns (b,)."""
-
-    row: IntArray
-    column: IntArray
-    values: FloatArray
+    prior: FloatArray
 
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
     """Whitened errors at an estimate: predicted minus measured, in standard deviations."""
     step = relative_pose(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
     step[:, 2] = wrap_angle(step[:, 2])
-    tilt = np.zeros((0, 2))
+    tilt, near = np.zeros((0, 2)), graph.line_prior
     if estimate.tilt is not None and weighting.tilt_sigma_rad > 0.0:
         tilt = estimate.tilt[1:] / weighting.tilt_sigma_rad
     return Errors(
@@ -151,110 +145,55 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
         discs=_apply(graph.disc_whitening, _disc_errors(graph, estimate, weighting)),
         lines=_bearing_errors(graph, estimate),
         tilt=tilt,
+        prior=np.zeros((0, 2)) if near is None else (estimate.line_xy - near) / LINE_PRIOR_M,
     )
-
-
-def robust(squared: FloatArray, weighting: Weighting) -> tuple[FloatArray, FloatArray]:
-    """Costs of rows under the loss, and their weights in the equivalent least squares.
-
-    Parameters
-    ----------
-    squared : (n,) float64
-        Squared errors of rows in units of their variance.
-    weighting : Weighting
-        The loss: Huber, Cauchy (Lorentzian) or Geman-McClure; all are the square near 0.
-
-    Returns
-    -------
-    cost, weight : (n,) float64
-        The weight is the cost's derivative by the square.
-    """
-    c2 = weighting.loss_scale**2
-    if weighting.loss == "huber":
-        far = squared > c2
-        root = np.sqrt(np.where(far, squared, c2))
-        scale = weighting.loss_scale
-        return np.where(far, 2.0 * scale * root - c2, squared), np.where(far, scale / root, 1.0)
-    if weighting.loss == "cauchy":
-        return c2 * np.log1p(squared / c2), 1.0 / (1.0 + squared / c2)
-    if weighting.loss == "geman-mcclure":
-        return squared * c2 / (c2 + squared), (c2 / (c2 + squared)) ** 2
-    return squared, np.ones_like(squared)
 
 
 def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
     """The function to minimise; infinite if a disc would be out of the camera's sight."""
     error = errors(graph, estimate, weighting)
-    discs, _ = robust(np.sum(error.discs**2, axis=1), weighting)
-    lines, _ = robust(error.lines**2, weighting)
-    total = float(np.sum(error.odometry**2) + np.sum(discs) + np.sum(lines) + np.sum(error.tilt**2))
-    return total if np.isfinite(total) else float("inf")
+    loss = Loss(weighting.loss, weighting.loss_scale)
+    return robust_cost(
+        [
+            (error.odometry, Loss()),
+            (error.discs, loss),
+            (error.lines[:, None], loss),
+            (error.tilt, Loss()),
+            (error.prior, Loss()),
+        ]
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """A linear least-squares problem: the change x, m of the unknowns least in ``|J x + B m + r|``.
+def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
+    """The problem near an estimate, its unknowns as in `Layout`; shared is the mounting.
 
-    Attributes
-    ----------
-    residual : (R,) float64
-    jacobian : (R, K) sparse
-        By all unknowns but the mounting, in the order of `Layout`.
-    border : (R, 4) or (R, 0) float64
-        By the mounting: a rotation vector in the robot frame, applied from the left, and height.
+    The mounting changes by a rotation vector in the robot frame, applied from the left, and height.
     """
-
-    residual: FloatArray
-    jacobian: sparse.csr_array
-    border: FloatArray
-
-
-def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linearised:
-    """The problem near an estimate; robust losses as reweighted least squares."""
     layout = layout_of(graph, weighting)
     error = errors(graph, estimate, weighting)
-    disc_root = np.sqrt(robust(np.sum(error.discs**2, axis=1), weighting)[1])
-    line_root = np.sqrt(robust(error.lines**2, weighting)[1])
-    first_disc_row = 3 * len(graph.steps)
-    first_line_row = first_disc_row + 2 * len(graph.disc_pose)
-    first_tilt_row = first_line_row + len(graph.line_pose)
-    rows = first_tilt_row + error.tilt.size
-
-    by_pose, by_tilt, by_disc, by_mounting = _disc_blocks(graph, estimate, weighting)
-    scale = disc_root[:, None, None]
-    row = first_disc_row + 2 * np.arange(len(graph.disc_pose), dtype=np.int64)
+    loss = Loss(weighting.loss, weighting.loss_scale)
+    by_first, by_second = relative_pose_jacobians(estimate.poses[:-1], estimate.poses[1:])
+    step = 3 * np.arange(len(graph.steps), dtype=np.int64)
+    by_pose, by_tilt, by_disc, by_mounting = _disc_derivatives(graph, estimate, weighting)
+    of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
+    seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
+    if layout.tilted:
+        seen.append((layout.first_tilt + 2 * (graph.disc_pose - 1), by_tilt))
+    whiten = graph.step_whitening
     blocks = [
-        *_odometry_blocks(graph, estimate),
-        *_pose_blocks(row, graph.disc_pose, by_pose * scale),
-        _Blocks(row, layout.first_disc + 2 * graph.disc_index, by_disc * scale),
-        *_line_blocks(graph, estimate, layout, line_root, first_line_row),
+        Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
+        Block(error.discs, seen, by_mounting if weighting.calibrate else None, loss),
+        *_line_blocks(graph, estimate, weighting, error.lines, loss),
     ]
     if layout.tilted:
-        blocks.append(_Blocks(row, layout.first_tilt + 2 * (graph.disc_pose - 1), by_tilt * scale))
         every = np.arange(error.tilt.size, dtype=np.int64)
         level = np.full((len(every), 1, 1), 1.0 / weighting.tilt_sigma_rad)
-        blocks.append(_Blocks(first_tilt_row + every, layout.first_tilt + every, level))
-    border = np.zeros((rows, MOUNTING_UNKNOWNS if weighting.calibrate else 0))
-    if weighting.calibrate:
-        border[first_disc_row:first_line_row] = (by_mounting * scale).reshape(-1, 4)
-        if estimate.mounting is not None and graph.camera is not None:
-            # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-            # turned to the left sees landmarks further to the right than they are.
-            _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
-            lines = -(line_root / graph.bearing_sigma_rad)[:, None] * by_turn
-            border[first_line_row:first_tilt_row] = lines
-    return Linearised(
-        residual=np.concatenate(
-            [
-                error.odometry.ravel(),
-                (error.discs * disc_root[:, None]).ravel(),
-                error.lines * line_root,
-                error.tilt.ravel(),
-            ]
-        ),
-        jacobian=_sparse(blocks, (rows, layout.size)),
-        border=border,
-    )
+        blocks.append(Block(error.tilt.reshape(-1, 1), [(layout.first_tilt + every, level)]))
+    if len(error.prior):
+        of_line = layout.first_line + 2 * np.arange(layout.lines, dtype=np.int64)
+        near = np.tile(np.eye(2) / LINE_PRIOR_M, (layout.lines, 1, 1))
+        blocks.append(Block(error.prior, [(of_line, near)]))
+    return stack(blocks, layout.size, MOUNTING_UNKNOWNS if weighting.calibrate else 0)
 
 
 def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -288,7 +227,7 @@ def _seen_discs(graph: Graph, estimate: Estimate) -> FloatArray:
     return disc_in_robot(estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index])
 
 
-def _disc_blocks(
+def _disc_derivatives(
     graph: Graph, estimate: Estimate, weighting: Weighting
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Derivatives of whitened disc errors by pose, tilt, disc and mounting."""
@@ -332,43 +271,33 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
 
 
 def _line_blocks(
-    graph: Graph, estimate: Estimate, layout: Layout, root: FloatArray, first_row: int
-) -> Iterator[_Blocks]:
+    graph: Graph, estimate: Estimate, weighting: Weighting, error: FloatArray, loss: Loss
+) -> list[Block]:
+    """A row's derivatives are those of all its lines."""
     if len(graph.line_pose) == 0:
-        return
+        return []
+    layout = layout_of(graph, weighting)
     pose, share = _members(graph)
     by_pose, by_line = bearing_jacobians(
         estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
     )
-    scale = share * (root / graph.bearing_sigma_rad)[graph.member_row]
-    row = first_row + graph.member_row
-    yield from _pose_blocks(row, pose, by_pose[:, None, :] * scale[:, None, None])
-    yield _Blocks(
-        row, layout.first_line + 2 * graph.member_line, by_line[:, None, :] * scale[:, None, None]
-    )
-
-
-def _odometry_blocks(graph: Graph, estimate: Estimate) -> Iterator[_Blocks]:
-    by_first, by_second = relative_pose_jacobians(estimate.poses[:-1], estimate.poses[1:])
-    step = np.arange(len(graph.steps), dtype=np.int64)
-    yield from _pose_blocks(3 * step, step, graph.step_whitening @ by_first)
-    yield from _pose_blocks(3 * step, step + 1, graph.step_whitening @ by_second)
-
-
-def _pose_blocks(row: IntArray, pose: IntArray, values: FloatArray) -> Iterator[_Blocks]:
-    """Derivatives by poses; the first pose is no unknown."""
-    free = pose > 0
-    yield _Blocks(row[free], 3 * (pose[free] - 1), values[free])
-
-
-def _sparse(blocks: list[_Blocks], shape: tuple[int, int]) -> sparse.csr_array:
-    values, rows, columns = [], [], []
-    for block in blocks:
-        _, height, width = block.values.shape
-        row = block.row[:, None, None] + np.arange(height, dtype=np.int64)[:, None]
-        column = block.column[:, None, None] + np.arange(width, dtype=np.int64)
-        values.append(block.values.ravel())
-        rows.append(np.broadcast_to(row, block.values.shape).ravel())
-        columns.append(np.broadcast_to(column, block.values.shape).ravel())
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(entries, shape=shape)
+    scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
+    by_pose, by_line = by_pose * scale, by_line * scale
+    shared = None
+    if weighting.calibrate and estimate.mounting is not None and graph.camera is not None:
+        # Rows' bearings were put into the robot frame as calibrated: a camera that is really
+        # turned to the left sees landmarks further to the right than they are.
+        _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
+        shared = (-by_turn / graph.bearing_sigma_rad[:, None])[:, None, :]
+    # The k-th line of each row; rows of fewer lines have none there.
+    order = np.argsort(graph.member_row, kind="stable")
+    count = np.bincount(graph.member_row, minlength=len(graph.line_pose))
+    start = np.cumsum(count) - count
+    of_row = np.zeros((len(count), 3))
+    np.add.at(of_row, graph.member_row, by_pose)
+    by = [(3 * (graph.line_pose - 1), of_row[:, None, :])]
+    for k in range(int(count.max())):
+        member = order[start + np.minimum(k, count - 1)]
+        first = layout.first_line + 2 * graph.member_line[member]
+        by.append((np.where(k < count, first, -1), by_line[member][:, None, :]))
+    return [Block(error[:, None], by, shared, loss)]

@@ -26,21 +26,11 @@ _LOCAL_PATH_M = 15.0
 
 @dataclass(frozen=True, eq=False)
 class InitialLines:
-    """Lines that can be placed, and the others.
+    """Lines that can be placed, and the others."""
 
-    Attributes
-    ----------
-    ids : (K,) int64
-        Lines that can be placed, ascending.
-    xy : (K, 2) float64
-        Their positions in the map (m).
-    unplaced : (U,) int64
-        Lines never seen, alone in a row, under enough parallax.
-    """
-
-    ids: IntArray
-    xy: FloatArray
-    unplaced: IntArray
+    ids: IntArray  # (K,): lines that can be placed, ascending
+    xy: FloatArray  # (K, 2): their positions in the map (m)
+    unplaced: IntArray  # (U,): lines never seen, alone in a row, under enough parallax
 
 
 def place_lines(
@@ -56,20 +46,7 @@ def place_lines(
     line is triangulated from its views along some metres of path from its first sight on; if they
     have too little parallax, from all of its views.
 
-    Parameters
-    ----------
-    poses : (N + 1, 3) float64
-        The start and the pose after each step.
-    rows : LineRows
-        All rows of lines.
-    camera_xy : (2,) float64
-        Where in the robot frame bearings are taken from (m).
-    least_parallax_rad : float
-        Least angle between some two rays.
-
-    Returns
-    -------
-    InitialLines
+    Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
     views: dict[int, list[int]] = {}
@@ -106,17 +83,7 @@ def place_lines(
 def well_placed(graph: Graph, estimate: Estimate) -> NDArray[np.bool_]:
     """Which lines of an estimate the bearings of its poses place.
 
-    Parameters
-    ----------
-    graph : Graph
-        With lines.
-    estimate : Estimate
-
-    Returns
-    -------
-    (K,) bool
-        False for lines whose place is less certain than `MOST_SIGMA_M`, or that lie behind the
-        camera in most of their rows.
+    Returns (K,).
     """
     line, row = graph.member_line, graph.member_row
     pose = estimate.poses[graph.line_pose[row]]
@@ -141,22 +108,7 @@ def triangulate(
 ) -> FloatArray | None:
     """The place nearest to rays.
 
-    Parameters
-    ----------
-    poses : (n, 3) float64
-        Where the rays were taken.
-    bearing_rad, sigma_rad : (n,) float64
-        Their bearings in the robot frame.
-    camera_xy : (2,) float64
-        Where in the robot frame they begin (m).
-    least_parallax_rad : float
-        Least angle between some two rays.
-
-    Returns
-    -------
-    (2,) float64 or None
-        None where no two rays cross under that angle, or most of them miss the place or have it
-        behind them.
+    Takes `poses` (n, 3), `bearing_rad, sigma_rad` (n,), `camera_xy` (2,); returns (2,).
     """
     theta = poses[:, 2]
     cos, sin = np.cos(theta), np.sin(theta)

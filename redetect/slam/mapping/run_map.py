@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.least_squares.solver import LossKind
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
 from redetect.slam.mapping.connection import check_connected
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import Loss, Weighting
+from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.marginals import Marginals, marginals
-from redetect.slam.mapping.solve import Solution, solve
+from redetect.slam.mapping.solve import Marginals, Solution, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -36,43 +36,24 @@ _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Rows and landmarks that a map cannot use, or cannot check.
-
-    Attributes
-    ----------
-    rows_without_id : int
-    discs_seen_once : int
-        They are in the map, but nothing checks them.
-    lines_without_parallax : int
-        Lines never seen, alone in a row, under enough parallax, or that do not stay placed.
-    line_rows : int
-        Rows of lines that show one of those.
-    """
+    """Rows and landmarks that a map cannot use, or cannot check."""
 
     rows_without_id: int
-    discs_seen_once: int
+    discs_seen_once: int  # they are in the map, but nothing checks them
+    # Lines never seen, alone in a row, under enough parallax, or that do not stay placed.
     lines_without_parallax: int
-    line_rows: int
+    line_rows: int  # rows of lines that show one of those
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """A camera's mounting as the run has it.
+    """A camera's mounting as the run has it."""
 
-    Attributes
-    ----------
-    change : (4,) float64
-        Rotation vector in the robot frame (rad) and height (m), true less calibrated.
-    covariance : (4, 4) float64
-    robot_from_camera : (3, 4) float64
-    gain : float
-        By how much less the sum of squares is than with the mounting as calibrated.
-    """
-
+    # (4,): rotation vector in the robot frame (rad) and height (m), true less calibrated.
     change: FloatArray
-    covariance: FloatArray
-    robot_from_camera: FloatArray
-    gain: float
+    covariance: FloatArray  # (4, 4)
+    robot_from_camera: FloatArray  # (3, 4)
+    gain: float  # by how much less the sum of squares is than with the mounting as calibrated
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +221,7 @@ def _with_lines(
         ids, xy = ids[good], estimate.line_xy[good]
 
 
-def _descent(solver: Solver, loss: Loss) -> Callable[[Graph, Estimate, Weighting], Solution]:
+def _descent(solver: Solver, loss: LossKind) -> Callable[[Graph, Estimate, Weighting], Solution]:
     if solver == "gtsam":
         return solve_gtsam
     # A robust loss converges slowly at last: reweighting is no Newton's method.

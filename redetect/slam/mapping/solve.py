@@ -1,4 +1,4 @@
-"""Sparse Levenberg-Marquardt that solves for positions exactly while headings move.
+"""The least squares of a map, solving for positions exactly while headings move.
 
 With headings given, odometry and discs are linear in all positions. So each step of the headings is
 followed by the positions that fit them best (K. Khosoussi, S. Huang, G. Dissanayake, Exploiting the
@@ -12,66 +12,77 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial.transform import Rotation
 
+from redetect.least_squares.covariance import diagonal_blocks
+from redetect.least_squares.solver import (
+    Linear,
+    NormalEquations,
+    StartError,
+    factor,
+    minimise,
+    normal_equations,
+)
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.mapping.graph_terms import (
-    Layout,
-    Linearised,
-    Weighting,
-    cost,
-    layout_of,
-    linearise,
-)
-from redetect.slam.models.mounted_discs import rotation_exp
+from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
 from redetect.slam.models.mounting import nominal_mounting
 
 FloatArray = NDArray[np.float64]
 
-_FIRST_DAMPING = 1e-6
-_LEAST_DAMPING = 1e-12
-_LARGEST_DAMPING = 1e10
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a descent ended.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    cost : float
-        What was minimised: chi-squared, or less under a robust loss.
-    costs : tuple of float
-        At the start and after each step.
-    """
+    """Where a descent ended."""
 
     estimate: Estimate
-    cost: float
-    costs: tuple[float, ...]
+    cost: float  # what was minimised: chi-squared, or less under a robust loss
+    costs: tuple[float, ...]  # at the start and after each step
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """J^T J and J^T r, the mounting's unknowns apart because they touch every row.
+class Marginals:
+    """Covariance of each unknown, all others unknown too."""
 
-    Attributes
-    ----------
-    matrix : (K, K) sparse
-    gradient : (K,) float64
-    border : (K, 4) or (K, 0) float64
-        Between the mounting and the others.
-    corner : (4, 4) or (0, 0) float64
-    corner_gradient : (4,) or (0,) float64
-    """
+    poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
+    discs: FloatArray  # (M, 2, 2)
+    lines: FloatArray  # (K, 2, 2)
+    mounting: FloatArray | None  # (4, 4): of the rotation vector (rad) and the height (m)
 
-    matrix: sparse.csc_array
-    gradient: FloatArray
-    border: FloatArray
-    corner: FloatArray
-    corner_gradient: FloatArray
+
+@dataclass(frozen=True, eq=False)
+class _MapProblem:
+    """A graph as `redetect.least_squares.solver.minimise` takes it."""
+
+    graph: Graph
+    weighting: Weighting
+
+    def cost(self, at: Estimate) -> float:
+        return cost(self.graph, at, self.weighting)
+
+    def linear(self, at: Estimate) -> Linear:
+        return linearise(self.graph, at, self.weighting)
+
+    def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
+        return moved(at, layout_of(self.graph, self.weighting), step, shared)
+
+    def with_best_positions(self, trial: Estimate, reached: float) -> tuple[Estimate, float]:
+        """A trial with positions fitted to its headings, if that lowers the cost, and its cost."""
+        layout = layout_of(self.graph, self.weighting)
+        problem = self.linear(trial)
+        free = np.ones(layout.size, dtype=bool)
+        free[2 : layout.first_tilt : 3] = False
+        free[layout.first_tilt : layout.first_disc] = False
+        jacobian = problem.jacobian.tocsc()[:, np.flatnonzero(free)]
+        step = np.zeros(layout.size)
+        try:
+            normal = factor((jacobian.T @ jacobian).tocsc())
+        except np.linalg.LinAlgError:
+            return trial, reached
+        step[free] = -normal.solve(jacobian.T @ problem.residual)
+        fitted = moved(trial, layout, step, np.zeros(0))
+        fitted_cost = self.cost(fitted)
+        return (fitted, fitted_cost) if fitted_cost < reached else (trial, reached)
 
 
 def solve(
@@ -104,108 +115,64 @@ def solve(
     Raises
     ------
     SlamError
-        If the start is not finite, or the steps run out.
+        If the start is not finite, the steps run out, or the measurements do not determine the
+        unknowns.
     """
     estimate = _with_unknowns(graph, start, weighting)
-    lowest = cost(graph, estimate, weighting)
-    if not np.isfinite(lowest):
+    problem = _MapProblem(graph, weighting)
+    try:
+        found = minimise(
+            problem,
+            estimate,
+            tolerance=tolerance,
+            most_steps=most_steps,
+            refined=problem.with_best_positions,
+        )
+    except StartError:
         raise SlamError(
             "least squares cannot begin: a disc lies where the camera as mounted cannot see it"
-        )
-    layout = layout_of(graph, weighting)
-    damping = _FIRST_DAMPING
-    costs = [lowest]
-    for _ in range(most_steps):
-        before = lowest
-        equations = normal_equations(linearise(graph, estimate, weighting))
-        while damping < _LARGEST_DAMPING:
-            try:
-                step = damped_step(equations, damping)
-            except SlamError:
-                if 10.0 * damping >= _LARGEST_DAMPING:
-                    raise
-                damping *= 10.0
-                continue
-            trial = moved(estimate, layout, *step)
-            trial, trial_cost = _with_best_positions(graph, trial, weighting, layout)
-            if trial_cost < before:
-                estimate, lowest = trial, trial_cost
-                damping = max(damping / 10.0, _LEAST_DAMPING)
-                break
-            damping *= 10.0
-        costs.append(lowest)
-        if before - lowest <= tolerance * lowest:
-            return Solution(estimate, lowest, tuple(costs))
-    raise SlamError(
-        f"least squares: no minimum within {most_steps} steps: chi-squared is {lowest:.6g} and "
-        "falling"
-    )
-
-
-def normal_equations(problem: Linearised) -> NormalEquations:
-    """Normal equations of a linear least-squares problem."""
-    transposed = problem.jacobian.T
-    return NormalEquations(
-        matrix=(transposed @ problem.jacobian).tocsc(),
-        gradient=np.asarray(transposed @ problem.residual),
-        border=np.asarray(transposed @ problem.border),
-        corner=problem.border.T @ problem.border,
-        corner_gradient=problem.border.T @ problem.residual,
-    )
-
-
-def factor(matrix: sparse.csc_array, damping: float = 0.0) -> SuperLU:
-    """Factorise a positive definite matrix, its diagonal raised by a share of it."""
-    if damping > 0.0:
-        matrix = (matrix + sparse.diags_array(damping * matrix.diagonal())).tocsc()
-    return splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-
-
-def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Change of all unknowns but the mounting, and of the mounting.
-
-    Raises
-    ------
-    SlamError
-        If the measurements do not determine the unknowns.
-    """
-    try:
-        factored = factor(equations.matrix, damping)
-    except RuntimeError:
+        ) from None
+    except np.linalg.LinAlgError:
         raise SlamError(
             "least squares: the measurements do not determine all poses and landmarks"
         ) from None
-    step = -factored.solve(equations.gradient)
-    if equations.corner.size == 0:
-        return step, np.zeros(0)
-    eliminated = factored.solve(equations.border)
-    corner = equations.corner + damping * np.diag(np.diag(equations.corner))
-    mounting = np.linalg.solve(
-        corner - equations.border.T @ eliminated,
-        -equations.corner_gradient - equations.border.T @ step,
-    )
-    return step - eliminated @ mounting, mounting
+    if not found.converged:
+        raise SlamError(
+            f"least squares: no minimum within {most_steps} steps: chi-squared is "
+            f"{found.costs[-1]:.6g} and falling"
+        )
+    return Solution(found.at, found.costs[-1], found.costs)
+
+
+def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> NormalEquations:
+    """Normal equations of a map near an estimate."""
+    return normal_equations(linearise(graph, estimate, weighting))
+
+
+def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Marginals:
+    """Covariances of all poses and landmarks at a minimum of `solve`.
+
+    Under a robust loss, rows' information is multiplied by their weights. Raises `SlamError` if the
+    measurements do not determine the unknowns.
+    """
+    layout = layout_of(graph, weighting)
+    blocks = [
+        (3, np.arange(0, layout.first_tilt, 3)),
+        (2, np.arange(layout.first_disc, layout.first_line, 2)),
+        (2, np.arange(layout.first_line, layout.size, 2)),
+    ]
+    try:
+        found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
+    except np.linalg.LinAlgError:
+        raise SlamError(
+            "covariances: the measurements do not determine all poses and landmarks"
+        ) from None
+    poses = np.concatenate([np.zeros((1, 3, 3)), found[0]])
+    return Marginals(poses, found[1], found[2], shared if weighting.calibrate else None)
 
 
 def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:
-    """An estimate after a step.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Before.
-    layout : Layout
-        Layout of the step.
-    step : (K,) float64
-        Changes of all unknowns but the mounting.
-    mounting : (0,) or (4,) float64
-        Rotation vector in the robot frame, applied from the left, and change of height.
-    """
+    """An estimate after a step (K,) of all unknowns but the mounting, and (0,) or (4,) of that."""
     poses, tilt, discs, lines = np.split(
         step, [layout.first_tilt, layout.first_disc, layout.first_line]
     )
@@ -219,7 +186,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
         turned = np.concatenate([np.zeros((1, 2)), tilt.reshape(-1, 2)])
         after = replace(after, tilt=estimate.tilt + turned)
     if mounting.size and estimate.mounting is not None:
-        turn, _ = rotation_exp(mounting[:3])
+        turn = Rotation.from_rotvec(mounting[:3]).as_matrix()
         changed = np.concatenate([turn @ estimate.mounting[:, :3], estimate.mounting[:, 3:]], 1)
         changed[2, 3] += mounting[3]
         after = replace(after, mounting=changed)
@@ -240,27 +207,3 @@ def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estim
         if start.tilt is None:
             start = replace(start, tilt=np.zeros((len(start.poses), 2)))
     return start
-
-
-def _with_best_positions(
-    graph: Graph, trial: Estimate, weighting: Weighting, layout: Layout
-) -> tuple[Estimate, float]:
-    """A trial with positions fitted to its headings, if that lowers the cost, and its cost."""
-    reached = cost(graph, trial, weighting)
-    if not np.isfinite(reached):
-        return trial, reached
-    problem = linearise(graph, trial, weighting)
-    free = np.ones(layout.size, dtype=bool)
-    free[2 : layout.first_tilt : 3] = False
-    free[layout.first_tilt : layout.first_disc] = False
-    jacobian = problem.jacobian.tocsc()[:, np.flatnonzero(free)]
-    transposed = jacobian.T
-    try:
-        positions = -factor((transposed @ jacobian).tocsc()).solve(transposed @ problem.residual)
-    except RuntimeError:
-        return trial, reached
-    step = np.zeros(layout.size)
-    step[free] = positions
-    fitted = moved(trial, layout, step, np.zeros(0))
-    fitted_cost = cost(graph, fitted, weighting)
-    return (fitted, fitted_cost) if fitted_cost < reached else (trial, reached)

@@ -45,30 +45,7 @@ def solve_gtsam(
     tolerance: float = 1e-10,
     most_steps: int = 200,
 ) -> Solution:
-    """Minimise the sum of `redetect.slam.mapping.solve.solve` by GTSAM's Levenberg-Marquardt.
-
-    Parameters
-    ----------
-    graph : Graph
-        The measurements.
-    start : Estimate
-        Where to begin. From odometry over thousands of poses GTSAM does not arrive.
-    weighting : Weighting
-        What is minimised. Neither mounting nor tilt can be unknown here.
-    tolerance : float
-        Stop at a step that lowers the cost by less than this share of it.
-    most_steps : int
-        Largest number of steps before giving up.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    SlamError
-        If GTSAM is not installed, the mounting or a tilt is unknown, or the steps run out.
-    """
+    """Minimise the sum of `redetect.slam.mapping.solve.solve` by GTSAM's Levenberg-Marquardt."""
     gtsam = load_gtsam()
     if weighting.calibrate or weighting.tilt_sigma_rad > 0.0:
         raise SlamError(

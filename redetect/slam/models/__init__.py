@@ -2,6 +2,6 @@
 
 - `motion`: composition of poses.
 - `measurement`: discs and lines as a pose sees them.
-- `mounting`, `mounted_discs`: rows as a differently mounted camera would have written them.
+- `mounting`: rows as a differently mounted camera would have written them.
 - `odometry_noise`: assumed where a source states no covariance.
 """

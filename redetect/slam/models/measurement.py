@@ -42,15 +42,7 @@ def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Jacobians of `disc_in_robot` by the pose (J5) and by the disc's centre (J6).
 
-    Parameters
-    ----------
-    pose, disc_xy : array_like
-        As for `disc_in_robot`.
-
-    Returns
-    -------
-    by_pose : (..., 2, 3) float64
-    by_disc : (..., 2, 2) float64
+    Returns `by_pose` (..., 2, 3), `by_disc` (..., 2, 2).
     """
     robot = np.asarray(pose, dtype=np.float64)
     seen = disc_in_robot(pose, disc_xy)
@@ -67,16 +59,7 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 def disc_in_map(pose: ArrayLike, seen_xy: ArrayLike) -> FloatArray:
     """Inverse measurement model of a disc: where in the map it lies.
 
-    Parameters
-    ----------
-    pose : (..., 3) array_like
-        The robot's pose in the map.
-    seen_xy : (..., 2) array_like
-        The disc's centre in the robot frame (m).
-
-    Returns
-    -------
-    (..., 2) float64
+    Takes `pose` (..., 3), `seen_xy` (..., 2); returns (..., 2).
     """
     robot = np.asarray(pose, dtype=np.float64)
     seen = np.asarray(seen_xy, dtype=np.float64)
@@ -116,15 +99,7 @@ def bearing_jacobians(
 ) -> tuple[FloatArray, FloatArray]:
     """Jacobians of `bearing_of_vertical` by the pose and by the line's place (chain rule).
 
-    Parameters
-    ----------
-    pose, line_xy, camera_xy : array_like
-        As for `bearing_of_vertical`.
-
-    Returns
-    -------
-    by_pose : (..., 3) float64
-    by_line : (..., 2) float64
+    Returns `by_pose` (..., 3), `by_line` (..., 2).
     """
     seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
     squared = np.sum(seen**2, axis=-1)
@@ -135,32 +110,3 @@ def bearing_jacobians(
         np.asarray(np.einsum("...i,...ij->...j", by_seen, by_pose)),
         np.asarray(np.einsum("...i,...ij->...j", by_seen, by_line)),
     )
-
-
-def disc_of_range_and_bearing(
-    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
-) -> tuple[FloatArray, FloatArray]:
-    """Landmarks measured by range and bearing, as positions in the robot frame.
-
-    Parameters
-    ----------
-    range_m, bearing_rad : (n,) array_like
-        Distance (m), and bearing: 0 forward, positive to the left (rad).
-    sigma_m, sigma_rad : float
-        Standard deviations of both.
-
-    Returns
-    -------
-    xy : (n, 2) float64
-        Positions (m).
-    covariance : (n, 2, 2) float64
-        J R J^T (m^2).
-    """
-    distance = np.asarray(range_m, dtype=np.float64)
-    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
-    direction = np.stack([sin, -cos], axis=-1)
-    root = np.stack(
-        [sigma_m * direction, sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)],
-        axis=-1,
-    )
-    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)

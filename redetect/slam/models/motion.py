@@ -18,14 +18,7 @@ FloatArray = NDArray[np.float64]
 def rotation(theta_rad: ArrayLike) -> FloatArray:
     """Rotations of the plane, robot axes into the map's.
 
-    Parameters
-    ----------
-    theta_rad : (...) array_like
-        Angles (rad).
-
-    Returns
-    -------
-    (..., 2, 2) float64
+    Takes `theta_rad` (...); returns (..., 2, 2).
     """
     angle = np.asarray(theta_rad, dtype=np.float64)
     cos, sin = np.cos(angle), np.sin(angle)
@@ -35,17 +28,7 @@ def rotation(theta_rad: ArrayLike) -> FloatArray:
 def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     """Motion model f: the pose after an odometry step.
 
-    Parameters
-    ----------
-    pose : (..., 3) array_like
-        x, y (m), theta (rad) before the step.
-    step : (..., 3) array_like
-        dx, dy (m), dphi (rad) in the robot frame before the step.
-
-    Returns
-    -------
-    (..., 3) float64
-        theta is the sum of both angles, not wrapped.
+    Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
     """
     before = np.asarray(pose, dtype=np.float64)
     moved = np.asarray(step, dtype=np.float64)
@@ -63,14 +46,7 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
 def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Jacobians of `move` by the pose (J1) and by the step (J2).
 
-    Parameters
-    ----------
-    pose, step : (..., 3) array_like
-        As for `move`.
-
-    Returns
-    -------
-    by_pose, by_step : (..., 3, 3) float64
+    Takes `pose, step` (..., 3); returns `by_pose, by_step` (..., 3, 3).
     """
     before = np.asarray(pose, dtype=np.float64)
     moved = np.asarray(step, dtype=np.float64)
@@ -116,14 +92,7 @@ def relative_pose(first: ArrayLike, second: ArrayLike) -> FloatArray:
 def relative_pose_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Jacobians of `relative_pose` by the first (J3) and by the second pose (J4).
 
-    Parameters
-    ----------
-    first, second : (..., 3) array_like
-        As for `relative_pose`.
-
-    Returns
-    -------
-    by_first, by_second : (..., 3, 3) float64
+    Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
     """
     before = np.asarray(first, dtype=np.float64)
     step = relative_pose(first, second)

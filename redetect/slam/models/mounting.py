@@ -13,10 +13,37 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from camera.calibration.model import cross_matrices
 from redetect.slam.errors import SlamError
-from redetect.slam.models.mounted_discs import rotation_exp, skew
 
 FloatArray = NDArray[np.float64]
+
+
+def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations of rotation vectors, and the left Jacobians of that map.
+
+    Parameters
+    ----------
+    vectors : (..., 3) float array
+        Rotation vectors, radians.
+
+    Returns
+    -------
+    rotations : (..., 3, 3) float array
+        exp([v]x), by Rodrigues' formula.
+    left_jacobians : (..., 3, 3) float array
+        J with ``exp([v + d]x) = exp([J d]x) exp([v]x)`` to first order in d.
+    """
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    # sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, all defined at a = 0.
+    sine = np.sinc(angle / np.pi)
+    versine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    small = angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    k = cross_matrices(vectors)
+    k2 = k @ k
+    return np.eye(3) + sine * k + versine * k2, np.eye(3) + versine * k + third * k2
 
 
 def nominal_mounting(camera: Camera) -> FloatArray:
@@ -27,17 +54,7 @@ def nominal_mounting(camera: Camera) -> FloatArray:
 def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     """Rays from the camera as calibrated to rows' places on the floor.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    floor_xy : (n, 2) float64
-        Rows in the robot frame (m).
-
-    Returns
-    -------
-    (n, 3) float64
-        Directions in the robot frame, z below 0, not of unit length.
+    Takes `floor_xy` (n, 2); returns (n, 3).
     """
     on_floor = np.concatenate([floor_xy, np.zeros((len(floor_xy), 1))], axis=1)
     return np.asarray(on_floor - camera.centre)
@@ -73,27 +90,18 @@ def rows_through_mounting(
     by_ray = np.zeros((len(ray), 2, 3))
     by_ray[:, 0, 0] = by_ray[:, 1, 1] = -centre[2] / ray[:, 2]
     by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
-    by_mounting = np.concatenate([-by_ray @ skew(ray), -slope[:, :, None]], axis=2)
+    by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
     return centre[:2] - centre[2] * slope, by_mounting
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedJacobians:
-    """Derivatives of n rows as recorded.
+    """Derivatives of n rows as recorded."""
 
-    Attributes
-    ----------
-    floor : (n, 2, 2) float64
-        By the disc in the robot frame.
-    tilt : (n, 2, 2) float64
-        By the frame's pitch and roll.
-    mounting : (n, 2, 4) float64
-        By a rotation vector in the robot frame, applied to the mounting from the left, and by the
-        height.
-    """
-
-    floor: FloatArray
-    tilt: FloatArray
+    floor: FloatArray  # (n, 2, 2): by the disc in the robot frame
+    tilt: FloatArray  # (n, 2, 2): by the frame's pitch and roll
+    # (n, 2, 4): by a rotation vector in the robot frame, applied to the mounting from the left, and
+    # by the height.
     mounting: FloatArray
 
 
@@ -105,22 +113,8 @@ def rows_as_recorded(
     The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
     the camera.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    floor_xy : (n, 2) float64
-        Discs in the robot frame (m).
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-    tilt : (n, 2) float64
-        Pitch and roll of the robot: x and y of a rotation vector in the robot frame (rad).
-
-    Returns
-    -------
-    rows_xy : (n, 2) float64
-        In the robot frame (m); NaN where the ray does not go down for the calibrated camera.
-    jacobians : RecordedJacobians
+    Takes `floor_xy` (n, 2), `mounting` (3, 4), `tilt` (n, 2); returns `rows_xy` (n, 2),
+    `jacobians`.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
     from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
@@ -138,24 +132,17 @@ def rows_as_recorded(
     by_robot = by_untilted @ level
     return camera.centre[:2] - height * slope, RecordedJacobians(
         floor=by_robot[:, :, :2],
-        tilt=(by_robot @ skew(from_centre) @ left)[:, :, :2],
-        mounting=np.concatenate([by_untilted @ skew(untilted), -by_robot[:, :, 2:]], axis=2),
+        tilt=(by_robot @ cross_matrices(from_centre) @ left)[:, :, :2],
+        mounting=np.concatenate(
+            [by_untilted @ cross_matrices(untilted), -by_robot[:, :, 2:]], axis=2
+        ),
     )
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
     """Rotation vector in the robot frame (rad) and height (m), true less calibrated.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-
-    Returns
-    -------
-    (4,) float64
+    Takes `mounting` (3, 4); returns (4,).
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     return np.append(
@@ -166,20 +153,7 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
 def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, FloatArray]:
     """By how much a camera is turned about the vertical against its calibration.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-
-    Returns
-    -------
-    angle : float
-        The turn of the plane nearest to the rotation (rad).
-    by_mounting : (4,) float64
-        Its derivatives by a rotation vector in the robot frame, applied to the mounting from the
-        left, and by the height.
+    Takes `mounting` (3, 4); returns `angle`, `by_mounting` (4,).
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     sin, cos = turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]
@@ -191,14 +165,7 @@ def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, Float
 
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
-    """See that rows can come from a camera at all.
-
-    Raises
-    ------
-    SlamError
-        If a row lies where the camera as calibrated cannot see the floor: the calibration is not
-        that of the run.
-    """
+    """See that rows can come from a camera at all."""
     pixels = camera.project_floor(floor_xy)
     outside = ~np.all(np.isfinite(pixels), axis=-1)
     if np.any(outside):

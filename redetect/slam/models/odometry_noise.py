@@ -20,27 +20,13 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Standard deviations of the steps of odometry that state none.
+    """Standard deviations of the steps of odometry that state none."""
 
-    Parameters
-    ----------
-    per_metre : float
-        Of the way, as a share of it.
-    per_radian : float
-        Of the turn, as a share of it.
-    turn_per_metre : float
-        Of the turn by the way, radians per metre.
-    least_m : float
-        Of every step's way, metres.
-    least_rad : float
-        Of every step's turn, radians.
-    """
-
-    per_metre: float = 0.05
-    per_radian: float = 0.05
-    turn_per_metre: float = 0.03
-    least_m: float = 0.005
-    least_rad: float = 0.002
+    per_metre: float = 0.05  # of the way, as a share of it
+    per_radian: float = 0.05  # of the turn, as a share of it
+    turn_per_metre: float = 0.03  # of the turn by the way, radians per metre
+    least_m: float = 0.005  # of every step's way, metres
+    least_rad: float = 0.002  # of every step's turn, radians
 
     def __post_init__(self) -> None:
         demand(

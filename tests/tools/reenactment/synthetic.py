@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect.landmarks import Frame, Step, circle_landmarks
-from redetect.slam.models.mounted_discs import Geometry
 from tools.reenactment.fitting import odometry_residuals
+from tools.reenactment.mounted_discs import Geometry
 
 FloatArray = NDArray[np.float64]
 

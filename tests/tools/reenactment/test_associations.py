@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from redetect.slam.models.mounted_discs import Geometry
 from tests.tools.reenactment.synthetic import make_run
 from tools.reenactment.associations import map_positions, mend_associations
+from tools.reenactment.mounted_discs import Geometry
 from tools.reenactment.recording import Recording, recording_of_frames
 
 

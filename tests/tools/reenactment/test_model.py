@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect.slam.models.motion import chain_steps
-from redetect.slam.models.mounted_discs import Geometry, predict_pixels, rotation_exp
+from redetect.slam.models.mounting import rotation_exp, rows_as_recorded
 from tools.reenactment.fitting import odometry_residuals
+from tools.reenactment.mounted_discs import Geometry, predict_pixels
 
 FloatArray = NDArray[np.float64]
 
@@ -117,3 +118,21 @@ def test_odometry_of_a_chained_path_leaves_nothing() -> None:
     steps = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
     residuals = odometry_residuals(chain_steps(steps)[1:], steps)
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
+
+
+def test_rows_as_recorded_go_through_the_lens_and_back(published_camera: Camera) -> None:
+    rng = np.random.default_rng(2)
+    floor = np.column_stack([rng.uniform(-1, 1, 20), rng.uniform(-3.5, -1.2, 20)])
+    tilt = 0.02 * rng.standard_normal((20, 2))
+    turn, _ = rotation_exp(np.array([-0.04, 0.01, 0.002]))
+    centre = published_camera.centre + np.array([0.0, 0.0, -0.02])
+    geometry = Geometry(np.zeros((20, 3)), floor, turn @ published_camera.rotation, centre, tilt)
+    every = np.arange(20)
+    pixels, by = predict_pixels(published_camera, geometry, every, every)
+    mounting = np.column_stack([geometry.rotation, centre])
+    rows, by_rows = rows_as_recorded(published_camera, floor, mounting, tilt)
+    np.testing.assert_allclose(rows, published_camera.floor_from_pixel(pixels), atol=1e-5)
+    into = published_camera.floor_jacobian(pixels)
+    np.testing.assert_allclose(by_rows.mounting, into @ by.mounting, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_rows.tilt, into @ by.tilt, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_rows.floor, into @ by.disc, rtol=1e-4, atol=1e-4)

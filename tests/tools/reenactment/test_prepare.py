@@ -11,9 +11,9 @@ import pytest
 
 from camera import Camera, write_camera
 from redetect.landmarks import read_frames, write_frames
-from redetect.slam.models.mounted_discs import Geometry
 from tests.tools.reenactment.synthetic import make_run, rows_of_frame
 from tools.reenactment.__main__ import main
+from tools.reenactment.mounted_discs import Geometry
 from tools.reenactment.prepare import Stage, stages
 from tools.reenactment.recording import Recording, read_map, read_path, recording_of_frames
 from tools.reenactment.world import read_world

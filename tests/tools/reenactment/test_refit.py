@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from redetect.slam.models.mounted_discs import Geometry
 from tests.tools.reenactment.synthetic import MOUNTING_HEIGHT, MOUNTING_VECTOR, make_run
 from tools.reenactment.fitting import RefitError, Weighting, nominal_geometry, refit, row_distances
+from tools.reenactment.mounted_discs import Geometry
 from tools.reenactment.recording import Recording, recording_of_frames, start_from_odometry
 
 

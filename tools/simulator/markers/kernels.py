@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from camera.brown_kernels import brown_shift_point
-from camera.kernels import has_brown
+from camera.kernels import brown_shift_point, has_brown
 from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
 
 

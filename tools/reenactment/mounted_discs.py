@@ -12,45 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.calibration.model import cross_matrices
+from redetect.slam.models.mounting import rotation_exp
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-
-def skew(vectors: FloatArray) -> FloatArray:
-    """(..., 3, 3) matrices [v]x of (..., 3) vectors: ``[v]x a = v x a``."""
-    matrix = np.zeros((*vectors.shape[:-1], 3, 3))
-    matrix[..., 0, 1], matrix[..., 1, 0] = -vectors[..., 2], vectors[..., 2]
-    matrix[..., 0, 2], matrix[..., 2, 0] = vectors[..., 1], -vectors[..., 1]
-    matrix[..., 1, 2], matrix[..., 2, 1] = -vectors[..., 0], vectors[..., 0]
-    return matrix
-
-
-def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations of rotation vectors, and the left Jacobians of that map.
-
-    Parameters
-    ----------
-    vectors : (..., 3) float array
-        Rotation vectors, radians.
-
-    Returns
-    -------
-    rotations : (..., 3, 3) float array
-        exp([v]x), by Rodrigues' formula.
-    left_jacobians : (..., 3, 3) float array
-        J with ``exp([v + d]x) = exp([J d]x) exp([v]x)`` to first order in d.
-    """
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    # sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, all defined at a = 0.
-    sine = np.sinc(angle / np.pi)
-    versine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    small = angle < 1e-2
-    safe = np.where(small, 1.0, angle)
-    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    k = skew(vectors)
-    k2 = k @ k
-    return np.eye(3) + sine * k + versine * k2, np.eye(3) + versine * k + third * k2
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +107,9 @@ def predict_pixels(
     spin = np.stack([floor[:, 1], -floor[:, 0]], axis=-1)
     by_disc = by_floor @ robot_from_map
     by_pose = np.concatenate([-by_disc, (by_floor @ spin[:, :, None])], axis=2)
-    by_tilt = (by_robot @ skew(from_centre) @ left)[:, :, :2]
+    by_tilt = (by_robot @ cross_matrices(from_centre) @ left)[:, :, :2]
     untilted = np.einsum("nji,nj->ni", turn, from_centre)
     by_mounting = np.concatenate(
-        [by_camera @ geometry.rotation.T @ skew(untilted), -by_robot[:, :, 2:]], axis=2
+        [by_camera @ geometry.rotation.T @ cross_matrices(untilted), -by_robot[:, :, 2:]], axis=2
     )
     return pixels, PixelJacobians(by_pose, by_tilt, by_disc, by_mounting)

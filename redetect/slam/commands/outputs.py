@@ -17,13 +17,7 @@ PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
 
 
 def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
-    """Refuse before the work what could not be written after it, and make the folder.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If one of the files exists and may not be replaced.
-    """
+    """Refuse before the work what could not be written after it, and make the folder."""
     for name in names:
         if (folder / name).exists() and not overwrite:
             raise OutputExistsError(folder / name)
@@ -31,14 +25,7 @@ def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> Non
 
 
 def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
-    """Take a filter through a run.
-
-    Returns
-    -------
-    run : FilterRun
-    line : str
-        How long it took, for the terminal.
-    """
+    """Take a filter through a run; also returned is what to print of its time."""
     began, began_working = time.perf_counter(), time.thread_time()
     run = work()
     seconds, working = time.perf_counter() - began, time.thread_time() - began_working
@@ -50,13 +37,7 @@ def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
 
 
 def write_json(path: Path, content: dict[str, object], *, overwrite: bool) -> None:
-    """Write a summary.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
-    """
+    """Write a summary."""
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())
 
@@ -69,21 +50,7 @@ def draw_results(
     title: str,
     flags: FilterFlags,
 ) -> None:
-    """Draw the map with the path and, where there is a path to compare with, the distance from it.
-
-    Parameters
-    ----------
-    output : Path
-        The folder.
-    landmark_map : LandmarkMap
-    path : Path2D
-        The filter's.
-    reference : Path2D or None
-        The path to compare with.
-    title : str
-    flags : FilterFlags
-        Of the command: whether files are replaced, and pictures shown.
-    """
+    """Draw the map with the path and, beside a reference, the distance from it."""
     draw_map(
         output / MAP_PICTURE,
         landmark_map,

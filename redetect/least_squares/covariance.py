@@ -1,0 +1,180 @@
+"""Covariances at a minimum: parts of the inverse of sparse normal equations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import sparse
+
+from redetect.least_squares.solver import NormalEquations, factor, scaled_inverse
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Columns of the inverse that are computed at once.
+_CHUNK = 128
+
+
+def diagonal_blocks(
+    equations: NormalEquations, blocks: list[tuple[int, IntArray]]
+) -> tuple[list[FloatArray], FloatArray]:
+    """Covariances of groups of unknowns, and of the shared ones, all others unknown too.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+    blocks : list of (width, (b,) int64)
+        Width and first indices of groups.
+
+    Returns
+    -------
+    covariances : list of (b, width, width) float64
+    shared : (s, s) float64
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the residuals do not determine the unknowns.
+    """
+    found = inverse_blocks(equations.matrix, blocks)
+    eliminated, shared = _shared(equations)
+    for k, (width, first) in enumerate(blocks):
+        by = eliminated[first[:, None] + np.arange(width)]
+        found[k] = found[k] + by @ shared @ np.swapaxes(by, 1, 2)
+    return found, shared
+
+
+def chosen_covariance(equations: NormalEquations, chosen: IntArray) -> FloatArray:
+    """(n, n) joint covariance of n chosen unknowns; errors as `diagonal_blocks`."""
+    factored, size = factor(equations.matrix), equations.matrix.shape[0]
+    covariance = np.empty((len(chosen), len(chosen)))
+    for first in range(0, len(chosen), _CHUNK):
+        some = chosen[first : first + _CHUNK]
+        unit = np.zeros((size, len(some)))
+        unit[some, np.arange(len(some))] = 1.0
+        covariance[:, first : first + len(some)] = factored.solve(unit)[chosen]
+    eliminated, shared = _shared(equations)
+    covariance += eliminated[chosen] @ shared @ eliminated[chosen].T
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _shared(equations: NormalEquations) -> tuple[FloatArray, FloatArray]:
+    """How the others follow the shared unknowns (K, s), and the covariance of these (s, s)."""
+    if equations.corner.size == 0:
+        return equations.border, equations.corner
+    eliminated = factor(equations.matrix).solve(equations.border)
+    return eliminated, scaled_inverse(equations.corner - equations.border.T @ eliminated)
+
+
+def inverse_blocks(
+    matrix: sparse.csc_array, blocks: list[tuple[int, IntArray]]
+) -> list[FloatArray]:
+    """Diagonal blocks of the inverse of a sparse positive definite matrix."""
+    factored = factor(matrix)
+    order = np.asarray(factored.perm_c, dtype=np.int64)
+    if not np.array_equal(order, factored.perm_r):
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    # Row i of the matrix is row order[i] of the factor's.
+    entries = matrix.tocoo()
+    # The requested entries must be in the pattern, even if the matrix is zero there.
+    asked = [(f + i, f + j) for width, f in blocks for i in range(width) for j in range(width)]
+    row = order[np.concatenate([entries.row, *(i for i, _ in asked)])]
+    column = order[np.concatenate([entries.col, *(j for _, j in asked)])]
+    pattern = sparse.csc_array((np.ones(len(row)), (row, column)))
+    indptr, indices = filled_pattern(
+        pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+    )
+    columns = np.repeat(np.arange(len(order), dtype=np.int64), np.diff(indptr))
+    keys = columns * len(order) + indices
+    lower = sparse.tril(factored.L, -1).tocoo()
+    values = np.zeros(len(indices))
+    values[np.searchsorted(keys, lower.col.astype(np.int64) * len(order) + lower.row)] = lower.data
+    below, on_diagonal = selected_inverse(indptr, indices, values, factored.U.diagonal())
+    found = []
+    for width, first in blocks:
+        block = np.zeros((len(first), width, width))
+        for i in range(width):
+            block[:, i, i] = on_diagonal[order[first + i]]
+            for j in range(i):
+                one, other = order[first + i], order[first + j]
+                key = np.minimum(one, other) * len(order) + np.maximum(one, other)
+                block[:, i, j] = block[:, j, i] = below[np.searchsorted(keys, key)]
+        found.append(block)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
+    """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns."""
+    n = len(indptr) - 1
+    first_child = np.full(n, -1, dtype=np.int64)
+    next_child = np.full(n, -1, dtype=np.int64)
+    mark = np.full(n, -1, dtype=np.int64)
+    start = np.zeros(n + 1, dtype=np.int64)
+    rows = np.empty(4 * len(indices) + n, dtype=np.int64)
+    for j in range(n):
+        count = start[j]
+        if count + n > len(rows):
+            larger = np.empty(2 * len(rows) + n, dtype=np.int64)
+            larger[:count] = rows[:count]
+            rows = larger
+        mark[j] = j
+        for at in range(indptr[j], indptr[j + 1]):
+            i = indices[at]
+            if i > j and mark[i] != j:
+                mark[i] = j
+                rows[count] = i
+                count += 1
+        child = first_child[j]
+        while child >= 0:
+            for at in range(start[child], start[child + 1]):
+                i = rows[at]
+                if mark[i] != j:
+                    mark[i] = j
+                    rows[count] = i
+                    count += 1
+            child = next_child[child]
+        start[j + 1] = count
+        rows[start[j] : count].sort()
+        if count > start[j]:
+            parent = rows[start[j]]
+            next_child[j] = first_child[parent]
+            first_child[parent] = j
+    return start, rows[: start[n]].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def selected_inverse(
+    indptr: IntArray, indices: IntArray, lower: FloatArray, diagonal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Entries of the inverse of ``L D L^T`` in the pattern of L, and on the diagonal.
+
+    K. Takahashi, J. Fagan, M.-S. Chin, Formation of a sparse bus impedance matrix and its
+    application to short circuit study, PICA 1973.
+    """
+    n = len(diagonal)
+    below = np.zeros(len(lower))
+    on_diagonal = np.zeros(n)
+    place = np.full(n, -1, dtype=np.int64)
+    sums = np.zeros(n)
+    for j in range(n - 1, -1, -1):
+        first, last = indptr[j], indptr[j + 1]
+        for at in range(first, last):
+            place[indices[at]] = at
+            sums[at - first] = 0.0
+        for at in range(first, last):
+            k = indices[at]
+            sums[at - first] += on_diagonal[k] * lower[at]
+            for other in range(indptr[k], indptr[k + 1]):
+                here = place[indices[other]]
+                if here >= 0:
+                    sums[here - first] += below[other] * lower[at]
+                    sums[at - first] += below[other] * lower[here]
+        variance = 1.0 / diagonal[j]
+        for at in range(first, last):
+            below[at] = -sums[at - first]
+            variance -= lower[at] * below[at]
+            place[indices[at]] = -1
+        on_diagonal[j] = variance
+    return below, on_diagonal

@@ -1,0 +1,263 @@
+"""Levenberg-Marquardt on sparse normal equations.
+
+A residual depends on a few of many unknowns (poses, landmarks), and perhaps on some that are shared
+by all residuals (a camera's mounting or lens). The latter would fill the sparse matrix: they are
+kept apart as a border, and solved for by the Schur complement of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+LossKind = Literal["none", "huber", "cauchy", "geman-mcclure"]
+X = TypeVar("X")
+
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e10
+
+
+class StartError(ValueError):
+    """A start at which what is minimised is not defined."""
+
+
+class Loss(NamedTuple):
+    """How much a residual counts: its square, or less beyond `scale` standard deviations."""
+
+    kind: LossKind = "none"
+    scale: float = 1.0
+
+
+class Block(NamedTuple):
+    """Whitened residuals of one kind, with their derivatives.
+
+    Attributes
+    ----------
+    error : (n, d) float64
+        Each row is one residual to the loss.
+    by : sequence of ((n,) int64, (n, d, k) float64)
+        Derivatives by k unknowns, and the index of the first of these; below 0: not an unknown.
+    shared : (n, d, s) float64 or None
+        Derivatives by the shared unknowns; None: all are 0.
+    loss : Loss
+    """
+
+    error: FloatArray
+    by: Sequence[tuple[IntArray, FloatArray]]
+    shared: FloatArray | None = None
+    loss: Loss = Loss()
+
+
+class Linear(NamedTuple):
+    """A linear problem: the change x, m of the unknowns, m shared, least in ``|J x + B m + r|``."""
+
+    residual: FloatArray  # (R,)
+    jacobian: sparse.csr_array  # (R, K)
+    border: FloatArray  # (R, s)
+
+
+class Problem(Protocol[X]):
+    """What is minimised: a function of unknowns of any type."""
+
+    def cost(self, at: X) -> float:
+        """The sum to minimise; infinite where it is not defined."""
+
+    def linear(self, at: X) -> Linear:
+        """The problem near an estimate."""
+
+    def moved(self, at: X, step: FloatArray, shared: FloatArray) -> X:
+        """The estimate after a step of the (K,) unknowns and of the (s,) shared ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[X]):
+    """Where a descent ended: the estimate, and the costs at the start and after each step."""
+
+    at: X
+    costs: tuple[float, ...]
+    converged: bool  # False if the steps ran out.
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """J^T J and J^T r, the shared unknowns apart."""
+
+    matrix: sparse.csc_array  # (K, K)
+    gradient: FloatArray  # (K,)
+    border: FloatArray  # (K, s), between shared and other unknowns
+    corner: FloatArray  # (s, s)
+    corner_gradient: FloatArray  # (s,)
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Steps of both kinds of unknowns, the diagonal raised by a share of it (Marquardt).
+
+        Raises `numpy.linalg.LinAlgError` where the residuals do not determine the unknowns.
+        """
+        factored = factor(self.matrix, damping)
+        step = -factored.solve(self.gradient)
+        if self.corner.size == 0:
+            return step, np.zeros(0)
+        eliminated = factored.solve(self.border)
+        corner = self.corner + damping * np.diag(np.diag(self.corner))
+        shared = scaled_inverse(corner - self.border.T @ eliminated) @ (
+            -self.corner_gradient - self.border.T @ step
+        )
+        return step - eliminated @ shared, shared
+
+
+def robust(squared: FloatArray, loss: Loss) -> tuple[FloatArray, FloatArray]:
+    """Costs of (n,) squared residuals, and their weights: the costs' derivatives by the squares.
+
+    Huber's, Cauchy's (Lorentzian) and Geman and McClure's losses are the square near 0.
+    """
+    c2 = loss.scale**2
+    if loss.kind == "huber":
+        far = squared > c2
+        root = np.sqrt(np.where(far, squared, c2))
+        cost = np.where(far, 2.0 * loss.scale * root - c2, squared)
+        return cost, np.where(far, loss.scale / root, 1.0)
+    if loss.kind == "cauchy":
+        return c2 * np.log1p(squared / c2), 1.0 / (1.0 + squared / c2)
+    if loss.kind == "geman-mcclure":
+        return squared * c2 / (c2 + squared), (c2 / (c2 + squared)) ** 2
+    return squared, np.ones_like(squared)
+
+
+def robust_cost(errors: Iterable[tuple[FloatArray, Loss]]) -> float:
+    """Sum of the costs of (n, d) whitened residuals; infinite if one is not finite."""
+    parts = [np.sum(robust(np.sum(error**2, axis=1), loss)[0]) for error, loss in errors]
+    total = float(np.sum(parts))
+    return total if np.isfinite(total) else float("inf")
+
+
+def stack(blocks: Sequence[Block], unknowns: int, shared: int) -> Linear:
+    """The linear problem of blocks, robust losses as weights (iteratively reweighted)."""
+    residuals, border, values, rows, columns = [], [], [], [], []
+    first_row = 0
+    for block in blocks:
+        n, d = block.error.shape
+        root = np.sqrt(robust(np.sum(block.error**2, axis=1), block.loss)[1])[:, None, None]
+        residuals.append((block.error * root[:, :, 0]).ravel())
+        by_shared = np.zeros((n, d, shared)) if block.shared is None else root * block.shared
+        border.append(by_shared.reshape(n * d, shared))
+        row = first_row + np.arange(n * d, dtype=np.int64).reshape(n, d, 1)
+        for first, by in block.by:
+            free = slice(None) if np.all(first >= 0) else first >= 0
+            some = by[free] * root[free]
+            column = first[free, None, None] + np.arange(by.shape[2], dtype=np.int64)
+            values.append(some.ravel())
+            rows.append(np.broadcast_to(row[free], some.shape).ravel())
+            columns.append(np.broadcast_to(column, some.shape).ravel())
+        first_row += n * d
+    places = (np.concatenate(rows), np.concatenate(columns))
+    return Linear(
+        residual=np.concatenate(residuals),
+        jacobian=sparse.csr_array((np.concatenate(values), places), shape=(first_row, unknowns)),
+        border=np.concatenate(border),
+    )
+
+
+def normal_equations(problem: Linear) -> NormalEquations:
+    """Normal equations of a linear problem."""
+    transposed = problem.jacobian.T
+    return NormalEquations(
+        matrix=(transposed @ problem.jacobian).tocsc(),
+        gradient=np.asarray(transposed @ problem.residual),
+        border=np.asarray(transposed @ problem.border),
+        corner=problem.border.T @ problem.border,
+        corner_gradient=problem.border.T @ problem.residual,
+    )
+
+
+def factor(matrix: sparse.csc_array, damping: float = 0.0) -> SuperLU:
+    """Factorise a positive definite matrix, its diagonal raised by a share of it.
+
+    Raises `numpy.linalg.LinAlgError` where it is singular.
+    """
+    if damping > 0.0:
+        matrix = matrix.copy()
+        column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+        matrix.data[matrix.indices == column] *= 1.0 + damping
+    options = {"SymmetricMode": True}
+    try:
+        return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    except RuntimeError as error:
+        raise np.linalg.LinAlgError(str(error)) from None
+
+
+def scaled_inverse(matrix: FloatArray) -> FloatArray:
+    """Pseudo-inverse of a positive semidefinite matrix whose unknowns differ much in scale."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    both = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix / both, 1e-14, hermitian=True) / both)
+
+
+def minimise(
+    problem: Problem[X],
+    start: X,
+    *,
+    tolerance: float = 1e-10,
+    most_steps: int = 200,
+    damping: float = 1e-6,
+    refined: Callable[[X, float], tuple[X, float]] | None = None,
+) -> Minimum[X]:
+    """Minimise by Levenberg and Marquardt's method.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : X
+    tolerance : float
+        Stop at a step that lowers the cost by less than this share of it.
+    most_steps : int
+        Stop after as many.
+    damping : float
+        At the beginning, a share of the diagonal.
+    refined : callable, optional
+        Improves each trial, whose cost it takes and returns, before it is judged.
+
+    Returns
+    -------
+    Minimum
+
+    Raises
+    ------
+    StartError
+        If the cost is not finite at the start.
+    numpy.linalg.LinAlgError
+        If the residuals do not determine the unknowns.
+    """
+    at, lowest = start, problem.cost(start)
+    if not np.isfinite(lowest):
+        raise StartError("the cost is not finite at the start")
+    costs = [lowest]
+    for _ in range(most_steps):
+        before = lowest
+        equations = normal_equations(problem.linear(at))
+        while damping < _LARGEST_DAMPING:
+            try:
+                trial = problem.moved(at, *equations.step(damping))
+            except np.linalg.LinAlgError:
+                damping *= 10.0
+                if damping >= _LARGEST_DAMPING:
+                    raise
+                continue
+            cost = problem.cost(trial)
+            if refined is not None and np.isfinite(cost):
+                trial, cost = refined(trial, cost)
+            if cost < before:
+                at, lowest = trial, cost
+                damping = max(damping / 10.0, _LEAST_DAMPING)
+                break
+            damping *= 10.0
+        costs.append(lowest)
+        if before - lowest <= tolerance * lowest:
+            return Minimum(at, tuple(costs), converged=True)
+    return Minimum(at, tuple(costs), converged=False)

@@ -1,0 +1,113 @@
+"""Input of the commands: the run, its camera, a path to compare with."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera, read_camera
+from redetect.landmarks.map_file import Path2D, read_path
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.frames import NO_CAMERA
+from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.options import RunFlags
+from redetect.slam.recording import Recording, read_recording
+
+FloatArray = NDArray[np.float64]
+
+
+def recording_of(flags: RunFlags) -> Recording:
+    """Read the rows of the run that a command names; assumptions on its odometry are printed."""
+    recording = read_recording(
+        flags.run,
+        circles=flags.circles or not flags.lines,
+        lines=flags.lines,
+        stem=flags.stem,
+        noise=flags.odometry_noise,
+    )
+    print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
+    return recording
+
+
+def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
+    """Print the noise that was assumed of the steps that state none, if there are any."""
+    if unstated:
+        print(
+            f"{unstated} of {total} steps state no covariance: taken for {noise.sentence()} "
+            "(--odometry-noise)",
+            file=sys.stderr,
+        )
+
+
+def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
+    """Read the calibration that belongs to a run.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder, or a file in one.
+    camera : Path, optional
+        The calibration; by default the one ``.cam`` in the folder, ``<run>.cam`` if there are
+        several.
+
+    Returns
+    -------
+    Camera
+
+    Raises
+    ------
+    SlamError
+        If there is none, or it is not clear which.
+    camera.CameraError
+        If the file is malformed.
+    """
+    if camera is not None:
+        return read_camera(camera)
+    folder = run if run.is_dir() else run.parent
+    found = sorted(folder.glob("*.cam"))
+    own = folder / f"{folder.resolve().name}.cam"
+    if len(found) > 1 and own not in found:
+        names = ", ".join(path.name for path in found)
+        raise SlamError(f"{folder}: several calibrations ({names}): expected one by --camera")
+    if not found:
+        raise SlamError(
+            f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
+            "calibrate` makes one, `camera convert` brings one over from other programs"
+        )
+    return read_camera(own if own in found else found[0])
+
+
+def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
+    """Rows of the run that a command names, and where its camera is.
+
+    Returns `recording`, `camera_xy` (2,).
+    """
+    recording = recording_of(flags)
+    return recording, camera_xy_of(recording, flags.run, flags.camera)
+
+
+def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
+    """(2,) the camera's centre in the robot frame (m); zero where no line needs it."""
+    if not len(recording.lines):
+        return NO_CAMERA
+    mounting = camera_of_run(run, camera).robot_from_camera
+    return np.array([mounting[0][3], mounting[1][3]])
+
+
+def read_reference(path: Path, poses: Path2D) -> Path2D:
+    """A path to compare with, which must be of the same run."""
+    reference = read_path(path)
+    if len(reference.poses) != len(poses.poses):
+        raise SlamError(
+            f"{path}: {len(reference.poses)} poses: expected {len(poses.poses)}, the start and one "
+            "after each step of the run"
+        )
+    return reference
+
+
+def default_output(run: Path, name: str) -> Path:
+    """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
+    return (run if run.is_dir() else run.parent) / "slam" / name

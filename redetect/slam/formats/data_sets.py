@@ -1,0 +1,263 @@
+"""Data sets of robots that measure ranges and bearings of landmarks, as runs, paths and maps.
+
+UTIAS (MRCLAM): robots log velocities, and range and bearing to barcodes of landmarks and of each
+other. Victoria Park: a car between trees that its laser scanner sees; the robot frame is that of
+the scanner. Axes of both are X forward, Y left.
+
+References
+----------
+K. Leung, Y. Halpern, T. Barfoot, H. Liu, "The UTIAS multi-robot cooperative localization and
+mapping dataset", International Journal of Robotics Research 30(8), 2011.
+J. E. Guivant, E. M. Nebot, "Optimization of the simultaneous localization and map-building
+algorithm for real-time implementation", IEEE Transactions on Robotics and Automation 17(3), 2001.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+from redetect.landmarks import CircleLandmark, Frame, Step
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.slam.errors import SlamError
+from redetect.slam.formats.axes import to_dataset
+from redetect.slam.formats.text import finite, text_rows
+from redetect.slam.models.motion import chain_steps, relative_pose
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: How the names of a robot's odometry and of the files beside it end.
+ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
+LANDMARKS, BARCODES = "Landmark_Groundtruth.dat", "Barcodes.dat"
+_ROBOTS = 5
+
+#: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
+DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
+# The car: distance of the axles, of the encoder from the middle, and the scanner's place (m).
+_AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
+_BEAMS = 361
+_FARTHEST_M = 75.0
+# Neighbouring beams on one trunk differ by less; what is behind a trunk is farther by more.
+_SAME_M, _BEHIND_M = 0.5, 1.5
+_LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RangeBearing:
+    """A run."""
+
+    times: FloatArray  # (N,): of the frames (s), ascending
+    # (N, 3): movements before each frame in the data set's axes: dx, dy (m), dphi (rad).
+    steps: FloatArray
+    frame: IntArray  # (n,): the frame of each measurement, ascending
+    # (n,): from the origin of the robot frame; 0 forward, positive to the left.
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    ids: IntArray  # (n,): the landmark; -1 where it is not known
+
+    @property
+    def prefixes(self) -> tuple[str, ...]:
+        """Names of the frames: their times."""
+        return tuple(f"{time:.3f}" for time in self.times)
+
+
+def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame]:
+    """The run as frames, whose steps state no covariance; landmarks as discs."""
+    xy, covariance = discs_of_ranges(run.range_m, run.bearing_rad, sigma_m, sigma_rad)
+    starts = np.searchsorted(run.frame, np.arange(len(run.times) + 1))
+    frames = []
+    for k, (prefix, step) in enumerate(zip(run.prefixes, run.steps.tolist())):
+        rows = range(starts[k], starts[k + 1])
+        seen = tuple(_disc(xy[row], covariance[row], int(run.ids[row])) for row in rows)
+        frames.append(Frame(Step(prefix, *step, *([0.0] * 6)), seen))
+    return frames
+
+
+def _disc(xy: FloatArray, covariance: FloatArray, number: int) -> CircleLandmark:
+    (x, y), (cxx, cxy, _, cyy) = xy.tolist(), covariance.ravel().tolist()
+    return CircleLandmark(x, y, 1.0, cxx, cxy, cyy, (number,))
+
+
+def discs_of_ranges(
+    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
+) -> tuple[FloatArray, FloatArray]:
+    """Landmarks measured by range and bearing, as positions in the robot frame.
+
+    Takes `range_m, bearing_rad` (n,); returns `xy` (n, 2), `covariance` (n, 2, 2).
+    """
+    distance = np.asarray(range_m, dtype=np.float64)
+    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
+    direction = np.stack([sin, -cos], axis=-1)
+    root = np.stack(
+        [sigma_m * direction, sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)],
+        axis=-1,
+    )
+    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
+
+
+def _steps_between(
+    logged: FloatArray,
+    times: FloatArray,
+    along: Callable[[IntArray, FloatArray], FloatArray],
+    ends: tuple[float, float],
+) -> FloatArray:
+    """Movements (N, 3) to each time, from the first of `ends` on; what was logged holds till next.
+
+    `along` gives the movements under rows of the log (k,) held for some seconds (k,).
+    """
+    knots = np.union1d(np.append(logged, ends[1]), times)
+    knots = knots[knots >= ends[0]]
+    held = np.clip(np.searchsorted(logged, knots[:-1], side="right") - 1, 0, None)
+    poses = chain_steps(along(held, np.diff(knots)))[np.searchsorted(knots, times)]
+    return relative_pose(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+
+
+def read_robot(odometry: Path) -> RangeBearing:
+    """What a robot logged; other robots that it saw are left out."""
+    velocity = _table(odometry, ("time", "v", "omega"))
+    seen = _table(_beside(odometry, MEASUREMENTS), ("time", "barcode", "range", "bearing"))
+    barcodes = _table(odometry.with_name(BARCODES), ("subject", "barcode"))
+    subject = {int(barcode): int(number) for number, barcode in barcodes}
+    ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
+    seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
+    order = np.argsort(seen[:, 0], kind="stable")
+    times, frame = np.unique(seen[order, 0], return_inverse=True)
+    if len(times) == 0 or len(velocity) == 0:
+        raise SlamError(f"{odometry}: no odometry, or no landmark seen: expected both")
+    return RangeBearing(
+        times=times,
+        steps=to_dataset(_velocity_steps(velocity, times), "robotics"),
+        frame=frame,
+        range_m=seen[order, 2],
+        bearing_rad=seen[order, 3],
+        ids=ids[order],
+    )
+
+
+def read_truth(odometry: Path) -> Path2D:
+    """True poses of a robot at the times of its frames, and first that at the start."""
+    run = read_robot(odometry)
+    truth = _table(_beside(odometry, TRUTH), ("time", "x", "y", "theta"))
+    if len(truth) == 0:
+        raise SlamError(f"{odometry}: no true pose beside it: expected some")
+    begin = _table(odometry, ("time", "v", "omega"))[0, 0]
+    at = np.concatenate([[min(begin, run.times[0])], run.times])
+    columns = (truth[:, 1], truth[:, 2], np.unwrap(truth[:, 3]))
+    poses = np.stack([np.interp(at, truth[:, 0], column) for column in columns], axis=1)
+    return Path2D(("start", *run.prefixes), to_dataset(poses, "robotics"))
+
+
+def read_landmarks(path: Path) -> LandmarkMap:
+    """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map."""
+    table = _table(path, ("subject", "x", "y", "x sigma", "y sigma"))
+    table = table[np.argsort(table[:, 0])]
+    covariance = np.zeros((len(table), 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
+    count = np.zeros(len(table), dtype=np.int64)
+    xy = to_dataset(table[:, 1:3], "robotics")
+    return LandmarkMap(
+        Landmarks(table[:, 0].astype(np.int64), xy, covariance, count), no_landmarks()
+    )
+
+
+def _velocity_steps(velocity: FloatArray, times: FloatArray) -> FloatArray:
+    """Movements from the odometry's begin to each time, along arcs by their chords."""
+    first = min(velocity[0, 0], times[0])
+    last = max(times[-1], velocity[-1, 0]) + 1.0
+
+    def along(held: IntArray, duration: FloatArray) -> FloatArray:
+        turn = velocity[held, 2] * duration
+        chord = velocity[held, 1] * duration * np.sinc(turn / (2.0 * np.pi))
+        return np.stack([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn], axis=1)
+
+    return _steps_between(velocity[:, 0], times, along, (first, last))
+
+
+def _beside(odometry: Path, ending: str) -> Path:
+    return odometry.with_name(odometry.name.removesuffix(ODOMETRY) + ending)
+
+
+def _table(path: Path, names: tuple[str, ...]) -> FloatArray:
+    """The numbers of a file, sorted by the first column as they come."""
+    rows = []
+    for line, text in text_rows(path):
+        if text.startswith("#"):
+            continue
+        words = text.split()
+        if len(words) != len(names):
+            raise SlamError(f"{path}:{line}: {len(words)} numbers: expected {', '.join(names)}")
+        rows.append([finite(path, line, name, word) for name, word in zip(names, words)])
+    return np.array(rows, dtype=np.float64).reshape(-1, len(names))
+
+
+def read_drive(drive: Path) -> RangeBearing:
+    """What the car logged, with the trees found in its scans."""
+    time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
+    scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
+    time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
+    if len({len(time), len(speed), len(steering)}) != 1 or laser.shape != (len(scanned), _BEAMS):
+        raise SlamError(f"{drive}: expected rows of equal number, and scans of {_BEAMS} beams")
+    usable = scanned >= time[0]
+    times, scans = scanned[usable] / 1000.0, laser[usable] / 100.0
+    found = [trees_of(scan) for scan in scans]
+    trees = np.concatenate([np.zeros((0, 2)), *found])
+    return RangeBearing(
+        times=times,
+        steps=to_dataset(_car_steps(time / 1000.0, speed, steering, times), "robotics"),
+        frame=np.repeat(np.arange(len(found)), [len(some) for some in found]),
+        range_m=trees[:, 0],
+        bearing_rad=trees[:, 1],
+        ids=np.full(len(trees), -1),
+    )
+
+
+def trees_of(scan: FloatArray) -> FloatArray:
+    """Trunks in a scan: runs of beams of nearly one range with nothing near beside them.
+
+    Takes `scan` (361,); returns (n, 2).
+    """
+    edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
+    starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
+    before = np.concatenate(
+        [[0.0], scan[starts[1:] - 1]]
+    )  # what the scan's border hides is unknown
+    after = np.concatenate([scan[ends[:-1]], [0.0]])
+    found = []
+    for first, last, right, left in zip(starts, ends, before, after):
+        reach = float(np.mean(scan[first:last]))
+        diameter = reach * np.radians(0.5 * (last - first))
+        alone = min(right, left) > reach + _BEHIND_M
+        if alone and reach < _FARTHEST_M and _LEAST_DIAMETER_M < diameter < _MOST_DIAMETER_M:
+            found.append((reach + 0.5 * diameter, np.radians(0.25 * (first + last - 1) - 90.0)))
+    return np.array(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _car_steps(
+    time: FloatArray, speed: FloatArray, steering: FloatArray, times: FloatArray
+) -> FloatArray:
+    """Movements of the scanner between times, from the speed of a rear wheel and the steering."""
+
+    def along(held: IntArray, duration: FloatArray) -> FloatArray:
+        slope = np.tan(steering[held])
+        way = speed[held] / (1.0 - slope * _ENCODER_M / _AXLES_M) * duration
+        turn = way / _AXLES_M * slope
+        return np.stack([way - turn * _LEFT_M, turn * _AHEAD_M, turn], axis=1)
+
+    return _steps_between(time, times, along, (time[0], max(time[-1], times[-1])))
+
+
+def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
+    try:
+        content = loadmat(path)
+        return [np.asarray(content[name], dtype=np.float64) for name in names]
+    except (OSError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
+        raise SlamError(
+            f"{path}: cannot be read ({error}): expected a MATLAB file with {', '.join(names)}"
+        ) from None
