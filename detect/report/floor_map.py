@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.drawing.inputs import SeenRows
-from detect.report.figures import DATA, MARK, REFERENCE, Part, figure_file, image_part
+from detect.report.figures import DATA, MARK, REFERENCE
 from detect.seen import circle_on_floor
 from detect.view_command import summed_steps
 from redetect.landmarks import Frame, circle_arrays
+from redetect.reporting.page import Part, figure_file, image_part
 
 FloatArray = NDArray[np.float64]
 
