@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
-from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.groundtruth.validation.scoring import compare_streams
 from redetect.landmarks import wrap_angle

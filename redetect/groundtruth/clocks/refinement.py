@@ -18,9 +18,9 @@ from scipy.optimize import Bounds, minimize
 
 from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.learning import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.fusion.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]

@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, direct, minimize
 
-from redetect.groundtruth.clocks.clock import ClockSegment, Status
-from redetect.groundtruth.clocks.heading_pair import HeadingPair, pair_headings, without_turns
-from redetect.groundtruth.clocks.headings import continuous_headings, segments_between_gaps
-from redetect.groundtruth.clocks.jump import find_jump
-from redetect.groundtruth.clocks.line import on_one_line
+from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
+from redetect.groundtruth.clocks.headings import (
+    HeadingPair,
+    continuous_headings,
+    pair_headings,
+    segments_between_gaps,
+    without_turns,
+)
 from redetect.groundtruth.clocks.refinement import refine_by_movement
-from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering
+from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering, find_jump
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
-from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.outline import LaserSettings
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.session import load_session
-from redetect.groundtruth.lasers.settings import LaserSettings
-from redetect.groundtruth.lasers.suspects import excess_shifts, track_without_suspects
+from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -24,6 +22,9 @@ from redetect.groundtruth.lasers.tracking import (
     STATUS,
     UNDETERMINED,
     LaserTrack,
+    combined_poses,
+    excess_shifts,
+    track_without_suspects,
 )
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_whole

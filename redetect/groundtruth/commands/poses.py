@@ -12,7 +12,7 @@ import numpy as np
 from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import write_json
+from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.calibration import Network, read_network, read_rig
 from redetect.groundtruth.markers.session import (
     RIG_NAME,

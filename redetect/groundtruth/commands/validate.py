@@ -19,9 +19,9 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import read_robot
 from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.report.pictures import draw_errors
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation.fiducials import read_distances, read_survey
-from redetect.groundtruth.validation.picture import draw_errors
 from redetect.groundtruth.validation.reference_poses import DistanceSettings, poses_from_distances
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, RefineSettings
 from redetect.groundtruth.validation.validate import (
@@ -69,7 +69,7 @@ def perform(options: Validate) -> int:
     if options.refine == "scans":
         settings = _Settings(options.refine, scans=RefineSettings())
         map_file = find_building(session)
-        segments = read_building(map_file).segments
+        segments = read_building(map_file)
         onboard, scan_files = _onboard(session)
         clock_path = _clock_path(session, options.clock)
         if onboard and clock_path is None:
@@ -80,7 +80,7 @@ def perform(options: Validate) -> int:
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     elif (session / "building.csv").is_file() or (session / "building.dxf").is_file():
-        segments = read_building(find_building(session)).segments  # for the picture
+        segments = read_building(find_building(session))  # for the picture
     solved = poses_from_distances(survey, measured, settings.distances)
     references, refused = reference_poses(solved, onboard, segments, clock, settings.scans)
     for entry in refused:

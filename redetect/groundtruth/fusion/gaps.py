@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.motion_kernels import POSE, STATE
-from redetect.groundtruth.fusion.smoother_kernels import (
+from redetect.groundtruth.fusion.kernels import (
     AFTER_REJECTIONS,
+    POSE,
+    STATE,
     WHERE_LOST,
     Gating,
     MeasuredPoses,

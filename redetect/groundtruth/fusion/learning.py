@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtri
 
-from redetect.groundtruth.fusion.motion_kernels import POSE
+from redetect.groundtruth.fusion.inputs import FuseSettings
+from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-from redetect.groundtruth.fusion.settings import FuseSettings
 
 FloatArray = NDArray[np.float64]
 

@@ -19,10 +19,13 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from redetect.groundtruth.fusion.motion_kernels import POSE
+from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-from redetect.groundtruth.trajectories.alignment import moved_poses, planar_alignment
-from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.matching import (
+    interpolate_poses,
+    moved_poses,
+    planar_alignment,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from redetect.groundtruth.fusion.controls import movements, variances_of
 from redetect.groundtruth.fusion.gaps import (
     UNMEASURED_S,
     Bridge,
@@ -20,10 +19,10 @@ from redetect.groundtruth.fusion.gaps import (
     ends_that_did_not_fit,
     gaps_where_lost,
 )
-from redetect.groundtruth.fusion.measurements import gather
-from redetect.groundtruth.fusion.motion_kernels import POSE, STATE
-from redetect.groundtruth.fusion.settings import FuseSettings
-from redetect.groundtruth.fusion.smoother_kernels import (
+from redetect.groundtruth.fusion.inputs import FuseSettings, gather, movements, variances_of
+from redetect.groundtruth.fusion.kernels import (
+    POSE,
+    STATE,
     FilterHistory,
     Gating,
     MeasuredPoses,

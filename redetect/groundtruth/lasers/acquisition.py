@@ -12,18 +12,22 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from redetect.groundtruth.geometry.plane import compose
-from redetect.groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
+from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import (
+    LaserSettings,
+    outline_faces,
+    outline_radius_m,
+    outline_symmetries,
+)
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
-from redetect.groundtruth.lasers.settings import LaserSettings
 from redetect.groundtruth.lasers.tracking_kernels import (
     OutlineFit,
     Seen,
     explain_set,
-    fit_outline,
     new_points,
     refine_outline,
 )
+from redetect.groundtruth.trajectories.plane import compose
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -185,8 +189,8 @@ def _search(
         c, s = math.cos(theta), math.sin(theta)
         x, y = body.middle
         start = np.array([place[0] - c * x + s * y, place[1] - s * x - c * y, theta])
-        pose, _, count, _ = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
-        pose, _, count, _ = fit_outline(
+        pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
+        pose, _, count = fit_outline(
             seen.points, body.faces, pose, settings.gate_m, settings.kept, 1e-4, settings.most_steps
         )
         if count < settings.acquire_readings or any(_close(pose, other) for other in tried):

@@ -8,20 +8,27 @@ nothing moves; and the whole, then each scanner, to the building map.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.plane import apply, between, compose, invert
-from redetect.groundtruth.lasers.icp import IcpSettings, icp_to_segments
-from redetect.groundtruth.lasers.icp_kernels import rigid_fit
-from redetect.groundtruth.lasers.icp_scan_kernels import align_scans, explained, scan_normals
+from redetect.groundtruth.lasers.icp import (
+    IcpSettings,
+    Scan,
+    align_scans,
+    explained,
+    icp_to_segments,
+    rigid_fit,
+    scan_normals,
+)
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
 from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
+from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
 from redetect.storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
 
@@ -93,8 +100,7 @@ class StillScan:
     sigma_m : float
         Of the averaged readings.
     normals : (n, 2) float64
-    good : (n,) bool
-        Which normals are good.
+        Of lines through the points; zeros where there is none.
     """
 
     points: FloatArray
@@ -102,7 +108,6 @@ class StillScan:
     direction: FloatArray
     sigma_m: float
     normals: FloatArray
-    good: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +171,9 @@ def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
     angle = scanner.angles_rad[usable]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     points = np.ascontiguousarray(mean[:, None] * direction)
-    normals, good = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
+    normals = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
     sigma = max(scanner.sigma_m, 0.003) / math.sqrt(float(np.median(count[usable])))
-    return StillScan(points, mean, direction, sigma, normals, good)
+    return StillScan(points, mean, direction, sigma, normals)
 
 
 def align_scanners(
@@ -229,30 +234,24 @@ def align_scanners(
     )
 
 
-def _gates(first_m: float, last_m: float, count: int) -> FloatArray:
-    return np.asarray(np.geomspace(first_m, last_m, count))
-
-
 def _pairs(
     scans: list[StillScan], measured: FloatArray, s: AlignmentSettings
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], FloatArray]]:
     """ICP of every pair, from the measured poses: shares explained, and poses j in i."""
     shares: dict[tuple[int, int], float] = {}
     relative: dict[tuple[int, int], FloatArray] = {}
-    gates = _gates(max(2.0 * s.gate_m, 0.1), 0.1, 12)
-    for i in range(len(scans)):
-        for j in range(i + 1, len(scans)):
-            best = (-1.0, between(measured[i], measured[j]))
-            for turn in s.turns_deg:
-                start = between(measured[i], measured[j]) + np.array([0.0, 0.0, math.radians(turn)])
-                pose, _, _ = align_scans(
-                    scans[j].points, scans[i].points, scans[i].normals, scans[i].good, start,
-                    gates, s.kept, 1e-6,
-                )  # fmt: skip
-                if np.isfinite(pose).all():
-                    share = explained(scans[j].points, scans[i].points, pose, _JUDGED_M)
-                    best = max(best, (share, pose), key=lambda entry: entry[0])
-            shares[i, j], relative[i, j] = max(best[0], 0.0), best[1]
+    gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
+    for i, j in combinations(range(len(scans)), 2):
+        apart = between(measured[i], measured[j])
+        target, points = Scan(scans[i].points, scans[i].normals), scans[j].points
+        best = (0.0, apart)
+        for turn in np.radians(s.turns_deg):
+            start = apart + np.array([0.0, 0.0, turn])
+            pose = align_scans(points, target, start, gates, s.kept, 1e-6)
+            if np.isfinite(pose).all():
+                share = explained(points, target, pose, _JUDGED_M)
+                best = max(best, (share, pose), key=lambda entry: entry[0])
+        shares[i, j], relative[i, j] = best
     return shares, relative
 
 
@@ -278,24 +277,18 @@ def _chained(
     return poses
 
 
-def _merge(
-    scans: list[StillScan], poses: FloatArray, members: list[int]
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Points, normals and which of these are good, of several scans in one frame."""
-    turned = [apply(np.array([0.0, 0.0, poses[k][2]]), scans[k].normals) for k in members]
-    return (
+def _merge(scans: list[StillScan], poses: FloatArray, members: Iterable[int]) -> Scan:
+    """Several scans in one frame."""
+    return Scan(
         np.concatenate([apply(poses[k], scans[k].points) for k in members]),
-        np.concatenate(turned),
-        np.concatenate([scans[k].good for k in members]),
+        np.concatenate([apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]),
     )
 
 
 def _align_one(
-    scans: list[StillScan], poses: FloatArray, k: int, members: list[int], gates: FloatArray,
-    s: AlignmentSettings,
-) -> FloatArray:  # fmt: skip
-    points, normals, good = _merge(scans, poses, members)
-    pose, _, _ = align_scans(scans[k].points, points, normals, good, poses[k], gates, s.kept, 1e-7)
+    scans: list[StillScan], poses: FloatArray, k: int, target: Scan, gates: FloatArray, kept: float
+) -> FloatArray:
+    pose = align_scans(scans[k].points, target, poses[k], gates, kept, 1e-7)
     return pose if np.isfinite(pose).all() else poses[k]
 
 
@@ -306,10 +299,11 @@ def _merged(
     """One scan after the other, best overlapping first, aligned with those merged already."""
     poses = poses.copy()
     members = [0]
+    gates = np.geomspace(s.gate_m, 0.08, 8)
     while len(members) < len(scans):
         outside = [k for k in range(len(scans)) if k not in members]
         k = max(outside, key=lambda k: max(shares[min(k, m), max(k, m)] for m in members))
-        poses[k] = _align_one(scans, poses, k, members, _gates(s.gate_m, 0.08, 8), s)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, members), gates, s.kept)
         members.append(k)
     return poses
 
@@ -317,9 +311,10 @@ def _merged(
 def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
     """Each scanner but the first aligned again with the merged scans of all others."""
     poses = poses.copy()
+    gates = np.geomspace(0.15, 0.06, 4)
     for k in range(1, len(scans)):
         others = [m for m in range(len(scans)) if m != k]
-        poses[k] = _align_one(scans, poses, k, others, _gates(0.15, 0.06, 4), s)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, others), gates, s.kept)
     return poses
 
 
@@ -342,7 +337,7 @@ def _whole_to_map(
         body = rigid_fit(poses[:, :2].copy(), measured[:, :2].copy(), np.ones(len(poses), bool))
     else:
         body = compose(measured[0], invert(poses[0]))
-    everything, _, _ = _merge(scans, poses, list(range(len(scans))))
+    everything = _merge(scans, poses, range(len(scans))).points
     for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
         body = icp_to_segments(everything, building, body, IcpSettings(gate, s.kept, 1e-5)).pose
     return compose(np.broadcast_to(body, poses.shape), poses)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import read_json, write_json
+from redetect.groundtruth.files import read_json, write_json
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -167,7 +167,7 @@ def write_scanners(
     overwrite: bool = False,
 ) -> None:
     """Write a ``scanners.json`` with covariances, and other entries, whole or not at all."""
-    content = {"version": 1, "scanners": [_scanner_entry(s) for s in scanners], **(extra or {})}
+    content = {"version": 1, "scanners": [scanner_entry(s) for s in scanners], **(extra or {})}
     write_json(path, content, overwrite=overwrite)
 
 
@@ -191,26 +191,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
         raise GroundTruthError(f"{path}: {error}") from None
 
 
-def write_robot(
-    path: str | os.PathLike[str],
-    robot: Robot,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Write a ``robot.json``, and other entries, whole or not at all."""
-    content = {
-        "version": 1,
-        "outline": robot.outline.tolist(),
-        "largest_speed_m_s": robot.largest_speed_m_s,
-        "largest_turn_rad_s": robot.largest_turn_rad_s,
-        "scanners": [_scanner_entry(s) for s in robot.scanners],
-        **(extra or {}),
-    }
-    write_json(path, content, overwrite=overwrite)
-
-
-def _scanner_entry(scanner: Scanner) -> dict[str, Any]:
+def scanner_entry(scanner: Scanner) -> dict[str, Any]:
+    """A scanner as files have it."""
     return {
         "name": scanner.name,
         "pose": scanner.pose.tolist(),

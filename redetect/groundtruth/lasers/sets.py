@@ -1,21 +1,115 @@
-"""Scans of several scanners as sets, and the tables by which the kernels work on them."""
+"""Scans of several scanners as sets, the background that they see, and the kernels' tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.background import Background
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, read_robot, read_scanners
+from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.groundtruth.lasers.tracking_kernels import Beams
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """A scanner's static background, beam by beam.
+
+    Attributes
+    ----------
+    range_m : (readings,) float64
+        Median of the beam's readings; NaN where it has none.
+    sigma_m : (readings,) float64
+        Their standard deviation by the median of deviations, at least `least_sigma_m`; NaN where
+        the beam has none.
+    near_m : (readings,) float64
+        A reading below this is something that was not there; infinite where the beam sees nothing.
+    drop_out : (readings,) float64
+        Share of the scans without a reading.
+    quantum_m : float
+        All readings are whole multiples of this; 0 if there are none.
+    scans : int
+        Scans that it was learned from.
+    """
+
+    range_m: FloatArray
+    sigma_m: FloatArray
+    near_m: FloatArray
+    drop_out: FloatArray
+    quantum_m: float
+    scans: int
+
+
+def learn_background(
+    ranges_mm: NDArray[np.uint16],
+    max_range_m: float,
+    *,
+    least_sigma_m: float = 0.005,
+    margin_sigma: float = 5.0,
+    passing: float = 0.02,
+) -> Background:
+    """Learn the background of the beams from scans of the empty area.
+
+    Parameters
+    ----------
+    ranges_mm : (N, readings) uint16
+        The scans; 0 or `max_range_m` and more where nothing came back.
+    max_range_m : float
+        The scanner's.
+    least_sigma_m : float
+        Standard deviation that a beam has at least (m).
+    margin_sigma : float
+        A reading is new if it is this many standard deviations nearer than the nearest object that
+        the beam saw.
+    passing : float
+        The nearest object is at this quantile of the beam's readings: beams along an edge see near
+        and far in turn, and nearer readings than that are treated as passing objects.
+
+    Returns
+    -------
+    Background
+
+    Raises
+    ------
+    GroundTruthError
+        If there are no scans.
+    """
+    if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
+        raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
+    metres = ranges_mm * 1e-3
+    hit = (ranges_mm > 0) & (metres < max_range_m)
+    ordered = np.sort(np.where(hit, metres, np.inf), axis=0)
+    count = hit.sum(axis=0)
+    beams = np.arange(ranges_mm.shape[1])
+
+    def quantile(values: FloatArray, share: float) -> FloatArray:
+        row = np.minimum((share * count).astype(np.int64), np.maximum(count - 1, 0))
+        return np.asarray(values[row, beams])
+
+    median = quantile(ordered, 0.5)
+    # Two readings in a hundred scans say nothing about the background.
+    seen = count >= max(1, round(0.02 * len(ranges_mm)))
+    deviation = np.full_like(metres, np.inf)
+    np.subtract(metres, median, out=deviation, where=hit)
+    deviation = np.sort(np.abs(deviation), axis=0)
+    sigma = np.maximum(1.4826 * quantile(deviation, 0.5), least_sigma_m)
+    near = np.where(seen, quantile(ordered, passing), 0.0)
+    near -= margin_sigma * np.where(seen, sigma, 0.0)
+    return Background(
+        np.where(seen, median, np.nan),
+        np.where(seen, sigma, np.nan),
+        np.where(seen, np.maximum(near, 0.0), np.inf),
+        1.0 - count / len(ranges_mm),
+        1e-3 * float(np.gcd.reduce(ranges_mm, axis=None)),
+        len(ranges_mm),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +173,12 @@ class ScanSets:
         return len(self.times_s)
 
 
-def scanner_tables(
-    scanners: Sequence[Scanner],
-    backgrounds: Sequence[Background],
-    joint_covariance: FloatArray | None = None,
-) -> ScannerTables:
+def scanner_tables(scanners: Sequence[Scanner], backgrounds: Sequence[Background]) -> ScannerTables:
     """Arrange scanners and their backgrounds for the kernels.
 
     Parameters
     ----------
     scanners, backgrounds : sequences of the same length
-    joint_covariance : (3 scanners, 3 scanners) array, optional
-        Of their poses; by default that of each one by itself.
 
     Raises
     ------
@@ -116,12 +204,6 @@ def scanner_tables(
         angle = scanner.pose[2] + scanner.angles_rad
         beams[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = scanner.covariance
-    if joint_covariance is not None:
-        if joint_covariance.shape != covariance.shape:
-            raise GroundTruthError(
-                f"joint covariance of shape {joint_covariance.shape}: expected {covariance.shape}"
-            )
-        covariance = np.array(joint_covariance, dtype=np.float64)
     return ScannerTables(
         tuple(scanner.name for scanner in scanners),
         np.stack([scanner.pose for scanner in scanners]),
@@ -188,3 +270,26 @@ def _group(
         begun = t
         rows.append(current)
     return np.array(rows, dtype=np.int64).reshape(-1, scanners)
+
+
+def load_session(
+    folder: Path, calibration: Path
+) -> tuple[tuple[Scanner, ...], Robot, ScannerTables, ScanSets]:
+    """Read fixed scanners, robot, scans, and learn the background.
+
+    Raises
+    ------
+    GroundTruthError
+        If a file is missing or does not fit the others.
+    """
+    scanners = read_scanners(calibration)
+    robot = read_robot(folder / "robot.json")
+    backgrounds = []
+    for scanner in scanners:
+        path = find_scans(folder / "empty", scanner.name)
+        backgrounds.append(
+            learn_background(read_scans(path, scanner.readings).ranges_mm, scanner.max_range_m)
+        )
+    tables = scanner_tables(scanners, backgrounds)
+    scans = [read_scans(find_scans(folder, s.name), s.readings) for s in scanners]
+    return scanners, robot, tables, sets_of_scans(scans)

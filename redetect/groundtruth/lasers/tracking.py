@@ -8,20 +8,25 @@ that the beams agree. Errors of one set affect the next one's pose only through 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.geometry.plane import compose
-from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import LaserSettings
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
-from redetect.groundtruth.lasers.settings import LaserSettings
-from redetect.groundtruth.lasers.tracking_kernels import Seen, fit_outline, new_points
+from redetect.groundtruth.lasers.tracking_kernels import Seen, new_points
+from redetect.groundtruth.trajectories.plane import compose
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
@@ -186,7 +191,7 @@ class Tracker:
         if len(seen.points) < s.least_readings:
             self.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
             return None
-        start, _, count, _ = fit_outline(
+        start, _, count = fit_outline(
             seen.points, body.faces, predicted, s.gate_m, s.kept, s.threshold_m, s.most_steps
         )
         if count < s.least_readings:
@@ -321,7 +326,7 @@ class Tracker:
         s, body = self.settings, self.body
         start = compose(self.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
-        start, _, _, _ = fit_outline(
+        start, _, _ = fit_outline(
             seen.points, body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
         )
         found = refine(seen, start, self.tables, body, s, 0.02)
@@ -394,3 +399,135 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     enough = (n[:, 0] > 4) & (spread[:, 0] > 1e-6)
     out[enough] = ((stx - st * sx / n) / np.where(spread > 0.0, spread, 1.0))[enough]
     return out
+
+
+_SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
+
+
+def track_robot(
+    sets: ScanSets, tables: ScannerTables, robot: Robot, settings: LaserSettings | None = None
+) -> LaserTrack:
+    """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`)."""
+    settings = LaserSettings() if settings is None else settings
+    body = robot_body(robot.outline, settings.symmetry_m)
+    return Tracker(
+        sets, tables, body, robot.largest_speed_m_s, robot.largest_turn_rad_s, settings
+    ).run()
+
+
+def track_without_suspects(
+    sets: ScanSets,
+    tables: ScannerTables,
+    robot: Robot,
+    scanners: tuple[Scanner, ...],
+    settings: LaserSettings | None = None,
+) -> tuple[LaserTrack, dict[str, FloatArray]]:
+    """Follow the robot, leaving out scanners whose readings do not fit the others'.
+
+    One at a time, the worst first, and only while three scanners or more are left to say so.
+
+    Returns
+    -------
+    track : LaserTrack
+    left_out : dict of str to (2, 3) float64
+        By scanner, the shift that its readings suggest and its standard deviations.
+    """
+    left_out: dict[str, FloatArray] = {}
+    track = track_robot(sets, tables, robot, settings)
+    while len(scanners) - len(left_out) >= 3:
+        excess = excess_shifts(track, scanners)
+        worst = int(np.argmax(excess))
+        if excess[worst] <= 1.0:
+            break
+        left_out[scanners[worst].name] = np.stack(
+            [track.corrections[worst], track.correction_sigma[worst]]
+        )
+        rows = sets.rows.copy()
+        rows[:, worst] = -1
+        sets = replace(sets, rows=rows)
+        track = track_robot(sets, tables, robot, settings)
+    return track, left_out
+
+
+def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:
+    """(scanners,) how far beyond what is allowed their shifts are; above 1 is suspect."""
+    least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
+    excess = np.zeros(len(scanners))
+    for k, scanner in enumerate(scanners):
+        shift, sigma = track.corrections[k], track.correction_sigma[k]
+        if np.isfinite(shift).all():
+            allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
+            excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
+    return excess
+
+
+#: Sets farther apart than this are not of one block (s).
+LARGEST_GAP_S = 0.05
+
+
+def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
+    """Poses of a track, each from `sets_per_pose` consecutive sets.
+
+    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set
+    is in one pose only, so that the readings' errors in different poses are independent; those of
+    the scanners' poses are common to all and are not averaged away.
+
+    Parameters
+    ----------
+    track : LaserTrack
+    sets_per_pose : int
+        1: every set by itself. A block is shorter at the end of a visit, and where sets have no
+        determined pose.
+
+    Returns
+    -------
+    PlanarPoses
+        Sets with an undetermined direction come as poses of their own, with the covariance that
+        says so; those whose front is unknown do not come at all.
+
+    Raises
+    ------
+    GroundTruthError
+        If `sets_per_pose` is not positive.
+    """
+    if sets_per_pose < 1:
+        raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
+    determined = np.isin(track.status, (OK, REACQUIRED))
+    rows = np.flatnonzero(determined | (track.status == UNDETERMINED))
+    if not len(rows):
+        return PlanarPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    times = track.times_s[rows]
+    # A new block where the visit changes, after a gap, and round an undetermined set.
+    parted = np.ones(len(rows), dtype=np.bool_)
+    parted[1:] = (
+        (track.segment[rows[1:]] != track.segment[rows[:-1]])
+        | (np.diff(times) > LARGEST_GAP_S)
+        | ~determined[rows[1:]]
+        | ~determined[rows[:-1]]
+    )
+    first = np.flatnonzero(parted)
+    run = np.cumsum(parted) - 1
+    within = (np.arange(len(rows)) - first[run]) // sets_per_pose
+    begins = parted | np.concatenate([[True], np.diff(within) != 0])
+    block = np.cumsum(begins) - 1
+    count = int(block[-1]) + 1
+
+    size = np.bincount(block, minlength=count).astype(np.float64)
+    origin = times[0]
+    middle = np.bincount(block, times - origin, minlength=count) / size
+    lead = track.poses[rows[np.flatnonzero(begins)]]
+    moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
+    apart = moved - lead[block]
+    apart[:, 2] = wrap_angle(apart[:, 2])
+    # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
+    # with equal weights at the mean time an error of the motion drops out.
+    noise, shared = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
+    mean = np.zeros((count, 3))
+    np.add.at(mean, block, apart / size[block][:, None])
+    np.add.at(noise, block, track.noise[rows] / (size**2)[block][:, None, None])
+    np.add.at(shared, block, (track.covariances - track.noise)[rows] / size[block][:, None, None])
+    poses = lead + mean
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    covariances = noise + shared
+    covariances = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+    return PlanarPoses(middle + origin, poses, covariances)

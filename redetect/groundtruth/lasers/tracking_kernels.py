@@ -14,8 +14,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from redetect.groundtruth.lasers.icp_kernels import nearest_on_segments, rigid_fit
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -160,58 +158,6 @@ def new_points(
             range_m[n] = 1e-3 * r
             n += 1
     return points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy()
-
-
-@njit(cache=True, error_model="numpy")
-def to_robot(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Points of the world in the robot's frame."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    out = np.empty_like(points)
-    for i in range(points.shape[0]):
-        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
-        out[i, 0], out[i, 1] = c * dx + s * dy, -s * dx + c * dy
-    return out
-
-
-@njit(cache=True, error_model="numpy")
-def fit_outline(
-    points: FloatArray,
-    faces: FloatArray,
-    start: FloatArray,
-    gate_m: float,
-    kept: float,
-    threshold_m: float,
-    most_steps: int,
-) -> tuple[FloatArray, float, int, int]:
-    """Trimmed ICP of the outline to points: pose, root mean square error, pairs used, steps.
-
-    Every step pairs each point with the nearest point of the outline within the gate, keeps the
-    best share and fits by singular values, until the error changes by less than the threshold.
-    """
-    pose = start.copy()
-    before = np.inf
-    rms, count, step = np.inf, 0, 0
-    used = np.zeros(points.shape[0], dtype=np.bool_)
-    while True:
-        nearest, _, squared = nearest_on_segments(to_robot(points, pose), faces)
-        limit = gate_m * gate_m
-        within = squared[squared <= limit]
-        if within.size < 3:
-            return pose, np.inf, within.size, step
-        within.sort()
-        limit = within[math.ceil(kept * within.size) - 1]
-        total, count = 0.0, 0
-        for i in range(points.shape[0]):
-            used[i] = squared[i] <= limit
-            if used[i]:
-                total += squared[i]
-                count += 1
-        rms = math.sqrt(total / count)
-        if abs(before - rms) < threshold_m or step == most_steps:
-            return pose, rms, count, step
-        before = rms
-        pose = rigid_fit(nearest, points, used)
-        step += 1
 
 
 @njit(cache=True, error_model="numpy")

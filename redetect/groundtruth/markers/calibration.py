@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.transforms import quaternion_xyzw, transform_from_quaternion
-from redetect.groundtruth.json_file import read_json, write_json
+from redetect.groundtruth.files import read_json, write_json
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]

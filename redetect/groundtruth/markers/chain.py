@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.geometry.transforms import apply, hat, inverse
+from redetect.groundtruth.trajectories.transforms import apply, hat, inverse
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -14,51 +14,14 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.transforms import inverse, log_se3, transform
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
-from redetect.groundtruth.markers.bundle import Bundle, PosePrior
+from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
 from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.checkerboard import Checkerboard
 from redetect.groundtruth.markers.pnp import solve_camera
 from redetect.groundtruth.markers.settings import NetworkSettings
+from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class BoardView:
-    """A board in an image.
-
-    Attributes
-    ----------
-    camera : str
-    board : str
-    corners : (K, 2) float64
-        Pixels, in the order of `Checkerboard.points`.
-    """
-
-    camera: str
-    board: str
-    corners: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class DoubleBoard:
-    """Two boards held together.
-
-    Attributes
-    ----------
-    first, second : str
-    offset : (4, 4) float64 or None
-        `first_from_second`; None if it is to be estimated.
-    covariance : (6, 6) float64
-        Of its right perturbation; zeros if it is exactly known.
-    """
-
-    first: str
-    second: str
-    offset: FloatArray | None
-    covariance: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.covariance import (
+from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
+    inverse,
     inverse_covariance,
+    log_se3,
     mean_pose,
 )
-from redetect.groundtruth.geometry.transforms import inverse, log_se3
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

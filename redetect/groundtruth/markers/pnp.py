@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.transforms import apply, inverse, transform
 from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.settings import Solver
+from redetect.groundtruth.trajectories.transforms import apply, inverse, transform
 
 FloatArray = NDArray[np.float64]
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.transforms import inverse, log_se3, rotation_angle
 from redetect.groundtruth.markers.pnp import robot_rms_px, solve_robot, view_poses
 from redetect.groundtruth.markers.refinement import (
     PoseProblem,
@@ -24,6 +23,7 @@ from redetect.groundtruth.markers.refinement import (
     refine_pose,
 )
 from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.trajectories.transforms import inverse, log_se3, rotation_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import read_json_value
+from redetect.groundtruth.files import read_json_value
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.trajectories.alignment import align_poses
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.storage.bounded import read_bounded
 
@@ -177,8 +176,7 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
     except GroundTruthError:
         inputs.missing.append("building.csv or building.dxf")
         return None
-    building = _read(inputs, path, read_building)
-    return None if building is None else building.segments
+    return _read(inputs, path, read_building)
 
 
 def _document(path: Path) -> dict[str, Any]:

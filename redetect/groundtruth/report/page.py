@@ -17,7 +17,7 @@ from redetect.groundtruth.report.figures import (
     series_figure,
 )
 from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.matching import matched_streams
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 from redetect.groundtruth.validation.validate import PUBLISHED

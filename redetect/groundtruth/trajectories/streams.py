@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.geometry.transforms import quaternion_xyzw
-from redetect.groundtruth.text_file import read_text
+from redetect.groundtruth.files import read_text
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.json_file import read_json, write_json
-from redetect.groundtruth.text_file import read_text
-from redetect.storage import write_whole
+from redetect.groundtruth.files import read_json, read_text
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
-_HEAD = "pose,t,point,fiducial,distance_m"
+DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
 _NAME = re.compile(r"[^\s,#\"]{1,64}")
 _LARGEST_FILE_BYTES = 1 << 26
 _FARTHEST_M = 1e6
@@ -88,24 +85,6 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     return Survey(points[0], points[1], float(sigma))
 
 
-def write_survey(
-    path: str | os.PathLike[str],
-    survey: Survey,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Write a ``fiducials.json``, and other entries, whole or not at all."""
-    content = {
-        "version": 1,
-        "fiducials": {name: point.tolist() for name, point in survey.fiducials.items()},
-        "robot_points": {name: point.tolist() for name, point in survey.robot_points.items()},
-        "sigma_m": survey.sigma_m,
-        **(extra or {}),
-    }
-    write_json(path, content, overwrite=overwrite)
-
-
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
     """Read a ``distances.csv``.
 
@@ -129,19 +108,10 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     rows: list[Distance] = []
     for number, line in enumerate(text.split("\n"), 1):
         content = line.partition("#")[0].strip()
-        if not content or (not rows and content == _HEAD):
+        if not content or (not rows and content == DISTANCES_HEAD):
             continue
         rows.append(_distance(path, number, [word.strip() for word in content.split(",")], survey))
     return rows
-
-
-def write_distances(
-    path: str | os.PathLike[str], distances: list[Distance], *, overwrite: bool = False
-) -> None:
-    """Write a ``distances.csv``, whole or not at all; in tenths of a millimetre."""
-    rows = [f"{d.pose},{d.time_s:.6f},{d.point},{d.fiducial},{d.distance_m:.4f}" for d in distances]
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(("\n".join([_HEAD, *rows]) + "\n").encode())
 
 
 def _points(
@@ -169,11 +139,11 @@ def _distance(
     path: str | os.PathLike[str], number: int, words: list[str], survey: Survey
 ) -> Distance:
     if len(words) != 5:
-        raise StreamError(path, number, f"{len(words)} words: expected {_HEAD}")
+        raise StreamError(path, number, f"{len(words)} words: expected {DISTANCES_HEAD}")
     try:
         pose, time, distance = int(words[0]), float(words[1]), float(words[4])
     except ValueError:
-        raise StreamError(path, number, f"expected numbers in {_HEAD}") from None
+        raise StreamError(path, number, f"expected numbers in {DISTANCES_HEAD}") from None
     if pose < 0 or not np.isfinite(time) or not 0.0 <= distance < _FARTHEST_M:
         raise StreamError(path, number, "expected a pose and a distance of 0 or more, finite")
     for name, known in ((words[2], survey.robot_points), (words[3], survey.fiducials)):

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.plane import apply
 from redetect.groundtruth.lasers.icp import IcpResult, IcpSettings, icp_to_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.trajectories.plane import apply
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
 from redetect.storage.bounds import ABOVE_0, PROBABILITY, SHARE_ABOVE_0, demand

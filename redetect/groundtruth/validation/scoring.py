@@ -1,16 +1,25 @@
-"""Compares poses with the truth: errors, and whether their covariances are right."""
+"""Compares poses with the truth: absolute and relative errors, and their covariances."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.alignment import align_poses
-from redetect.groundtruth.trajectories.interpolation import matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
+from redetect.groundtruth.trajectories.matching import (
+    align_poses,
+    interpolate_poses,
+    matched_streams,
+)
+from redetect.groundtruth.trajectories.plane import between
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    is_positive_definite,
+    read_rows_of_numbers,
+)
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -148,3 +157,167 @@ def compare_streams(
 
 def _sigma(values: FloatArray) -> float:
     return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+
+
+_COLUMNS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """Poses of the robot at one time relative to another.
+
+    Attributes
+    ----------
+    from_s, to_s : (N,) float64
+        The two times (s); either may be the earlier one.
+    from_to : (N, 3) float64
+        x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`.
+    """
+
+    from_s: FloatArray
+    to_s: FloatArray
+    from_to: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.from_s)
+
+
+@dataclass(frozen=True)
+class RelativeScore:
+    """Relative errors.
+
+    Attributes
+    ----------
+    pairs : int
+        Pairs of times compared with the truth.
+    unmatched : int
+        Pairs that one side has no pose for, or that are too far apart.
+    position_mean_m, position_sigma_m, position_median_m, position_rmse_m, position_max_m : float
+        Of the lengths of the relative errors' translations; sigma with N - 1.
+    angle_rmse_rad, angle_abs_mean_rad, angle_max_rad : float
+        Of the relative errors' rotations.
+    """
+
+    pairs: int
+    unmatched: int
+    position_mean_m: float
+    position_sigma_m: float
+    position_median_m: float
+    position_rmse_m: float
+    position_max_m: float
+    angle_rmse_rad: float
+    angle_abs_mean_rad: float
+    angle_max_rad: float
+
+
+def read_relations(path: str | os.PathLike[str]) -> Relations:
+    """Read a file of relations: rows t_i, t_j, x, y, z, roll, pitch, yaw between blanks or commas.
+
+    Of these x, y and yaw count: poses are on a floor.
+
+    Raises
+    ------
+    StreamError
+        If the file cannot be read or a row is malformed; the message names file and line.
+    """
+    table = read_rows_of_numbers(path, _COLUMNS, "t_i, t_j, x, y, z, roll, pitch, yaw")
+    return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
+
+
+def score_relations(
+    poses: PlanarPoses, relations: Relations, largest_gap_s: float = np.inf
+) -> RelativeScore:
+    """Hold poses against known relations; the poses are interpolated at the relations' times.
+
+    Parameters
+    ----------
+    poses : PlanarPoses
+    relations : Relations
+    largest_gap_s : float
+        Nothing is interpolated across longer gaps.
+
+    Returns
+    -------
+    RelativeScore
+
+    Raises
+    ------
+    GroundTruthError
+        If no relation has poses at both its times.
+    """
+    before, known_before = _at(poses, relations.from_s, largest_gap_s)
+    after, known_after = _at(poses, relations.to_s, largest_gap_s)
+    known = known_before & known_after
+    return relative_score(
+        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
+    )
+
+
+def score_steps(
+    poses: PlanarPoses, truth: PlanarPoses, step: int, longest_s: float = np.inf
+) -> RelativeScore:
+    """Relative errors over steps of a truth, from every pose.
+
+    Parameters
+    ----------
+    poses, truth : PlanarPoses
+        With the same times.
+    step : int
+        From each pose to the one `step` poses later.
+    longest_s : float
+        Steps that take longer, as across a gap, do not count (s).
+
+    Returns
+    -------
+    RelativeScore
+
+    Raises
+    ------
+    GroundTruthError
+        If the numbers of poses differ or no step remains.
+    """
+    if len(poses) != len(truth):
+        raise GroundTruthError(f"{len(poses)} poses and {len(truth)} of the truth: expected equal")
+    if step < 1:
+        raise GroundTruthError(f"step is {step}: expected 1 or more")
+    known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
+    mine, right = (between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
+    return relative_score(right, mine, int((~known).sum()))
+
+
+def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0) -> RelativeScore:
+    """Figures of the errors truth^-1 * estimate of (N, 3) relative poses.
+
+    Raises
+    ------
+    GroundTruthError
+        If there is none.
+    """
+    if not len(truth):
+        raise GroundTruthError("no two times with poses to compare relative to each other")
+    error = between(truth, estimates)
+    length = np.hypot(error[:, 0], error[:, 1])
+    return RelativeScore(
+        len(error),
+        unmatched,
+        float(length.mean()),
+        float(length.std(ddof=1)) if len(length) > 1 else 0.0,
+        float(np.median(length)),
+        float(np.sqrt(np.mean(length**2))),
+        float(length.max()),
+        float(np.sqrt(np.mean(error[:, 2] ** 2))),
+        float(np.abs(error[:, 2]).mean()),
+        float(np.abs(error[:, 2]).max()),
+    )
+
+
+def _at(
+    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
+) -> tuple[FloatArray, BoolArray]:
+    """(N, 3) poses at times in any order, and which of them there are; zeros elsewhere."""
+    order = np.argsort(times_s, kind="stable")
+    interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
+    result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
+    result[order[found]] = interpolated.poses
+    known[order[found]] = True
+    return result, known

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.trajectories.transforms import (
     adjoint,
     apply,
     exp_se3,

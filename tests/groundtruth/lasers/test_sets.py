@@ -7,10 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.background import learn_background
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.lasers.sets import ScannerTables, scanner_tables, sets_of_scans
+from redetect.groundtruth.lasers.sets import (
+    ScannerTables,
+    learn_background,
+    scanner_tables,
+    sets_of_scans,
+)
 from tests.groundtruth.lasers.scene import (
     empty_scans,
     four_scanners,

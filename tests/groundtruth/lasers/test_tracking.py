@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.plane import compose, invert
 from redetect.groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
-from redetect.groundtruth.lasers.background import learn_background
-from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import LaserSettings
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets, scanner_tables, sets_of_scans
-from redetect.groundtruth.lasers.settings import LaserSettings
-from redetect.groundtruth.lasers.suspects import track_robot, track_without_suspects
+from redetect.groundtruth.lasers.sets import (
+    ScannerTables,
+    ScanSets,
+    learn_background,
+    scanner_tables,
+    sets_of_scans,
+)
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -29,14 +32,17 @@ from redetect.groundtruth.lasers.tracking import (
     REACQUIRED,
     UNDETERMINED,
     UNRESOLVED,
+    combined_poses,
+    track_robot,
+    track_without_suspects,
 )
 from redetect.groundtruth.lasers.tracking_kernels import (
     Beams,
     Seen,
     explain_set,
-    fit_outline,
     new_points,
 )
+from redetect.groundtruth.trajectories.plane import compose, invert
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import (
@@ -143,7 +149,7 @@ def test_exact_readings_give_the_exact_pose(
     body = robot_body(FRONTED)
     seen = exact(scanners, pose, tables)
     start = pose + np.array([0.03, -0.02, 0.05])
-    found, rms, count, _ = fit_outline(seen.points, body.faces, start, 0.2, 0.95, 1e-9, 500)
+    found, rms, count = fit_outline(seen.points, body.faces, start, 0.2, 0.95, 1e-9, 500)
     assert found == pytest.approx(pose, abs=2e-3)
     assert rms < 1e-3
     assert count >= 0.9 * len(seen.points)

@@ -13,7 +13,6 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.building import Building, write_building
 from redetect.groundtruth.report.figures import (
     Series,
     Track,
@@ -28,6 +27,7 @@ from redetect.groundtruth.report.page import report_page, table
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.validation.scoring import compare_streams
 from redetect.reporting.page import Part, Section, page_of
+from tools.simulator.laser.writers import write_building
 
 HOSTILE = "\"><script>alert(1)</script><img src=x onerror=alert(2)>\x00\ud800 </style> & 'onload="
 NAMES = """html head meta title style body a header nav ul li main section h1 h2 p div table caption
@@ -100,7 +100,7 @@ def session(tmp_path: Path) -> Path:
     folder = tmp_path / "a session <b>"
     folder.mkdir()
     walls = np.array([[0, 0, 6, 0], [6, 0, 6, 6], [6, 6, 0, 6], [0, 6, 0, 0]], dtype=float)
-    write_building(folder / "building.csv", Building(walls))
+    write_building(folder / "building.csv", walls)
     for seed, (name, noise) in enumerate({"laser": 0.003, "camera": 0.05, "fused": 0.002}.items()):
         write_planar_poses(folder / f"{name}.csv", stream(noise, seed))
     write_planar_poses(folder / "truth.csv", stream(0.0, 9, covariance=False))
@@ -209,7 +209,7 @@ def test_files_larger_than_the_bounds_are_not_read(
     for module, name in (
         ("report.inputs", "_MOST_LINES_BYTES"),
         ("report.inputs", "_MOST_PICTURE_BYTES"),
-        ("json_file", "_LARGEST_FILE_BYTES"),
+        ("files", "_LARGEST_FILE_BYTES"),
     ):
         monkeypatch.setattr(f"redetect.groundtruth.{module}.{name}", 64)
     inputs = gather(session)

@@ -1,4 +1,4 @@
-"""JSON files: read with a bound on their size, written in lines that people can read."""
+"""Text and JSON files: read with a bound on their size; JSON written in lines people can read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 
@@ -69,3 +69,29 @@ def _laid_out(value: Any, indent: str = "") -> str:
     if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple | Mapping):
         return "[\n" + ",\n".join(deeper + _laid_out(v, deeper) for v in value) + f"\n{indent}]"
     return json.dumps(value, allow_nan=False)
+
+
+def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
+    """The text of a file (UTF-8, perhaps with a byte order mark).
+
+    Parameters
+    ----------
+    path : path
+    largest_bytes : int
+        A larger file is refused.
+    expected : str
+        What should be in it, for the message about a file that is no text.
+
+    Raises
+    ------
+    StreamError
+        If it cannot be read or is no text.
+    """
+    try:
+        return read_bounded(path, largest_bytes).decode("utf-8-sig")
+    except FileNotFoundError:
+        raise StreamError(path, None, "no such file") from None
+    except UnicodeDecodeError:
+        raise StreamError(path, None, f"is no text: expected {expected}") from None
+    except OSError as error:
+        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
