@@ -34,73 +34,40 @@ _LARGEST_NUMBER = 1e15
 
 @dataclass(frozen=True)
 class ClockSegment:
-    """The two clocks over one segment of the ground truth.
+    """The two clocks over one segment of the ground truth."""
 
-    Attributes
-    ----------
-    from_s, to_s : float
-        The segment, on the ground truth's clock.
-    reference_s : float
-        Where in it the offset holds, on the ground truth's clock.
-    offset_s : float
-        Robot time minus ground truth time there.
-    rate : float
-        Seconds of the robot's clock per second of the ground truth's.
-    angle_rad : float
-        Heading of the ground truth minus heading of the odometry.
-    sigma_offset_s, sigma_rate, sigma_angle_rad : float
-        Standard deviations; infinite where the segment does not determine the value.
-    turned_rad : float
-        Sum of the absolute values of the robot's turns.
-    status : str
-        `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
-        `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at
-        the limit of the search range.
-    note : str
-        Details of the status.
-    """
-
+    # `from_s`, `to_s`: The segment, on the ground truth's clock
     from_s: float
     to_s: float
-    reference_s: float
-    offset_s: float
-    rate: float
-    angle_rad: float
-    sigma_offset_s: float
-    sigma_rate: float
-    sigma_angle_rad: float
-    turned_rad: float
-    status: Status
-    note: str = ""
+    reference_s: float  # Where in it the offset holds, on the ground truth's clock
+    offset_s: float = 0.0  # Robot time minus ground truth time there
+    rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
+    angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
+    # `sigma_offset_s`, `sigma_rate`, `sigma_angle_rad`: Standard deviations; infinite where the
+    # segment does not determine the value.
+    sigma_offset_s: float = math.inf
+    sigma_rate: float = math.inf
+    sigma_angle_rad: float = math.inf
+    turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
+    # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
+    # `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at the
+    # limit of the search range.
+    status: Status = "ok"
+    note: str = ""  # Details of the status
 
 
 @dataclass(frozen=True)
 class ClockModel:
-    """The robot's clock against the ground truth's over a session.
+    """The robot's clock against the ground truth's over a session."""
 
-    Attributes
-    ----------
-    segments : tuple of ClockSegment
-        In order; at least one whose offset is determined.
-    """
-
-    segments: tuple[ClockSegment, ...]
+    segments: tuple[ClockSegment, ...]  # In order; at least one whose offset is determined.
 
     def __post_init__(self) -> None:
         if not self.segments:
             raise GroundTruthError("a clock without segments: expected at least one")
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
-        """Robot times of times on the ground truth's clock.
-
-        Parameters
-        ----------
-        times_s : (N,) array_like
-
-        Returns
-        -------
-        (N,) float64
-        """
+        """Robot times of times on the ground truth's clock."""
         knots, offsets = self._knots()
         times = np.asarray(times_s, dtype=np.float64)
         offset = np.interp(times, knots, offsets)
@@ -111,22 +78,7 @@ class ClockModel:
         return np.asarray(times + offset)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
-        """Times on the ground truth's clock of robot times: the inverse of `robot_times`.
-
-        Parameters
-        ----------
-        robot_times_s : (N,) array_like
-
-        Returns
-        -------
-        (N,) float64
-
-        Raises
-        ------
-        GroundTruthError
-            If the clock stops or runs backward between two segments (it was set back): then a robot
-            time has no unique ground truth time.
-        """
+        """Times on the ground truth's clock of robot times: the inverse of `robot_times`."""
         knots, offsets = self._knots()
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
@@ -169,14 +121,6 @@ def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
 
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
-
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    ClockModel
 
     Raises
     ------
@@ -233,17 +177,9 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     A clock that is neither disciplined nor set runs evenly over minutes. Segments that are minutes
     apart then determine its rate much better than each alone, and its offset somewhat better.
 
-    Parameters
-    ----------
-    segments : sequence of ClockSegment
-        Of one session, in order.
-
-    Returns
-    -------
-    list of ClockSegment
-        With the line's offsets, rates and deviations, and a note; unchanged where fewer than two
-        segments are determined, a clock was set, or one line does not explain them: its squared
-        error is larger than one session in a thousand has by chance.
+    `segments`: of one session, in order. Returns with the line's offsets, rates and deviations, and
+    a note; unchanged where fewer than two segments are determined, a clock was set, or one line
+    does not explain them: its squared error is larger than one session in a thousand has by chance.
     """
     determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}

@@ -20,15 +20,8 @@ BoolArray = NDArray[np.bool_]
 def continuous_headings(poses: PlanarPoses) -> FloatArray:
     """Headings without jumps of whole turns.
 
-    Parameters
-    ----------
-    poses : PlanarPoses
-        Sampled so often that the robot turns less than half a turn between neighbours.
-
-    Returns
-    -------
-    (N,) float64
-        Headings (rad), beyond +-pi where the robot went on turning.
+    `poses`: sampled so often that the robot turns less than half a turn between neighbours. Returns
+    (N,): headings (rad), beyond +-pi where the robot went on turning.
     """
     return np.asarray(np.unwrap(poses.poses[:, 2]))
 
@@ -36,17 +29,8 @@ def continuous_headings(poses: PlanarPoses) -> FloatArray:
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
     """Cut times where a pause is longer than a limit.
 
-    Parameters
-    ----------
-    times_s : (N,) array
-        Ascending.
-    largest_gap_s : float
-        Longer pauses begin a new segment.
-
-    Returns
-    -------
-    list of slice
-        The segments' samples.
+    `times_s` (N,): ascending. `largest_gap_s`: longer pauses begin a new segment. Returns the
+    segments' samples.
     """
     cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
     ends = [0, *cuts.tolist(), len(times_s)]
@@ -58,14 +42,7 @@ def heading_noise(times_s: FloatArray, headings_rad: FloatArray) -> float:
 
     Third differences cancel whatever turns smoothly; their median does not mind single jumps.
 
-    Parameters
-    ----------
-    times_s, headings_rad : (N,) arrays
-        At least 5 samples, headings continuous.
-
-    Returns
-    -------
-    float
+    `times_s`, `headings_rad` (N,): at least 5 samples, headings continuous.
     """
     if len(times_s) < 5:
         raise GroundTruthError(f"{len(times_s)} headings: expected 5 or more")
@@ -81,30 +58,16 @@ def sampling_interval(times_s: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class HeadingIntegral:
-    """Headings as a function of time, straight between samples, of which exact means are taken.
+    """Headings as a function of time, straight between samples, of which exact means are taken."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Ascending.
-    headings_rad : (N,) float64
-        Continuous.
-    """
-
-    times_s: FloatArray
-    headings_rad: FloatArray
+    times_s: FloatArray  # (N,): ascending
+    headings_rad: FloatArray  # (N,): continuous
 
     def means(self, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
         """Mean headings between pairs of times.
 
-        Parameters
-        ----------
-        from_s, to_s : (M,) arrays
-            Ends of the windows, `to_s` later; outside the samples the first or last heading holds.
-
-        Returns
-        -------
-        (M,) float64
+        `from_s`, `to_s` (M,): ends of the windows, `to_s` later; outside the samples the first or
+        last heading holds.
         """
         return np.asarray((self._integral(to_s) - self._integral(from_s)) / (to_s - from_s))
 
@@ -139,17 +102,8 @@ def windowed_means(
 ) -> tuple[FloatArray, FloatArray]:
     """Means of headings over windows side by side; windows with a gap in them are left out.
 
-    Parameters
-    ----------
-    times_s, headings_rad : (N,) arrays
-        Headings continuous.
-    window_s : float
-        Length of each window.
-
-    Returns
-    -------
-    middles_s, means_rad : (M,) arrays
-        Middles of the windows and the mean headings.
+    `times_s`, `headings_rad` (N,): headings continuous. `window_s`: length of each window. Returns
+    `middles_s`, `means_rad` (M,): middles of the windows and the mean headings.
     """
     count = int((times_s[-1] - times_s[0]) / window_s)
     edges = times_s[0] + window_s * np.arange(count + 1)
@@ -237,21 +191,10 @@ def pair_headings(
 ) -> HeadingPair | None:
     """The comparable part of two streams, fixed for a whole search of offset and drift.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        On the robot's clock.
-    segment : PlanarPoses
-        Ground truth without long pauses, on its own clock.
-    largest_offset_s, largest_drift : float
-        Bounds of the search.
-    fewest : int
-        Samples without which a comparison is worth nothing.
-
-    Returns
-    -------
-    HeadingPair or None
-        None if the other stream covers too few samples in the whole search range.
+    `odometry`: on the robot's clock. `segment`: ground truth without long pauses, on its own clock.
+    `largest_offset_s`, `largest_drift`: bounds of the search. `fewest`: samples without which a
+    comparison is worth nothing. Returns none if the other stream covers too few samples in the
+    whole search range.
     """
     if len(segment) < fewest:
         return None
@@ -315,16 +258,8 @@ def _way_driven(poses: PlanarPoses, times_s: FloatArray) -> FloatArray:
 def without_turns(differences: FloatArray, *, keep_mean: bool = False) -> FloatArray:
     """Differences of headings without whole turns: all within half a turn of their mean angle.
 
-    Parameters
-    ----------
-    differences : (N,) array
-    keep_mean : bool
-        Whether their mean angle stays in; else it is subtracted, which eliminates the angle between
-        the streams' axes.
-
-    Returns
-    -------
-    (N,) float64
+    `differences` (N,). `keep_mean`: whether their mean angle stays in; else it is subtracted, which
+    eliminates the angle between the streams' axes.
     """
     middle = float(np.angle(np.mean(np.exp(1j * differences))))
     level = wrap_angle(differences - middle)

@@ -42,22 +42,11 @@ def refine_by_movement(
 ) -> list[ClockSegment]:
     """Move each segment's offset and rate to where the movements fit best.
 
-    Parameters
-    ----------
-    segments : sequence of ClockSegment
-        The estimate by headings.
-    odometry : PlanarPoses
-        The robot's own poses on its own clock.
-    groundtruth : PlanarPoses
-        Poses with covariances.
-    largest : (float, float)
-        Bounds of the offset (s) and the drift, either way.
-
-    Returns
-    -------
-    list of ClockSegment
-        Refined if their status is `ok` or `jump`, the robot drove a metre or more, and the result
-        is near the estimate by headings and within the bounds; the others unchanged.
+    `segments`: the estimate by headings. `odometry`: the robot's own poses on its own clock.
+    `groundtruth`: poses with covariances. `largest` (float, float): bounds of the offset (s) and
+    the drift, either way. Returns refined if their status is `ok` or `jump`, the robot drove a
+    metre or more, and the result is near the estimate by headings and within the bounds; the others
+    unchanged.
     """
     if groundtruth.covariances is None:
         return list(segments)
@@ -87,9 +76,7 @@ def _refined(
         or float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))) < _LEAST_WAY_M
     ):
         return segment
-    measured = PlanarPoses(
-        groundtruth.times_s[here], groundtruth.poses[here], groundtruth.covariances[here]
-    )
+    measured = groundtruth.only(here)
     robot_times, own = odometry.times_s[near], odometry.poses[near]
     settings = FuseSettings()
     noise = noise_of(settings)

@@ -29,36 +29,17 @@ _LEAST_SIGMA_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Wandering:
-    """Noise of N samples of a difference.
+    """Noise of N samples of a difference."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Ascending strictly.
-    sigma : float
-        Standard deviation of each sample's own noise, above 0.
-    rate : float
-        Variance that the random walk gains per second, above 0.
-    systematic : (N, k) float64
-        Shapes that the difference may have besides, each times an unknown factor of deviation 1.
-    """
-
-    times_s: FloatArray
-    sigma: float
-    rate: float
+    times_s: FloatArray  # (N,): ascending strictly
+    sigma: float  # Standard deviation of each sample's own noise, above 0
+    rate: float  # Variance that the random walk gains per second, above 0
+    # (N, k): shapes that the difference may have besides, each times an unknown factor of deviation
+    # 1
     systematic: FloatArray
 
     def whiten(self, values: FloatArray) -> FloatArray:
-        """Multiply by the inverse of the covariance, the walk's level being unknown to it.
-
-        Parameters
-        ----------
-        values : (N,) or (N, k) array
-
-        Returns
-        -------
-        array of the same shape
-        """
+        """Multiply by the inverse of the covariance, the walk's level being unknown to it."""
         weighted = self._without_walk(values)
         shapes, inverse = self._shapes
         return np.asarray(weighted - shapes @ (inverse @ (self.systematic.T @ weighted)))
@@ -109,25 +90,10 @@ def estimate_wandering(
 ) -> Wandering:
     """Separate noise from random walk by the differences of samples over increasing time lags.
 
-    Parameters
-    ----------
-    times_s : (N,) array
-        Ascending strictly, N of 10 or more.
-    values : (N,) array
-        Differences of headings, without jumps.
-    systematic : (N, k) array, optional
-        Shapes that the differences may have besides; what of them is in the values is taken off.
-    lags : tuple of int
-        How many samples apart they are compared; short ones do not mind what changes slowly.
-
-    Returns
-    -------
-    Wandering
-
-    Raises
-    ------
-    GroundTruthError
-        If there are fewer samples, or two of one time.
+    `times_s` (N,): ascending strictly, N of 10 or more. `values` (N,): differences of headings,
+    without jumps. `systematic` (N, k): shapes that the differences may have besides; what of them
+    is in the values is taken off. `lags`: how many samples apart they are compared; short ones do
+    not mind what changes slowly.
     """
     if len(times_s) < 10:
         raise GroundTruthError(f"{len(times_s)} samples: expected 10 or more")
@@ -183,16 +149,7 @@ def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
     A step of the offset at each of many places is compared with the drift: there was a jump if a
     step explains the headings better than the drift does, or much that the drift leaves over.
 
-    Parameters
-    ----------
-    pair : HeadingPair
-    offset_s, drift : float
-        The best without a jump.
-
-    Returns
-    -------
-    float or None
-        The time on the ground truth's clock.
+    `offset_s`, `drift`: the best without a jump. Returns the time on the ground truth's clock.
     """
     jacobian = pair.sensitivities(offset_s, drift)
     information = np.cumsum(jacobian[:, 0] ** 2)

@@ -82,13 +82,7 @@ def perform(command: Poses) -> int:
 
 
 def read_all_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
-    """The markers found in all runs, whose folders' names are the cameras'.
-
-    Raises
-    ------
-    GroundTruthError
-        If a folder's name is no camera of the network.
-    """
+    """The markers found in all runs, whose folders' names are the cameras'."""
     frames = []
     for run in runs:
         name = run.resolve().name

@@ -42,90 +42,59 @@ __all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
 
 @dataclass(frozen=True)
 class Rejected:
-    """A measurement that the gate kept out.
+    """A measurement that the gate kept out."""
 
-    Attributes
-    ----------
-    stream : str
-        Its stream.
-    time_s : float
-    squared_innovation : float
-        Squared normalised innovation.
-    """
-
-    stream: str
+    stream: str  # Its stream
     time_s: float
-    squared_innovation: float
+    squared_innovation: float  # Squared normalised innovation
 
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """Odometry's errors estimated from the measurements.
+    """Odometry's errors estimated from the measurements."""
 
-    Attributes
-    ----------
-    turn_scale, turn_bias_per_metre, distance_scale : float
-        By what share turns are longer than odometry says, the turn it misses per metre (rad), by
-        what share ways are longer.
-    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
-        Their standard deviations.
-    distance_sigma, lateral_sigma, turn_sigma, turn_per_metre_sigma : float
-        Its random errors, as in `FuseSettings`.
-    looser_in_gaps : float
-        By what factor their variances were raised where nothing was measured for more than a
-        second, since odometry erred more over seconds than from sample to sample; 1 if it did not.
-    """
-
+    # `turn_scale`, `turn_bias_per_metre`, `distance_scale`: By what share turns are longer than
+    # odometry says, the turn it misses per metre (rad), by what share ways are longer
     turn_scale: float
     turn_bias_per_metre: float
     distance_scale: float
+    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Their standard
+    # deviations
     turn_scale_sigma: float
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
+    # `distance_sigma`, `lateral_sigma`, `turn_sigma`, `turn_per_metre_sigma`: Its random errors, as
+    # in `FuseSettings`
     distance_sigma: float
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
+    # By what factor their variances were raised where nothing was measured for more than a second,
+    # since odometry erred more over seconds than from sample to sample; 1 if it did not.
     looser_in_gaps: float
 
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
-    """The robot's path from all streams.
+    """The robot's path from all streams."""
 
-    Attributes
-    ----------
-    poses : PlanarPoses
-        At the odometry's times from the first measurement to the last, with covariances; headings
-        within +-pi.
-    rejected : tuple of Rejected
-        In order of time.
-    restarts_s : tuple of float
-        When the filter was restarted because no measurement fitted any more.
-    used : dict of str to int
-        Measurements that went in, by stream.
-    odometry : OdometryErrors
-        The estimated errors of odometry.
-    localisation : LocalisationErrors or None
-        Errors of odometry that is a localisation, along which the path was estimated then.
-    repaired : dict of str to int
-        Covariances that were not positive definite as written, by stream; they were raised by their
-        file's rounding.
-    repeated : dict of str to int
-        Rows that were the row before once more, by stream; they counted once.
-    pauses_s : tuple of (float, float)
-        Between which times odometry was not written, within the poses' time. What may have been
-        driven there besides, at the rates at which the robot usually goes, makes it less certain.
-    """
-
+    # At the odometry's times from the first measurement to the last, with covariances; headings
+    # within +-pi.
     poses: PlanarPoses
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[Rejected, ...]  # In order of time
+    # When the filter was restarted because no measurement fitted any more
     restarts_s: tuple[float, ...]
-    used: dict[str, int]
-    odometry: OdometryErrors
+    used: dict[str, int]  # Measurements that went in, by stream
+    odometry: OdometryErrors  # The estimated errors of odometry
+    # Errors of odometry that is a localisation, along which the path was estimated then
     localisation: LocalisationErrors | None
+    # Covariances that were not positive definite as written, by stream; they were raised by their
+    # file's rounding.
     repaired: dict[str, int]
+    # Rows that were the row before once more, by stream; they counted once.
     repeated: dict[str, int]
+    # Between which times odometry was not written, within the poses' time. What may have been
+    # driven there besides, at the rates at which the robot usually goes, makes it less certain.
     pauses_s: tuple[tuple[float, float], ...]
 
 
@@ -142,11 +111,6 @@ def fuse(
         The robot's own poses, on the measurements' clock; only movements between them count.
     streams : mapping of str to PlanarPoses
         Measured poses with covariances, by name.
-    settings : FuseSettings, optional
-
-    Returns
-    -------
-    Fusion
 
     Raises
     ------
@@ -224,28 +188,18 @@ _LARGEST_GAP_S = 2.0
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A segment of the ground truth, predicted without it.
+    """A segment of the ground truth, predicted without it."""
 
-    Attributes
-    ----------
-    from_s, to_s : float
-        The segment.
-    poses : int
-        Of the ground truth in it that have a prediction.
-    position_rms_m, heading_rms_rad : float
-        Root of the mean squared error of the fused path.
-    normalised_error : float
-        Mean squared normalised error per number, 1 if covariances are right.
-    aligned_position_rms_m, aligned_heading_rms_rad : float
-        The same of odometry after the rigid motion that fits it to the other segments best.
-    """
-
+    # `from_s`, `to_s`: The segment
     from_s: float
     to_s: float
-    poses: int
+    poses: int  # Of the ground truth in it that have a prediction
+    # `position_rms_m`, `heading_rms_rad`: Root of the mean squared error of the fused path
     position_rms_m: float
     heading_rms_rad: float
-    normalised_error: float
+    normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
+    # `aligned_position_rms_m`, `aligned_heading_rms_rad`: The same of odometry after the rigid
+    # motion that fits it to the other segments best
     aligned_position_rms_m: float
     aligned_heading_rms_rad: float
 
@@ -277,7 +231,7 @@ def leave_out(
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)
     inside = (truth.times_s >= own.times_s[0]) & (truth.times_s <= own.times_s[-1])
-    truth = _some(truth, inside)
+    truth = truth.only(inside)
     cuts = np.flatnonzero(np.diff(truth.times_s) > _SEGMENT_GAP_S) + 1
     parts = [times for times in np.split(truth.times_s, cuts) if len(times)]
     if len(parts) < 3:
@@ -301,19 +255,19 @@ def _left_out(
 ) -> LeftOut:
     fusion = fuse(
         odometry,
-        {name: _some(one, ~_during(one, from_s, to_s)) for name, one in streams.items()},
+        {name: one.only(~_during(one, from_s, to_s)) for name, one in streams.items()},
         settings,
     )
     here = _during(truth, from_s, to_s)
-    segment, others = _some(truth, here), _some(truth, ~here)
+    segment, others = truth.only(here), truth.only(~here)
     predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
-    error = _difference(predicted, _some(segment, known))
+    error = _difference(predicted, segment.only(known))
     assert predicted.covariances is not None
     assert segment.covariances is not None
     covariances = predicted.covariances + segment.covariances[known]
     weighted = np.linalg.solve(covariances, error[:, :, None])[:, :, 0]
     beside, aligned = interpolate_poses(odometry, others.times_s, _LARGEST_GAP_S)
-    moved = moved_poses(odometry, planar_alignment(beside, _some(others, aligned)))
+    moved = moved_poses(odometry, planar_alignment(beside, others.only(aligned)))
     rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
     return LeftOut(
         from_s,
@@ -321,13 +275,8 @@ def _left_out(
         len(predicted),
         *_rms(error),
         float(np.mean(np.sum(error * weighted, axis=1)) / 3.0),
-        *_rms(_difference(rigid, _some(segment, known))),
+        *_rms(_difference(rigid, segment.only(known))),
     )
-
-
-def _some(poses: PlanarPoses, which: NDArray[np.bool_]) -> PlanarPoses:
-    covariances = None if poses.covariances is None else poses.covariances[which]
-    return PlanarPoses(poses.times_s[which], poses.poses[which], covariances)
 
 
 def _during(poses: PlanarPoses, from_s: float, to_s: float) -> NDArray[np.bool_]:

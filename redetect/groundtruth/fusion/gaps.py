@@ -47,19 +47,12 @@ _TURN_PER_METRE = 4
 
 @dataclass(frozen=True, eq=False)
 class Bridge:
-    """The likeliest path over a gap.
+    """The likeliest path over a gap."""
 
-    Attributes
-    ----------
-    path : (N, 6) float64 or None
-        States from the gap's begin to its end; headings have no jumps. None if more than one
-        number of whole turns may be, or if none explains the end.
-    looser : float
-        By what factor odometry's variances had to be raised to explain it, 1 or more.
-    """
-
+    # (N, 6): states from the gap's begin to its end; headings have no jumps. None if more than one
+    # number of whole turns may be, or if none explains the end.
     path: FloatArray | None
-    looser: float
+    looser: float  # By what factor odometry's variances had to be raised to explain it, 1 or more
 
 
 def gaps_where_lost(
@@ -101,23 +94,12 @@ def bridge(
 ) -> Bridge:
     """Find the likeliest path between two known ends.
 
-    Parameters
-    ----------
-    controls, variances : (N, 4), (N, 3) arrays
-        Of the movements to each node; the first are not used (see `filter_forward`).
-    forward : (N - 1, 6) array
-        Where odometry leads from the first node on, up to the node before the last.
-    spread : (6, 6) array
-        Covariance at the first node.
-    end, end_spread : (3,), (3, 3) arrays
-        Pose at the last node, and covariance.
-    gate : float
-        Largest squared normalised distance of the end that odometry explains; beyond it, it is
-        taken to err more in this gap than elsewhere.
-
-    Returns
-    -------
-    Bridge
+    `controls`, `variances` (N, 4), (N, 3): of the movements to each node; the first are not used
+    (see `filter_forward`). `forward` (N - 1, 6): where odometry leads from the first node on, up to
+    the node before the last. `spread` (6, 6): covariance at the first node. `end`, `end_spread`
+    (3,), (3, 3): pose at the last node, and covariance. `gate`: largest squared normalised distance
+    of the end that odometry explains; beyond it, it is taken to err more in this gap than
+    elsewhere.
     """
     looser = 1.0
     for _ in range(_MOST_LOOSENINGS):
@@ -217,17 +199,9 @@ def back_from(
 ) -> tuple[FloatArray, FloatArray]:
     """States and covariances predicted backward by odometry from a gap's end.
 
-    Parameters
-    ----------
-    controls, variances : (N, 4), (N, 3) arrays
-        Of the movements to each node; the first are not used.
-    end, end_spread : (6,), (6, 6) arrays
-        At the last node.
-
-    Returns
-    -------
-    states, spreads : (N, 6), (N, 6, 6) arrays
-        In the order of the nodes.
+    `controls`, `variances` (N, 4), (N, 3): of the movements to each node; the first are not used.
+    `end`, `end_spread` (6,), (6, 6): at the last node. Returns `states`, `spreads` (N, 6), (N, 6,
+    6): in the order of the nodes.
     """
     count = len(controls)
     # Driven backward, all rates change their signs; the turn per metre does so by itself.

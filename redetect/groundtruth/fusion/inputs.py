@@ -31,44 +31,30 @@ _DEVIATIONS = (
 class FuseSettings:
     """How odometry errs, and how far a measurement may be off.
 
-    Parameters
-    ----------
-    distance_sigma : float
-        Standard deviation of odometry's distance after a metre (m); it grows with the root.
-    lateral_sigma : float
-        How far the robot slips sideways within a metre (m), its standard deviation; it grows with
-        the root. The lateral error by a wrong heading is not part of it.
-    turn_sigma : float
-        Standard deviation of its heading after turning a radian (rad).
-    turn_per_metre_sigma : float
-        The same after a metre driven (rad).
-    learn_noise : bool
-        Scale these deviations (distance's, the sideways one, and both of the heading together) by
-        what makes the measurements likeliest; they only begin the search then.
-    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
-        Standard deviations, before anything was measured, of what odometry is off by: the share of
-        each turn, the turn per metre (rad), the share of each way. Terms that make no better
-        predictions are left out.
-    gate_probability : float
-        Share of right poses that pass the gate.
-    covariance_scale : dict of str to float
-        Factors on the measurements' covariances, by the stream's name; others count as 1.
-
     Raises
     ------
     GroundTruthError
         If a number is not finite, negative, or no probability.
     """
 
+    # Standard deviation of odometry's distance after a metre (m); it grows with the root.
     distance_sigma: float = 0.02
+    # How far the robot slips sideways within a metre (m), its standard deviation; it grows with the
+    # root. The lateral error by a wrong heading is not part of it.
     lateral_sigma: float = 0.01
-    turn_sigma: float = 0.02
-    turn_per_metre_sigma: float = 0.01
+    turn_sigma: float = 0.02  # Standard deviation of its heading after turning a radian (rad)
+    turn_per_metre_sigma: float = 0.01  # The same after a metre driven (rad)
+    # Scale these deviations (distance's, the sideways one, and both of the heading together) by
+    # what makes the measurements likeliest; they only begin the search then.
     learn_noise: bool = True
+    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Standard deviations,
+    # before anything was measured, of what odometry is off by: the share of each turn, the turn per
+    # metre (rad), the share of each way. Terms that make no better predictions are left out.
     turn_scale_sigma: float = 0.03
     turn_bias_per_metre_sigma: float = 0.01
     distance_scale_sigma: float = 0.03
-    gate_probability: float = 0.9999
+    gate_probability: float = 0.9999  # Share of right poses that pass the gate
+    # Factors on the measurements' covariances, by the stream's name; others count as 1.
     covariance_scale: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
@@ -119,15 +105,8 @@ _USUAL_RATES_QUANTILE = 0.9
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
     """Pauses of odometry: only the resulting movement is known, not the path.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        No two samples of one time.
-
-    Returns
-    -------
-    list of (float, float)
-        The times of the samples before and after each pause.
+    `odometry`: no two samples of one time. Returns the times of the samples before and after each
+    pause.
     """
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
@@ -145,21 +124,10 @@ def movements(
 ) -> tuple[FloatArray, FloatArray]:
     """Movements between nodes, each a share of an arc between two samples of odometry.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        Two samples or more, no two of one time.
-    node_times_s : (N,) array
-        Ascending, within odometry's time.
-    settings : FuseSettings
-
-    Returns
-    -------
-    controls : (N, 4) float64
-        As in `redetect.groundtruth.fusion.movement.MovementProblem`.
-    unseen : (N, 2) float64
-        Additional distance (m) and turn (rad) that the robot may have made where odometry pauses,
-        at its usual rates.
+    `odometry`: two samples or more, no two of one time. `node_times_s` (N,): ascending, within
+    odometry's time. Returns `controls` (N, 4): as in
+    `redetect.groundtruth.fusion.movement.MovementProblem`. `unseen` (N, 2): additional distance (m)
+    and turn (rad) that the robot may have made where odometry pauses, at its usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
@@ -231,18 +199,9 @@ def variances_of(
     but for what pauses hide: there odometry's systematic bend has a way to act on that is not
     known, and what a wrong heading leads aside is taken to be that of a way out and back.
 
-    Parameters
-    ----------
-    times_s, controls, unseen : (N,), (N, 4), (N, 2) arrays
-        Nodes, and the movements to them.
-    noise : (4,) array
-        Odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
-    settings : FuseSettings
-
-    Returns
-    -------
-    (N, 3) float64
-        Along the way, across it (m^2), of the turn (rad^2).
+    `times_s`, `controls`, `unseen` (N,), (N, 4), (N, 2): nodes, and the movements to them. `noise`
+    (4,): odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`. Returns (N,
+    3): along the way, across it (m^2), of the turn (rad^2).
     """
     along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])
@@ -268,29 +227,10 @@ def gather(
 ) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-    streams : mapping of str to PlanarPoses
-        Measured poses, by name.
-    settings : FuseSettings
-
-    Returns
-    -------
-    names : list of M str
-        The stream of each measurement.
-    times_s, poses, covariances : (M,), (M, 3), (M, 3, 3) arrays
-    repaired : dict of str to int
-        Covariances that had to be raised, by stream.
-    repeated : dict of str to int
-        Rows that are the row before once more, to the last digit, by stream: left out, since one
-        measurement must not count twice.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no measurement within the odometry's time, a stream has no covariances, or one
-        of them cannot be repaired.
+    `streams`: measured poses, by name. Returns `names`: the stream of each measurement. `times_s`,
+    `poses`, `covariances` (M,), (M, 3), (M, 3, 3). `repaired`: covariances that had to be raised,
+    by stream. `repeated`: rows that are the row before once more, to the last digit, by stream:
+    left out, since one measurement must not count twice.
     """
     names: list[str] = []
     times, poses, covariances = [], [], []

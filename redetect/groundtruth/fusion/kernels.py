@@ -30,6 +30,8 @@ IntArray = NDArray[np.int64]
 #: Length of the state, and of the pose at its beginning.
 STATE = 6
 POSE = 3
+#: Restart of the filter at a node: none, after many rejections, where it was lost.
+NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 # Below this half turn (rad) differences cancel, and series are right to ten digits.
 _SERIES_BELOW = 0.1
 
@@ -38,23 +40,11 @@ _SERIES_BELOW = 0.1
 def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     """Effect of errors along an arc of length 1.
 
-    Parameters
-    ----------
-    half_turn : float
-        Half the angle between its tangents at both ends (rad).
-
-    Returns
-    -------
-    chord : float
-        Length of the chord, sin(h) / h.
-    mean_along : float
-        Mean of (cos h - cos 2ht) / 2h over t from -1/2 to 1/2. The mean of (sin h - sin 2ht) / 2h
-        is half the chord.
-    variance_along, variance_across : float
-        Variances of the two over t.
-    mean_cosine : float
-        Mean of cos(4ht), sin(2h) / 2h: how much of the difference between errors along the way and
-        across it is left in the directions of the chord.
+    `half_turn`: half the angle between its tangents at both ends (rad). Returns `chord`: length of
+    the chord, sin(h) / h. `mean_along`: mean of (cos h - cos 2ht) / 2h over t from -1/2 to 1/2. The
+    mean of (sin h - sin 2ht) / 2h is half the chord. `variance_along`, `variance_across`: variances
+    of the two over t. `mean_cosine`: mean of cos(4ht), sin(2h) / 2h: how much of the difference
+    between errors along the way and across it is left in the directions of the chord.
     """
     h = half_turn
     q = h * h
@@ -85,19 +75,12 @@ def move(
 ) -> None:
     """Move a state and its covariance on by a movement of odometry, in place.
 
-    Parameters
-    ----------
-    x, p : (6,), (6, 6) arrays
-        State (see `redetect.groundtruth.fusion.kernels`) and covariance; replaced.
-    f : (6, 6) array
-        Identity on the first call; becomes the derivative of the new state by the old one.
-    control : (4,) array
-        Way forward, way to the left (m) and turn (rad), summed up over the movement in the robot's
-        own, turning frame; and the part of the turn that a share of turns is a share of.
-    variances : (3,) array
-        What noise along the way, across it (m^2) and of the turn (rad^2) sum up to.
-    point : (6,) array
-        The state at which the movement is linearised.
+    `x`, `p` (6,), (6, 6): state (see `redetect.groundtruth.fusion.kernels`) and covariance;
+    replaced. `f` (6, 6): identity on the first call; becomes the derivative of the new state by the
+    old one. `control` (4,): way forward, way to the left (m) and turn (rad), summed up over the
+    movement in the robot's own, turning frame; and the part of the turn that a share of turns is a
+    share of. `variances` (3,): what noise along the way, across it (m^2) and of the turn (rad^2)
+    sum up to. `point` (6,): the state at which the movement is linearised.
     """
     way = math.sqrt(control[0] * control[0] + control[1] * control[1])
     turn, distinct = control[2], control[3]
@@ -142,20 +125,11 @@ def move(
     qc = middle - apart + lever * variance_across
     cross = east * north * (qa - qc) + of_turn * by_turn_x * by_turn_y
     p[0, 0] += east * east * qa + north * north * qc + of_turn * by_turn_x * by_turn_x
-    p[0, 1] += cross
-    p[1, 0] += cross
     p[1, 1] += north * north * qa + east * east * qc + of_turn * by_turn_y * by_turn_y
-    p[0, 2] += of_turn * by_turn_x
-    p[2, 0] += of_turn * by_turn_x
-    p[1, 2] += of_turn * by_turn_y
-    p[2, 1] += of_turn * by_turn_y
     p[2, 2] += of_turn
-
-
-KindArray = NDArray[np.int8]
-
-#: Restart of the filter at a node: none, after many rejections, where it was lost.
-NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
+    for i, j, value in ((0, 1, cross), (0, 2, of_turn * by_turn_x), (1, 2, of_turn * by_turn_y)):
+        p[i, j] += value
+        p[j, i] += value
 
 
 @njit(cache=True, error_model="numpy")
@@ -231,72 +205,41 @@ def _update(
 
 
 class Odometry(NamedTuple):
-    """Movements to N nodes, each from the node before; the first is not used.
+    """Movements to N nodes, each from the node before; the first is not used."""
 
-    Attributes
-    ----------
-    controls : (N, 4) float64
-        As `move` takes them.
-    variances : (N, 3) float64
-        Accumulated noise along the way, across it and of the turn.
-    """
-
-    controls: FloatArray
-    variances: FloatArray
+    controls: FloatArray  # (N, 4): as `move` takes them
+    variances: FloatArray  # (N, 3): accumulated noise along the way, across it and of the turn
 
 
 class MeasuredPoses(NamedTuple):
-    """M poses measured at some of the nodes, in ascending order.
+    """M poses measured at some of the nodes, in ascending order."""
 
-    Attributes
-    ----------
-    nodes : (M,) int64
-    poses, covariances : (M, 3), (M, 3, 3) float64
-    """
-
-    nodes: IntArray
+    nodes: IntArray  # (M,)
+    # `poses`, `covariances`: (M, 3), (M, 3, 3)
     poses: FloatArray
     covariances: FloatArray
 
 
 class Gating(NamedTuple):
-    """When a measurement is rejected, and when the filter restarts from one.
+    """When a measurement is rejected, and when the filter restarts from one."""
 
-    Attributes
-    ----------
-    largest_squared : float
-        Largest squared normalised innovation.
-    restart_after : int
-        After this number of rejections in a row the pose becomes the measured one, with
-        `restart_variances`, however far off the filter was.
-    restart_variances : (3,) float64
-    lost_variance : float
-        The same at once where the heading's variance (rad^2) is greater.
-    cuts : (N,) bool
-        The same at these nodes, at their first measurement.
-    """
-
-    largest_squared: float
+    largest_squared: float  # Largest squared normalised innovation
+    # After this number of rejections in a row the pose becomes the measured one, with
+    # `restart_variances`, however far off the filter was
     restart_after: int
-    restart_variances: FloatArray
-    lost_variance: float
-    cuts: BoolArray
+    restart_variances: FloatArray  # (3,)
+    lost_variance: float  # The same at once where the heading's variance (rad^2) is greater
+    cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
 
 
 class FilterHistory(NamedTuple):
-    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother.
-
-    Attributes
-    ----------
-    predicted, predicted_covariance, filtered, filtered_covariance : float64
-    transitions : (N, 6, 6) float64
-        Derivatives of each node's prediction with respect to the node before.
-    """
+    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother."""
 
     predicted: FloatArray
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
+    # (N, 6, 6): derivatives of each node's prediction with respect to the node before
     transitions: FloatArray
 
 
@@ -317,32 +260,15 @@ def filter_forward(
     gating: Gating,
     points: FloatArray,
     history: FilterHistory,
-) -> tuple[FloatArray, BoolArray, KindArray, float]:
+) -> tuple[FloatArray, BoolArray, NDArray[np.int8], float]:
     """Filter N nodes forward.
 
-    Parameters
-    ----------
-    odometry : Odometry
-    start, start_covariance : (6,), (6, 6) float64
-        Before the measurements at the first node.
-    measured : MeasuredPoses
-    gating : Gating
-    points : (N, 6) float64
-        States at which each movement away from a node is linearised, with headings that go on
-        without jumps; measured headings are assumed to be within half a turn of them. Of length 1:
-        at the filter's own.
-    history : FilterHistory
-        Filled, unless it is of no nodes.
-
-    Returns
-    -------
-    squared_innovations : (M,) float64
-        Normalised.
-    accepted : (M,) bool
-    restarted : (N,) int8
-        Whether the filter began anew at a node, and why.
-    surprise : float
-        Minus twice the logarithm of the likelihood of the accepted innovations.
+    `start`, `start_covariance` (6,), (6, 6): before the measurements at the first node. `points`
+    (N, 6): states at which each movement away from a node is linearised, with headings that go on
+    without jumps; measured headings are assumed to be within half a turn of them. Of length 1: at
+    the filter's own. `history`: filled, unless it is of no nodes. Returns `squared_innovations`
+    (M,): normalised. `accepted` (M,). `restarted` (N,): whether the filter began anew at a node,
+    and why. `surprise`: minus twice the logarithm of the likelihood of the accepted innovations.
     """
     controls, nodes = odometry.controls, measured.nodes
     keep = len(history.predicted) > 0
@@ -421,44 +347,13 @@ def filter_forward(
 
 
 @njit(cache=True, error_model="numpy")
-def _factor(p: FloatArray, lower: FloatArray) -> None:
-    """Cholesky factor of a covariance; directions without any variance are left out."""
-    for i in range(STATE):
-        for j in range(i + 1):
-            total = p[i, j]
-            for n in range(j):
-                total -= lower[i, n] * lower[j, n]
-            if i == j:
-                lower[i, i] = math.sqrt(total) if total > 1e-15 * p[i, i] else 0.0
-            else:
-                lower[i, j] = total / lower[j, j] if lower[j, j] > 0.0 else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _solve(lower: FloatArray, right: FloatArray) -> None:
-    """Replace a vector by the covariance's inverse times it, given the factor."""
-    for i in range(STATE):
-        total = right[i]
-        for n in range(i):
-            total -= lower[i, n] * right[n]
-        right[i] = total / lower[i, i] if lower[i, i] > 0.0 else 0.0
-    for i in range(STATE - 1, -1, -1):
-        total = right[i]
-        for n in range(i + 1, STATE):
-            total -= lower[n, i] * right[n]
-        right[i] = total / lower[i, i] if lower[i, i] > 0.0 else 0.0
-
-
-@njit(cache=True, error_model="numpy")
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     """Smooth what `filter_forward` left, from the last node to the first.
 
     Where the filter began anew, poses before learn from what came after only what it says of
     odometry's systematic errors.
 
-    Returns
-    -------
-    states, covariances : (N, 6), (N, 6, 6) float64
+    Returns `states`, `covariances` (N, 6), (N, 6, 6).
     """
     predicted, predicted_covariance = history.predicted, history.predicted_covariance
     filtered, filtered_covariance = history.filtered, history.filtered_covariance
@@ -467,43 +362,16 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     last = predicted.shape[0] - 1
     smoothed[last] = filtered[last]
     smoothed_covariance[last] = filtered_covariance[last]
-    lower = np.zeros((STATE, STATE))
-    temporary = np.empty((STATE, STATE))
-    gain = np.empty((STATE, STATE))
-    difference = np.empty(STATE)
     for k in range(last - 1, -1, -1):
-        p, f = filtered_covariance[k], transitions[k + 1]
-        _factor(predicted_covariance[k + 1], lower)
-        # gain = p f' (predicted covariance)^-1, row by row.
+        p = filtered_covariance[k]
+        expected = predicted_covariance[k + 1].copy()
         for i in range(STATE):
-            for j in range(POSE):
-                total = 0.0
-                for n in range(STATE):
-                    total += p[i, n] * f[j, n]
-                gain[i, j] = total
-            for j in range(POSE, STATE):
-                gain[i, j] = p[i, j]
-            _solve(lower, gain[i])
-        for i in range(STATE):
-            difference[i] = smoothed[k + 1, i] - predicted[k + 1, i]
-        for i in range(STATE):
-            total = filtered[k, i]
-            for j in range(STATE):
-                total += gain[i, j] * difference[j]
-            smoothed[k, i] = total
-        for i in range(STATE):
-            for j in range(STATE):
-                total = 0.0
-                for n in range(STATE):
-                    total += gain[i, n] * (
-                        smoothed_covariance[k + 1, n, j] - predicted_covariance[k + 1, n, j]
-                    )
-                temporary[i, j] = total
-        for i in range(STATE):
-            for j in range(i, STATE):
-                total = p[i, j]
-                for n in range(STATE):
-                    total += temporary[i, n] * gain[j, n]
-                smoothed_covariance[k, i, j] = total
-                smoothed_covariance[k, j, i] = total
+            # What is known exactly stays as it is.
+            if expected[i, i] == 0.0:
+                expected[i, i] = 1.0
+        gain = np.ascontiguousarray(np.linalg.solve(expected, transitions[k + 1] @ p).T)
+        smoothed[k] = filtered[k] + gain @ (smoothed[k + 1] - predicted[k + 1])
+        change = smoothed_covariance[k + 1] - predicted_covariance[k + 1]
+        spread = p + gain @ change @ gain.T
+        smoothed_covariance[k] = 0.5 * (spread + spread.T)
     return smoothed, smoothed_covariance

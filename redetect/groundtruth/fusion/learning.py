@@ -79,16 +79,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
     yet over a gap. So most measurements are left out, and what odometry makes of the ways between
     those that are left is compared with them.
 
-    Parameters
-    ----------
-    problem : MovementProblem
-    noise : (4,) array
-        Odometry's random errors.
-
-    Returns
-    -------
-    float
-        1 unless errors are beyond what chance explains.
+    `noise` (4,): odometry's random errors. Returns 1 unless errors are beyond what chance explains.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -123,17 +114,8 @@ def terms_that_pay(
     samples, measured poses deny it, and a share of turns comes out that is none (regression
     dilution). Over seconds, and over gaps, such an estimate predicts worse than none.
 
-    Parameters
-    ----------
-    problem : MovementProblem
-    noise : (4,) array
-        Odometry's random errors over seconds.
-    means, deviations : (3,) arrays
-        The estimates.
+    `noise` (4,): odometry's random errors over seconds. `means`, `deviations` (3,): the estimates.
 
-    Returns
-    -------
-    (3,) bool
     """
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0

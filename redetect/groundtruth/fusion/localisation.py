@@ -57,49 +57,32 @@ _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 
 @dataclass(frozen=True)
 class LocalisationErrors:
-    """How odometry errs that is a localisation.
+    """How odometry errs that is a localisation."""
 
-    Attributes
-    ----------
-    position_sigma, heading_sigma : float
-        Standard deviations of x and y (m each), and of the heading (rad).
-    position_correlation_s, heading_correlation_s : float
-        After which time errors are alike by 1/e only.
-    heading_offset : float
-        Heading of the ground truth beyond that of the aligned localisation (rad).
-    """
-
+    # `position_sigma`, `heading_sigma`: Standard deviations of x and y (m each), and of the heading
+    # (rad)
     position_sigma: float
     heading_sigma: float
+    # `position_correlation_s`, `heading_correlation_s`: After which time errors are alike by 1/e
+    # only
     position_correlation_s: float
     heading_correlation_s: float
+    # Heading of the ground truth beyond that of the aligned localisation (rad)
     heading_offset: float
 
 
 class LocalisationProblem(NamedTuple):
-    """Measured poses beside odometry's, aligned.
+    """Measured poses beside odometry's, aligned."""
 
-    Attributes
-    ----------
-    odometry : PlanarPoses
-        Aligned rigidly with the measured poses.
-    times_s : (M,) float64
-    differences, covariances : (M, 3), (M, 3, 3) float64
-        Measured poses minus odometry's at their times; covariances of the former.
-    offsets : (M, 2) float64
-        Odometry's positions less the centroid (m).
-    centroid : (2,) float64
-    gate : float
-        Largest squared normalised innovation.
-    """
-
-    odometry: PlanarPoses
-    times_s: FloatArray
+    odometry: PlanarPoses  # Aligned rigidly with the measured poses
+    times_s: FloatArray  # (M,)
+    # `differences`, `covariances`: (M, 3), (M, 3, 3): measured poses minus odometry's at their
+    # times; covariances of the former.
     differences: FloatArray
     covariances: FloatArray
-    offsets: FloatArray
-    centroid: FloatArray
-    gate: float
+    offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
+    centroid: FloatArray  # (2,)
+    gate: float  # Largest squared normalised innovation
 
 
 def localisation_problem(
@@ -107,20 +90,14 @@ def localisation_problem(
 ) -> LocalisationProblem:
     """Align odometry with measured poses.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        No two samples of one time.
-    measured : PlanarPoses
-        Two or more, with covariances, within odometry's time.
-    gate : float
-        Largest squared normalised innovation.
+    `odometry`: no two samples of one time. `measured`: two or more, with covariances, within
+    odometry's time. `gate`: largest squared normalised innovation.
     """
     assert measured.covariances is not None
     own, _ = interpolate_poses(odometry, measured.times_s)
     usual = np.ones(len(measured), dtype=np.bool_)
     for _ in range(_TRIMMINGS):
-        motion = planar_alignment(_some(own, usual), _some(measured, usual))
+        motion = planar_alignment(own.only(usual), measured.only(usual))
         beside = moved_poses(own, motion)
         differences = measured.poses - beside.poses
         differences[:, 2] = wrap_angle(differences[:, 2])
@@ -141,24 +118,12 @@ def localisation_problem(
     )
 
 
-def _some(poses: PlanarPoses, which: NDArray[np.bool_]) -> PlanarPoses:
-    return PlanarPoses(poses.times_s[which], poses.poses[which])
-
-
 def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]:
     """Deviations (m, rad) and correlation time that make the measurements likeliest.
 
-    Parameters
-    ----------
-    problem : LocalisationProblem
-        Of few measurements, seconds apart.
-
-    Returns
-    -------
-    errors : (4,) float64
-        Deviations of position and heading, correlation times of both (s).
-    surprise : float
-        Minus twice the logarithm of the measurements' likelihood.
+    `problem`: of few measurements, seconds apart. Returns `errors` (4,): deviations of position and
+    heading, correlation times of both (s). `surprise`: minus twice the logarithm of the
+    measurements' likelihood.
     """
     start = np.array(_START)
     bound = math.log(_LARGEST_FACTOR)
@@ -282,22 +247,9 @@ def smooth_localisation(
 ) -> tuple[PlanarPoses, FloatArray, float]:
     """The path from odometry that is a localisation.
 
-    Parameters
-    ----------
-    problem : LocalisationProblem
-    errors : (4,) array
-        See `learn_localisation`.
-    times_s : (N,) array
-        Odometry's times at which poses are wanted.
-
-    Returns
-    -------
-    poses : PlanarPoses
-        With covariances.
-    squared : (M,) float64
-        Squared normalised innovations of the measurements.
-    heading_offset : float
-        Rad.
+    `errors` (4,): see `learn_localisation`. `times_s` (N,): odometry's times at which poses are
+    wanted. Returns `poses`: with covariances. `squared` (M,): squared normalised innovations of the
+    measurements. `heading_offset`: rad.
     """
     there, _ = interpolate_poses(problem.odometry, times_s)
     all_times = np.concatenate([times_s, problem.times_s])
@@ -330,23 +282,10 @@ def as_localisation(
 ) -> tuple[PlanarPoses, FloatArray, LocalisationErrors] | None:
     """The path from odometry that is a localisation, if it clearly is one.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        No two samples of one time.
-    problem : MovementProblem
-        The same with the measurements.
-    noise : (4,) array
-        Random errors of its movements over seconds.
-    times_s : (N,) array
-        Odometry's times at which poses are wanted.
-
-    Returns
-    -------
-    poses : PlanarPoses
-    squared : (M,) float64
-        Squared normalised innovations of the measurements; infinite where they were left out.
-    errors : LocalisationErrors
+    `odometry`: no two samples of one time. `problem`: the same with the measurements. `noise` (4,):
+    random errors of its movements over seconds. `times_s` (N,): odometry's times at which poses are
+    wanted. Returns `squared` (M,): squared normalised innovations of the measurements; infinite
+    where they were left out.
     """
     thin = problem.thinned(_SPACING_S)
     if len(thin.nodes) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:

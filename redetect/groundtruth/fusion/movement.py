@@ -45,23 +45,13 @@ _RELINEARISATIONS_WHERE_LOST = 3
 
 @dataclass(frozen=True, eq=False)
 class MeasurementAccount:
-    """How the measurements were used.
+    """How the measurements were used."""
 
-    Attributes
-    ----------
-    squared : (M,) float64
-        Squared normalised innovations.
-    accepted : (M,) bool
-    restarted : (N,) int8
-        Whether the filter was restarted at a node, and why (see `smoother_kernels`).
-    surprise : float
-        Minus twice the logarithm of their likelihood.
-    """
-
-    squared: FloatArray
-    accepted: NDArray[np.bool_]
+    squared: FloatArray  # (M,): squared normalised innovations
+    accepted: NDArray[np.bool_]  # (M,)
+    # (N,): whether the filter was restarted at a node, and why (see `smoother_kernels`)
     restarted: NDArray[np.int8]
-    surprise: float
+    surprise: float  # Minus twice the logarithm of their likelihood
 
 
 class Smoothed(NamedTuple):
@@ -73,40 +63,22 @@ class Smoothed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MovementProblem:
-    """Odometry and measured poses on common nodes, whatever odometry errs at random.
+    """Odometry and measured poses on common nodes, whatever odometry errs at random."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        The nodes.
-    controls : (N, 4) float64
-        Odometry's movement to each node: way forward, way to the left (m) and turn (rad), each
-        summed up in the robot's turning frame; and the turn again where it is a distinct one, else
-        0.
-    unseen : (N, 2) float64
-        Way (m) and turn (rad) that it may have made besides, where odometry pauses.
-    nodes : (M,) int64
-        At which node each measurement was made, ascending.
-    measured, covariances : (M, 3), (M, 3, 3) float64
-        The measured poses.
-    streams : tuple of M str
-        Their streams.
-    repaired : dict of str to int
-        Covariances that had to be raised, by stream.
-    repeated : dict of str to int
-        Rows that repeated the row before and were left out, by stream.
-    settings : FuseSettings
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (N,): the nodes
+    # (N, 4): odometry's movement to each node: way forward, way to the left (m) and turn (rad),
+    # each summed up in the robot's turning frame; and the turn again where it is a distinct one,
+    # else 0.
     controls: FloatArray
+    # (N, 2): way (m) and turn (rad) that it may have made besides, where odometry pauses
     unseen: FloatArray
-    nodes: NDArray[np.int64]
+    nodes: NDArray[np.int64]  # (M,): at which node each measurement was made, ascending
+    # `measured`, `covariances`: (M, 3), (M, 3, 3): the measured poses
     measured: FloatArray
     covariances: FloatArray
-    streams: tuple[str, ...]
-    repaired: dict[str, int]
-    repeated: dict[str, int]
+    streams: tuple[str, ...]  # Their streams
+    repaired: dict[str, int]  # Covariances that had to be raised, by stream
+    repeated: dict[str, int]  # Rows that repeated the row before and were left out, by stream
     settings: FuseSettings
 
     def shortened(self, count: int) -> MovementProblem:
@@ -190,17 +162,9 @@ class MovementProblem:
     ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
         """Smoothed states, their covariances, and what became of the measurements.
 
-        Parameters
-        ----------
-        noise : (4,) array
-            Odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
-        looser_in_gaps : float
-            Factor on the variances they make where nothing is measured.
-
-        Returns
-        -------
-        states, covariances : (N, 6), (N, 6, 6) arrays
-        account : MeasurementAccount
+        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
+        `looser_in_gaps`: factor on the variances they make where nothing is measured. Returns
+        `states`, `covariances` (N, 6), (N, 6, 6).
         """
         variances = self._variances(noise)
         as_sampled = variances.copy()
@@ -317,24 +281,8 @@ def movement_problem(
 ) -> MovementProblem:
     """Bring odometry and measured poses to common nodes.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        On the measurements' clock.
-    streams : mapping of str to PlanarPoses
-        Measured poses with covariances, by name.
-    settings : FuseSettings
-
-    Returns
-    -------
-    MovementProblem
-        From the first measurement within the odometry's time to the last.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no measurement within the odometry's time, a stream has no covariances, or one
-        of them cannot be repaired.
+    `odometry`: on the measurements' clock. `streams`: measured poses with covariances, by name.
+    Returns from the first measurement within the odometry's time to the last.
     """
     names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
     odometry = last_of_each_time(odometry)

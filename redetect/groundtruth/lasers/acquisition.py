@@ -43,24 +43,12 @@ _LARGEST_CHI2 = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """The robot's data for the kernels.
+    """The robot's data for the kernels."""
 
-    Attributes
-    ----------
-    faces : (k, 4) float64
-        Counter-clockwise.
-    middle : (2,) float64
-        Of its bounding box, in its frame.
-    radius_m : float
-        Of its farthest corner from there.
-    symmetries : (s, 3) float64
-        Motions that its outline does not show, or not clearly.
-    """
-
-    faces: FloatArray
-    middle: FloatArray
-    radius_m: float
-    symmetries: FloatArray
+    faces: FloatArray  # (k, 4): counter-clockwise
+    middle: FloatArray  # (2,): of its bounding box, in its frame
+    radius_m: float  # Of its farthest corner from there
+    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
 
 
 class Refined(NamedTuple):
@@ -119,10 +107,7 @@ def acquire(
     through it nor much that hides it. Where the two best poses differ by more than one of the
     outline's symmetries and explain the scans about as well, none is returned.
 
-    Returns
-    -------
-    (3,) float64 or None
-        x, y (m), theta (rad); with a symmetric outline one of the equivalent poses.
+    Returns (3,): x, y (m), theta (rad); with a symmetric outline one of the equivalent poses.
     """
     seen = Seen(
         *new_points(

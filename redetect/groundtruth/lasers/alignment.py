@@ -30,7 +30,7 @@ from redetect.groundtruth.lasers.scans import Scans
 from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
 from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
-from redetect.storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
+from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 
@@ -45,22 +45,15 @@ _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
 _FLOOR_M = 0.001
 _WEAK_M = 0.02
 _LONE_STEPS = 30
+# Pairs are begun from the measured headings turned by these.
+_TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
+# A scanner whose place on the map is farther from that among the other scanners is named.
+_INCONSISTENT_M = 0.05
 
 
 @dataclass(frozen=True)
 class AlignmentSettings:
     """Settings of the scanners' alignment.
-
-    Parameters
-    ----------
-    gate_m : float
-        Farthest that a reading may lie from what it is matched with at first (m).
-    kept : float
-        Share of the matches that counts: the best.
-    turns_deg : tuple of float
-        Pairs are begun from the measured headings turned by these (deg).
-    inconsistent_m : float
-        A scanner whose place on the map is farther from that among the other scanners is named (m).
 
     Raises
     ------
@@ -68,77 +61,37 @@ class AlignmentSettings:
         If a number is out of range.
     """
 
-    gate_m: float = 0.5
-    kept: float = 0.95
-    turns_deg: tuple[float, ...] = (0.0, -2.0, 2.0, -4.0, 4.0)
-    inconsistent_m: float = 0.05
+    gate_m: float = 0.5  # Farthest that a reading may lie from what it is matched with at first (m)
+    kept: float = 0.95  # Share of the matches that counts: the best
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            GroundTruthError,
-            gate_m=ABOVE_0,
-            kept=SHARE_ABOVE_0,
-            turns_deg=from_to(-360.0, 360.0),
-            inconsistent_m=LIMIT_OR_0,
-        )
-        if not self.turns_deg:
-            raise GroundTruthError("turns_deg is empty: expected one or more")
+        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
 
 
 @dataclass(frozen=True, eq=False)
 class StillScan:
-    """Points of a scanner in the empty area, averaged over its scans.
+    """Points of a scanner in the empty area, averaged over its scans."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        In the scanner's frame, in the order of the beams (m).
-    range_m : (n,) float64
-    direction : (n, 2) float64
-        Of the beams.
-    sigma_m : float
-        Of the averaged readings.
-    normals : (n, 2) float64
-        Of lines through the points; zeros where there is none.
-    """
-
-    points: FloatArray
-    range_m: FloatArray
-    direction: FloatArray
-    sigma_m: float
-    normals: FloatArray
+    points: FloatArray  # (n, 2): in the scanner's frame, in the order of the beams (m)
+    range_m: FloatArray  # (n,)
+    direction: FloatArray  # (n, 2): of the beams
+    sigma_m: float  # Of the averaged readings
+    normals: FloatArray  # (n, 2): of lines through the points; zeros where there is none.
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where the scanners were found.
+    """Where the scanners were found."""
 
-    Attributes
-    ----------
-    scanners : tuple of Scanner
-        With poses on the map and their covariances.
-    steps : dict of str to (scanners, 3) float64
-        Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
-    pairs : dict of (int, int) to float
-        Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1.
-    matched : (scanners,) int64
-        Number of beams that hit the map.
-    rms_m : (scanners,) float64
-        Their root mean square distance from it.
-    undetermined : tuple of str
-        Scanners whose view of the map leaves a direction open.
-    inconsistent : tuple of str
-        Scanners whose place on the map is not that among the others.
-    """
-
-    scanners: tuple[Scanner, ...]
+    scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
+    # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
     steps: dict[str, FloatArray]
+    # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
     pairs: dict[tuple[int, int], float]
-    matched: NDArray[np.int64]
-    rms_m: FloatArray
-    undetermined: tuple[str, ...]
-    inconsistent: tuple[str, ...]
+    matched: NDArray[np.int64]  # (scanners,): number of beams that hit the map
+    rms_m: FloatArray  # (scanners,): their root mean square distance from it
+    undetermined: tuple[str, ...]  # Scanners whose view of the map leaves a direction open
+    inconsistent: tuple[str, ...]  # Scanners whose place on the map is not that among the others
 
 
 def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
@@ -146,11 +99,6 @@ def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
 
     Beams without a reading in half of the scans, and those along an edge, which see near and far
     in turn, are left out; a beam's readings far off its median, which passed by, too.
-
-    Raises
-    ------
-    GroundTruthError
-        If fewer than ten beams see something.
     """
     metres = empty.ranges_mm * 1e-3
     hit = scanner.has_return(empty.ranges_mm)
@@ -192,11 +140,6 @@ def align_scanners(
         Scans of the empty area, as many.
     building : (k, 4) float64
         The map's walls x1, y1, x2, y2 (m).
-    settings : AlignmentSettings, optional
-
-    Returns
-    -------
-    Alignment
 
     Raises
     ------
@@ -227,7 +170,7 @@ def align_scanners(
             weak.append(scanner.name)
     steps["each to the map"] = np.stack([scanner.pose for scanner in found])
     moved = steps["each to the map"] - steps["map as a whole"]
-    far = np.hypot(moved[:, 0], moved[:, 1]) > s.inconsistent_m
+    far = np.hypot(moved[:, 0], moved[:, 1]) > _INCONSISTENT_M
     names = tuple(scanner.name for scanner, is_far in zip(found, far) if is_far)
     return Alignment(
         tuple(found), steps, shares, np.array(matched), np.array(rms), tuple(weak), names
@@ -245,7 +188,7 @@ def _pairs(
         apart = between(measured[i], measured[j])
         target, points = Scan(scans[i].points, scans[i].normals), scans[j].points
         best = (0.0, apart)
-        for turn in np.radians(s.turns_deg):
+        for turn in np.radians(_TURNS_DEG):
             start = apart + np.array([0.0, 0.0, turn])
             pose = align_scans(points, target, start, gates, s.kept, 1e-6)
             if np.isfinite(pose).all():

@@ -35,13 +35,7 @@ _DEEPEST = 32
 
 
 def find_building(folder: str | os.PathLike[str]) -> Path:
-    """The building map of a session: ``building.csv`` or else ``building.dxf``.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is neither.
-    """
+    """The building map of a session: ``building.csv`` or else ``building.dxf``."""
     for name in ("building.csv", "building.dxf"):
         if (path := Path(folder) / name).is_file():
             return path

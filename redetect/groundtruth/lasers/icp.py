@@ -41,27 +41,18 @@ _REPEATED, _DAMPING = 10, 1e-3
 class IcpSettings:
     """Settings of an ICP.
 
-    Parameters
-    ----------
-    gate_m : float
-        Pairs farther apart than this do not count (m).
-    kept : float
-        Share of the pairs within the gate that counts: the best.
-    threshold_m : float
-        The ICP ends when the root mean square error changes by less than this (m).
-    weak_sigma_m : float
-        A direction is undetermined if the pose's standard deviation along it is larger than this
-        (m; a rotation counts by what it does to the points, root mean square).
-
     Raises
     ------
     GroundTruthError
         If a number is out of range.
     """
 
-    gate_m: float = 0.2
-    kept: float = 0.95
+    gate_m: float = 0.2  # Pairs farther apart than this do not count (m)
+    kept: float = 0.95  # Share of the pairs within the gate that counts: the best
+    # The ICP ends when the root mean square error changes by less than this (m)
     threshold_m: float = 1e-7
+    # A direction is undetermined if the pose's standard deviation along it is larger than this (m;
+    # a rotation counts by what it does to the points, root mean square).
     weak_sigma_m: float = 0.05
 
     def __post_init__(self) -> None:
@@ -77,28 +68,16 @@ class IcpSettings:
 
 @dataclass(frozen=True, eq=False)
 class IcpResult:
-    """Where an ICP ended.
+    """Where an ICP ended."""
 
-    Attributes
-    ----------
-    pose : (3,) float64
-        x, y (m), theta (rad): takes the points to the target's frame.
-    covariance : (3, 3) float64
-        Of the pose, from the residuals' size and the geometry; infinite on the diagonal where the
-        geometry determines nothing at all.
-    rms_m : float
-        Root mean square distance of the pairs that count.
-    used : (n,) bool
-        Which points count.
-    undetermined : (k, 3) float64
-        Directions of (x, y, theta) that the geometry leaves open, of unit length with theta
-        measured by what it does to the points; k is 0 for a good pose.
-    """
-
-    pose: FloatArray
+    pose: FloatArray  # (3,): x, y (m), theta (rad): takes the points to the target's frame
+    # (3, 3): of the pose, from the residuals' size and the geometry; infinite on the diagonal where
+    # the geometry determines nothing at all.
     covariance: FloatArray
-    rms_m: float
-    used: BoolArray
+    rms_m: float  # Root mean square distance of the pairs that count
+    used: BoolArray  # (n,): which points count
+    # (k, 3): directions of (x, y, theta) that the geometry leaves open, of unit length with theta
+    # measured by what it does to the points; k is 0 for a good pose.
     undetermined: FloatArray
 
 
@@ -118,7 +97,6 @@ def icp_to_segments(
         x1, y1, x2, y2 (m).
     start : (3,) array
         Pose to start from.
-    settings : IcpSettings, optional
 
     Raises
     ------
@@ -158,19 +136,13 @@ def icp_to_segments(
 def trimmed_variance(kept: float) -> tuple[float, float]:
     """Factors of variances due to keeping only the best share of Gaussian residuals.
 
-    Returns
-    -------
-    shrinkage : float
-        Variance of the residuals kept, relative to all.
-    inflation : float
-        Variance of a mean of those kept by their own distance from it, relative to the mean of as
-        many residuals as were kept.
-
-    Notes
-    -----
     With the cut c at +-c sigma and phi the normal density, both follow from
     v = kept - 2 c phi(c), the part of the variance within the cut, which is also the derivative of
     the estimating equation: shrinkage v / kept, variance v / v^2 per residual, kept or not.
+
+    Returns `shrinkage`: variance of the residuals kept, relative to all. `inflation`: variance of a
+    mean of those kept by their own distance from it, relative to the mean of as many residuals as
+    were kept.
     """
     if kept >= 1.0:
         return 1.0, 1.0
@@ -393,17 +365,6 @@ def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, error_model="numpy")
-def moved_back(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Points taken by a pose's inverse."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    out = np.empty_like(points)
-    for i in range(points.shape[0]):
-        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
-        out[i, 0], out[i, 1] = c * dx + s * dy, -s * dx + c * dy
-    return out
-
-
-@njit(cache=True, error_model="numpy")
 def fit_outline(
     points: FloatArray,
     faces: FloatArray,
@@ -422,7 +383,9 @@ def fit_outline(
     rms, count, step = np.inf, 0, 0
     used = np.zeros(points.shape[0], dtype=np.bool_)
     while True:
-        nearest, _, squared = nearest_on_segments(moved_back(points, pose), faces)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        back = np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
+        nearest, _, squared = nearest_on_segments(moved(points, back), faces)
         limit = gate_m * gate_m
         within = squared[squared <= limit]
         if within.size < 3:

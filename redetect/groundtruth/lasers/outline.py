@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
 from redetect.groundtruth.trajectories.plane import invert
-from redetect.storage.bounds import SHARE_ABOVE_0, demand, whole
+from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 
@@ -20,112 +21,56 @@ FloatArray = NDArray[np.float64]
 class LaserSettings:
     """Settings of laser tracking.
 
-    Parameters
-    ----------
-    gate_m : float
-        Farthest that a reading may lie from the robot's outline (m).
-    kept : float
-        Share of the readings within the gate that the ICP counts: the best.
-    threshold_m : float
-        The ICP ends when its root mean square error changes by less than this (m).
-    most_steps : int
-        Largest number of steps of the ICP.
-    floor_m : float
-        Standard deviation of a reading's distance from the outline that does not depend on the
-        scanner's noise: the outline is drawn to millimetres (m).
-    least_slope : float
-        Readings along a face, whose beam and normal have a smaller cosine, count as if it were
-        this: their distances from the face are small whatever the pose.
-    gate_sigma : float
-        The final pose uses readings up to this many standard deviations off.
-    weak_sigma_m : float
-        A direction is undetermined if the pose's standard deviation along it is larger (m;
-        a turn counts by what it does to the farthest corner).
-    least_readings : int
-        A pose needs as many.
-    acquire_readings : int
-        A robot that is found again needs as many.
-    coast_s : float
-        The robot is lost after so long without a pose (s).
-    acquire_s : float
-        When the robot is lost, it is searched this often (s).
-    headings : int
-        Headings that the search begins from.
-    link_m : float
-        New readings nearer to each other than this may be of one object (m).
-    least_agreement : float
-        Share of the beams that should see the robot, or see something beside it, that must agree
-        with a pose found.
-    symmetry_m : float
-        The outline counts as symmetric if it is nowhere farther from itself when rotated (m).
-    front_sigma : float
-        The readings identify the front if the residuals differ by this many standard errors.
-    forward_m : float
-        Otherwise the front is known after the robot has driven this much farther forward than
-        backward (m).
-
     Raises
     ------
     GroundTruthError
         If a number is out of range.
     """
 
-    gate_m: float = 0.2
-    kept: float = 0.95
-    threshold_m: float = 1e-5
-    most_steps: int = 60
-    floor_m: float = 0.001
-    least_slope: float = 0.35
-    gate_sigma: float = 3.5
-    weak_sigma_m: float = 0.03
-    least_readings: int = 8
-    acquire_readings: int = 16
-    coast_s: float = 0.25
-    acquire_s: float = 0.05
-    headings: int = 24
-    link_m: float = 0.3
-    least_agreement: float = 0.75
-    symmetry_m: float = 0.12
-    front_sigma: float = 5.0
-    forward_m: float = 0.3
+    gate_m: float = 0.2  # Farthest that a reading may lie from the robot's outline (m)
+    kept: float = 0.95  # Share of the readings within the gate that the ICP counts: the best
+
+    # The ICP ends when its root mean square error changes by less, or after as many steps.
+    threshold_m: ClassVar[float] = 1e-5
+    most_steps: ClassVar[int] = 60
+    # Standard deviation of a reading's distance from the outline that does not depend on the
+    # scanner's noise: the outline is drawn to millimetres.
+    floor_m: ClassVar[float] = 0.001
+    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
+    # their distances from the face are small whatever the pose.
+    least_slope: ClassVar[float] = 0.35
+    # The final pose uses readings up to this many standard deviations off.
+    gate_sigma: ClassVar[float] = 3.5
+    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
+    # by what it does to the farthest corner).
+    weak_sigma_m: ClassVar[float] = 0.03
+    # Readings that a pose needs, and that a robot needs which is found again.
+    least_readings: ClassVar[int] = 8
+    acquire_readings: ClassVar[int] = 16
+    # The robot is lost after so long without a pose; then it is searched this often.
+    coast_s: ClassVar[float] = 0.25
+    acquire_s: ClassVar[float] = 0.05
+    # Headings that the search begins from.
+    headings: ClassVar[int] = 24
+    # New readings nearer to each other than this may be of one object.
+    link_m: ClassVar[float] = 0.3
+    # Share of the beams that should see the robot, or see something beside it, that must agree.
+    least_agreement: ClassVar[float] = 0.75
+    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
+    symmetry_m: ClassVar[float] = 0.12
+    # The readings identify the front if the residuals differ by this many standard errors; else it
+    # is known after the robot has driven this much farther forward than backward.
+    front_sigma: ClassVar[float] = 5.0
+    forward_m: ClassVar[float] = 0.3
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            zero = entry.name in ("floor_m", "acquire_s", "coast_s")
-            if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
-                least = "0 or more" if zero else "more than 0"
-                raise GroundTruthError(f"{entry.name} is {value!r}: expected {least}")
-        demand(
-            self,
-            GroundTruthError,
-            kept=SHARE_ABOVE_0,
-            least_agreement=SHARE_ABOVE_0,
-            most_steps=whole(1),
-            least_readings=whole(1),
-            acquire_readings=whole(1),
-            headings=whole(1),
-        )
+        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:
     """Faces of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    Parameters
-    ----------
-    outline : (k, 2) array
-        Corners in order, either way round (m).
-
-    Returns
-    -------
-    (k, 4) float64
-        x1, y1, x2, y2.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are fewer than three corners, two that follow each other are one, a number is not
-        finite, or faces cross.
+    `outline` (k, 2): corners in order, either way round (m). Returns (k, 4): x1, y1, x2, y2.
     """
     corners = np.asarray(outline, dtype=np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -160,18 +105,9 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
 
     A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`.
 
-    Parameters
-    ----------
-    faces : (k, 4) array
-        From `outline_faces`.
-    tolerance_m : float
-        Largest distance that a point of the turned outline may have from the outline (m).
-
-    Returns
-    -------
-    (s, 3) float64
-        x, y (m), theta (rad), by rising theta from -pi on; s is 0 for an outline that shows where
-        the front is, 1 for a box, 3 for a square.
+    `faces` (k, 4): from `outline_faces`. `tolerance_m`: largest distance that a point of the turned
+    outline may have from the outline (m). Returns (s, 3): x, y (m), theta (rad), by rising theta
+    from -pi on; s is 0 for an outline that shows where the front is, 1 for a box, 3 for a square.
     """
     along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
     points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)

@@ -42,21 +42,16 @@ _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 class Scans:
     """Scans of one scanner over time.
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In some
-        real logs they step back.
-    ranges_mm : (N, readings) uint16
-        Readings in millimetres, 0 where nothing came back.
-
     Raises
     ------
     GroundTruthError
         If shapes or types disagree or a time is not finite.
     """
 
+    # (N,): seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In
+    # some real logs they step back.
     times_s: FloatArray
+    # (N, readings): readings in millimetres, 0 where nothing came back
     ranges_mm: NDArray[np.uint16]
 
     def __post_init__(self) -> None:

@@ -20,31 +20,18 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A scanner's static background, beam by beam.
+    """A scanner's static background, beam by beam."""
 
-    Attributes
-    ----------
-    range_m : (readings,) float64
-        Median of the beam's readings; NaN where it has none.
-    sigma_m : (readings,) float64
-        Their standard deviation by the median of deviations, at least `least_sigma_m`; NaN where
-        the beam has none.
-    near_m : (readings,) float64
-        A reading below this is something that was not there; infinite where the beam sees nothing.
-    drop_out : (readings,) float64
-        Share of the scans without a reading.
-    quantum_m : float
-        All readings are whole multiples of this; 0 if there are none.
-    scans : int
-        Scans that it was learned from.
-    """
-
-    range_m: FloatArray
+    range_m: FloatArray  # (readings,): median of the beam's readings; NaN where it has none.
+    # (readings,): their standard deviation by the median of deviations, at least `least_sigma_m`;
+    # NaN where the beam has none.
     sigma_m: FloatArray
+    # (readings,): A reading below this is something that was not there; infinite where the beam
+    # sees nothing.
     near_m: FloatArray
-    drop_out: FloatArray
-    quantum_m: float
-    scans: int
+    drop_out: FloatArray  # (readings,): share of the scans without a reading
+    quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
+    scans: int  # Scans that it was learned from
 
 
 def learn_background(
@@ -71,10 +58,6 @@ def learn_background(
     passing : float
         The nearest object is at this quantile of the beam's readings: beams along an edge see near
         and far in turn, and nearer readings than that are treated as passing objects.
-
-    Returns
-    -------
-    Background
 
     Raises
     ------
@@ -114,29 +97,14 @@ def learn_background(
 
 @dataclass(frozen=True, eq=False)
 class ScannerTables:
-    """Fixed scanners as arrays, padded to the longest scan.
-
-    Attributes
-    ----------
-    names : tuple of str
-    poses : (scanners, 3) float64
-        In the world.
-    covariance : (3 scanners, 3 scanners) float64
-        Of the poses, jointly.
-    near_mm : (scanners, readings) float64
-        A reading below this is new; 0 for the padding.
-    beams : (scanners, readings, 2) float64
-        The beams' directions in the world.
-    sigmas_m : (scanners,) float64
-        Standard deviations of readings, rounding included.
-    """
+    """Fixed scanners as arrays, padded to the longest scan."""
 
     names: tuple[str, ...]
-    poses: FloatArray
-    covariance: FloatArray
-    near_mm: FloatArray
-    beams: FloatArray
-    sigmas_m: FloatArray
+    poses: FloatArray  # (scanners, 3): in the world
+    covariance: FloatArray  # (3 scanners, 3 scanners): of the poses, jointly
+    near_mm: FloatArray  # (scanners, readings): A reading below this is new; 0 for the padding.
+    beams: FloatArray  # (scanners, readings, 2): the beams' directions in the world
+    sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
 
     @property
     def origins(self) -> FloatArray:
@@ -150,41 +118,20 @@ class ScannerTables:
 
 @dataclass(frozen=True, eq=False)
 class ScanSets:
-    """Scans that belong together.
+    """Scans that belong together."""
 
-    Attributes
-    ----------
-    times_s : (sets,) float64
-        Mean time of the set's scans.
-    rows : (sets, scanners) int64
-        Row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
-    ages_s : (sets, scanners) float64
-        The set's time minus the scan's.
-    ranges_mm : (scans, readings) uint16
-        All scans of all scanners.
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (sets,): mean time of the set's scans
+    # (sets, scanners): row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
     rows: IntArray
-    ages_s: FloatArray
-    ranges_mm: NDArray[np.uint16]
+    ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
+    ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
 
     def __len__(self) -> int:
         return len(self.times_s)
 
 
 def scanner_tables(scanners: Sequence[Scanner], backgrounds: Sequence[Background]) -> ScannerTables:
-    """Arrange scanners and their backgrounds for the kernels.
-
-    Parameters
-    ----------
-    scanners, backgrounds : sequences of the same length
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no scanners, or a background is not of its scanner's size.
-    """
+    """Arrange scanners and their backgrounds for the kernels."""
     if not scanners or len(scanners) != len(backgrounds):
         raise GroundTruthError(
             f"{len(scanners)} scanners, {len(backgrounds)} backgrounds: expected as many, some"

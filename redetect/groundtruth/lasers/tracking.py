@@ -41,57 +41,31 @@ _FRONT_SAMPLE = 60
 
 @dataclass(frozen=True, eq=False)
 class LaserTrack:
-    """Result for every set of scans.
+    """Result for every set of scans."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-    status : (N,) int64
-        Index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
-        direction where it is UNDETERMINED.
-    segment : (N,) int64
-        Number of the acquisition that the set belongs to; -1 where the robot is lost.
-    poses : (N, 3) float64
-        x, y (m), theta (rad); NaN without a pose.
-    covariances : (N, 3, 3) float64
-        Of (x, y, theta), from the readings' noise and the scanners' poses.
-    noise : (N, 3, 3) float64
-        The part from the readings' noise, independent from set to set.
-    motion : (N, 3) float64
-        Velocity (m/s) and turn (rad/s) in the world, from the poses before and after.
-    readings : (N,) int64
-        Readings that the pose rests on.
-    rms_m : (N,) float64
-        Their root mean square distance from the outline.
-    chi2 : (N,) float64
-        Their squared normalised residuals per degree of freedom.
-    beams : (N, 6) float64
-        As in `redetect.groundtruth.lasers.tracking_kernels.explain_set`.
-    weak : (N, 3) float64
-        The least determined direction of (x, y, theta times the outline's radius), where it is
-        UNDETERMINED.
-    reasons : dict of int to str
-        Why a set has no pose, where the robot was expected.
-    corrections : (scanners, 3) float64
-        Corrections of the scanners' given poses that their residuals suggest.
-    correction_sigma : (scanners, 3) float64
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (N,)
+    # (N,): index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
+    # direction where it is UNDETERMINED.
     status: IntArray
+    # (N,): number of the acquisition that the set belongs to; -1 where the robot is lost.
     segment: IntArray
-    poses: FloatArray
+    poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
+    # (N, 3, 3): of (x, y, theta), from the readings' noise and the scanners' poses
     covariances: FloatArray
-    noise: FloatArray
+    noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
+    # (N, 3): velocity (m/s) and turn (rad/s) in the world, from the poses before and after
     motion: FloatArray
-    readings: IntArray
-    rms_m: FloatArray
-    chi2: FloatArray
-    beams: FloatArray
+    readings: IntArray  # (N,): readings that the pose rests on
+    rms_m: FloatArray  # (N,): their root mean square distance from the outline
+    chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
+    beams: FloatArray  # (N, 6): as in `redetect.groundtruth.lasers.tracking_kernels.explain_set`
+    # (N, 3): the least determined direction of (x, y, theta times the outline's radius), where it
+    # is UNDETERMINED
     weak: FloatArray
-    reasons: dict[int, str]
+    reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
+    # (scanners, 3): corrections of the scanners' given poses that their residuals suggest
     corrections: FloatArray
-    correction_sigma: FloatArray
+    correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str] = field(default_factory=dict)
 
 
@@ -100,12 +74,8 @@ class Tracker:
 
     Parameters
     ----------
-    sets : ScanSets
-    tables : ScannerTables
-    body : Body
     largest_speed_m_s, largest_turn_rad_s : float
         The robot moves no faster.
-    settings : LaserSettings, optional
     """
 
     def __init__(
@@ -371,8 +341,7 @@ class Tracker:
         corrections = np.full((many, 3), np.nan)
         sigma = np.full((many, 3), np.nan)
         for k in range(many):
-            full = self.information[k] + np.tril(self.information[k], -1).T
-            values, vectors = np.linalg.eigh(full)
+            values, vectors = np.linalg.eigh(self.information[k])
             if values[0] > 1e-9 * max(values[2], 1e-9) and values[0] > 0.0:
                 covariance = (vectors / values) @ vectors.T
                 corrections[k] = -covariance @ self.gradient[k]
@@ -428,7 +397,6 @@ def track_without_suspects(
 
     Returns
     -------
-    track : LaserTrack
     left_out : dict of str to (2, 3) float64
         By scanner, the shift that its readings suggest and its standard deviations.
     """
@@ -474,7 +442,6 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
 
     Parameters
     ----------
-    track : LaserTrack
     sets_per_pose : int
         1: every set by itself. A block is shorter at the end of a visit, and where sets have no
         determined pose.

@@ -19,40 +19,21 @@ IntArray = NDArray[np.int64]
 
 
 class Beams(NamedTuple):
-    """The beams of all scanners.
+    """The beams of all scanners."""
 
-    Attributes
-    ----------
-    near_mm : (scanners, readings) float64
-        Below this a reading is new: nearer than the background.
-    direction : (scanners, readings, 2) float64
-        In the world.
-    origins : (scanners, 2) float64
-        In the world (m).
-    """
-
+    # (scanners, readings): below this a reading is new: nearer than the background
     near_mm: FloatArray
-    direction: FloatArray
-    origins: FloatArray
+    direction: FloatArray  # (scanners, readings, 2): in the world
+    origins: FloatArray  # (scanners, 2): in the world (m)
 
 
 class Seen(NamedTuple):
-    """New readings of a set of scans.
+    """New readings of a set of scans."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        In the world (m).
-    scanner : (n,) int64
-    direction : (n, 2) float64
-        Of the beams.
-    range_m : (n,) float64
-    """
-
-    points: FloatArray
-    scanner: IntArray
-    direction: FloatArray
-    range_m: FloatArray
+    points: FloatArray  # (n, 2): in the world (m)
+    scanner: IntArray  # (n,)
+    direction: FloatArray  # (n, 2): of the beams
+    range_m: FloatArray  # (n,)
 
     def where(self, chosen: NDArray[np.bool_]) -> Seen:
         """Those chosen."""
@@ -62,34 +43,17 @@ class Seen(NamedTuple):
 
 
 class OutlineFit(NamedTuple):
-    """How an outline is fitted.
+    """How an outline is fitted."""
 
-    Attributes
-    ----------
-    floor_m : float
-        Standard deviation of what the outline and the scanner are not.
-    least_slope : float
-        Beams that graze a face count as if they met it at this sine.
-    gate_sigma, gate_m : float
-        Readings farther off do not count; metres in the first step.
-    prior_sigma_m : float
-        With it, open directions hold on to the start.
-    weak_sigma_m : float
-        Directions along which the standard deviation would be larger are open.
-    scale_m : float
-        A radian counts as this.
-    steps : int
-        At most.
-    """
-
-    floor_m: float
-    least_slope: float
+    floor_m: float  # Standard deviation of what the outline and the scanner are not
+    least_slope: float  # Beams that graze a face count as if they met it at this sine
+    # `gate_sigma`, `gate_m`: Readings farther off do not count; metres in the first step.
     gate_sigma: float
     gate_m: float
-    prior_sigma_m: float
-    weak_sigma_m: float
-    scale_m: float
-    steps: int
+    prior_sigma_m: float  # With it, open directions hold on to the start
+    weak_sigma_m: float  # Directions along which the standard deviation would be larger are open
+    scale_m: float  # A radian counts as this
+    steps: int  # At most
 
 
 @njit(cache=True, error_model="numpy")
@@ -104,28 +68,12 @@ def new_points(
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Points of a set that are nearer than the background and within reach of a place.
 
-    Parameters
-    ----------
-    ranges_mm : (scans, readings) uint16
-    rows : (scanners,) int64
-        Each scanner's scan of the set.
-    beams : Beams
-    centre : (2,)
-        Points farther than `reach_m` from here are left out.
-    motion : (5,)
-        Of the robot: velocity (m/s), turn (rad/s), and the point it turns about at the set's time.
-    ages_s : (scanners,)
-        The set's time minus the scan's: the points are moved on by as much.
-
-    Returns
-    -------
-    points : (n, 2)
-        In the world (m).
-    scanner : (n,) int64
-    direction : (n, 2)
-        Of the beams that saw them.
-    range_m : (n,)
-        Their readings.
+    `ranges_mm` (scans, readings). `rows` (scanners,): each scanner's scan of the set. `centre`
+    (2,): points farther than `reach_m` from here are left out. `motion` (5,): of the robot:
+    velocity (m/s), turn (rad/s), and the point it turns about at the set's time. `ages_s`
+    (scanners,): the set's time minus the scan's: the points are moved on by as much. Returns
+    `points` (n, 2): in the world (m). `scanner` (n,). `direction` (n, 2): of the beams that saw
+    them. `range_m` (n,): their readings.
     """
     most = rows.size * ranges_mm.shape[1]
     points = np.empty((most, 2))
@@ -177,20 +125,12 @@ def refine_outline(
     the nearest one turned to the scanner. Readings beyond the gate do not count, and open
     directions hold on to the start (see `OutlineFit`).
 
-    Returns
-    -------
-    pose : (3,)
-    covariance : (3, 3)
-        Of (x, y, theta), from the readings alone, but for open directions, which have the prior's.
-    calibration : (3, 3 scanners)
-        Derivatives of the pose by the scanners' poses.
-    summary : (4,)
-        Readings used, their squared normalised residuals, the pose's open directions, the root mean
-        square distance from the outline (m).
-    weak : (3,)
-        The least determined direction of (x, y, theta), theta times `scale_m`.
-    information, gradient : (scanners, 3, 3), (scanners, 3)
-        Correction of each scanner's own pose by the residuals.
+    Returns `pose` (3,). `covariance` (3, 3): of (x, y, theta), from the readings alone, but for
+    open directions, which have the prior's. `calibration` (3, 3 scanners): derivatives of the pose
+    by the scanners' poses. `summary` (4,): readings used, their squared normalised residuals, the
+    pose's open directions, the root mean square distance from the outline (m). `weak` (3,): the
+    least determined direction of (x, y, theta), theta times `scale_m`. `information`, `gradient`
+    (scanners, 3, 3), (scanners, 3): correction of each scanner's own pose by the residuals.
     """
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -259,34 +199,19 @@ def refine_outline(
             squares += e * e
             sx += x
             sy += y
-            j0, j1, j2 = -nx, -ny, nx * y - ny * x
-            h[0, 0] += w * j0 * j0
-            h[1, 0] += w * j1 * j0
-            h[1, 1] += w * j1 * j1
-            h[2, 0] += w * j2 * j0
-            h[2, 1] += w * j2 * j1
-            h[2, 2] += w * j2 * j2
-            g[0] += w * j0 * e
-            g[1] += w * j1 * e
-            g[2] += w * j2 * e
+            by_robot = (-nx, -ny, nx * y - ny * x)
             # By the scanner's pose: the normal in the world, and turning about the scanner.
             q = scanner[i]
             wx, wy = c * nx - s * ny, s * nx + c * ny
-            b2 = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+            lever = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+            by_scanner = (wx, wy, lever)
             for a in range(3):
-                ja = j0 if a == 0 else (j1 if a == 1 else j2)
-                cross[a, 3 * q] += w * ja * wx
-                cross[a, 3 * q + 1] += w * ja * wy
-                cross[a, 3 * q + 2] += w * ja * b2
-            information[q, 0, 0] += w * wx * wx
-            information[q, 1, 0] += w * wy * wx
-            information[q, 1, 1] += w * wy * wy
-            information[q, 2, 0] += w * b2 * wx
-            information[q, 2, 1] += w * b2 * wy
-            information[q, 2, 2] += w * b2 * b2
-            gradient[q, 0] += w * wx * e
-            gradient[q, 1] += w * wy * e
-            gradient[q, 2] += w * b2 * e
+                g[a] += w * by_robot[a] * e
+                gradient[q, a] += w * by_scanner[a] * e
+                for b in range(3):
+                    h[a, b] += w * by_robot[a] * by_robot[b]
+                    cross[a, 3 * q + b] += w * by_robot[a] * by_scanner[b]
+                    information[q, a, b] += w * by_scanner[a] * by_scanner[b]
         summary[0], summary[1] = used, chi2
         if used < 3:
             return pose, covariance, calibration, summary, weak, information, gradient
@@ -294,9 +219,6 @@ def refine_outline(
         # Undetermined directions are evaluated about the middle of the points, theta in metres.
         mx, my = sx / used, sy / used
         scale = fit.scale_m
-        for a in range(3):
-            for b in range(a):
-                h[b, a] = h[a, b]
         # Turning about the middle: xi' = (t + theta x middle, theta * scale).
         back = np.array([[1.0, 0.0, my / scale], [0.0, 1.0, -mx / scale], [0.0, 0.0, 1.0 / scale]])
         values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
@@ -347,12 +269,9 @@ def explain_set(
 ) -> FloatArray:
     """How a pose explains the beams of a set, by casting each of them at the outline.
 
-    Returns
-    -------
-    (6,) float64
-        Beams that should see the robot before the background; of these: as far as they should,
-        farther (through it), nearer (hidden by something), without a reading; and new readings
-        in the outline's circle where the robot is not: objects beside it.
+    Returns (6,): beams that should see the robot before the background; of these: as far as they
+    should, farther (through it), nearer (hidden by something), without a reading; and new readings
+    in the outline's circle where the robot is not: objects beside it.
     """
     out = np.zeros(6)
     c, s = math.cos(pose[2]), math.sin(pose[2])

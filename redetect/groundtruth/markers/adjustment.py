@@ -58,32 +58,19 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Points in images, the poses that they depend on, and which of those are free.
-
-    Attributes
-    ----------
-    cameras : C cameras
-    world_from_camera : (C, 4, 4) float64
-    world_from_body : (B, 4, 4) float64
-    body_from_part : (P, 4, 4) float64
-    free_camera, free_body, free_part : (C | B | P,) bool
-    seen : ChainPoints
-    view : (N,) int64
-        Which part in which image each point is of: 0 to V - 1.
-    priors : tuple of PosePrior
-        Of free poses.
-    """
+    """Points in images, the poses that they depend on, and which of those are free."""
 
     cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray
-    world_from_body: FloatArray
-    body_from_part: FloatArray
+    world_from_camera: FloatArray  # (C, 4, 4)
+    world_from_body: FloatArray  # (B, 4, 4)
+    body_from_part: FloatArray  # (P, 4, 4)
+    # `free_camera`, `free_body`, `free_part`: (C | B | P,)
     free_camera: BoolArray
     free_body: BoolArray
     free_part: BoolArray
     seen: ChainPoints
-    view: IntArray
-    priors: tuple[PosePrior, ...] = ()
+    view: IntArray  # (N,): which part in which image each point is of: 0 to V - 1
+    priors: tuple[PosePrior, ...] = ()  # Of free poses
 
     @property
     def free(self) -> BoolArray:
@@ -133,31 +120,16 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedBundle:
-    """A bundle at its minimum.
+    """A bundle at its minimum."""
 
-    Attributes
-    ----------
-    bundle : Bundle
-        With the adjusted poses.
-    used : (N,) bool
-        Points whose views were not found to be wrong.
-    residuals : (N, 2) float64
-        Pixels seen minus pixels expected, of all points.
-    cost : float
-        Squared normalised residuals of the used points and of the priors.
-    degrees_of_freedom : int
-    camera_covariance : (6 C, 6 C) float64
-    part_covariance : (6 P, 6 P) float64
-        Of right perturbations, all other poses marginalised; zeros for fixed ones. They are
-        those of the corners' covariances, not scaled by the residuals.
-    """
-
-    bundle: Bundle
-    used: BoolArray
-    residuals: FloatArray
-    cost: float
+    bundle: Bundle  # With the adjusted poses
+    used: BoolArray  # (N,): points whose views were not found to be wrong
+    residuals: FloatArray  # (N, 2): pixels seen minus pixels expected, of all points
+    cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
-    camera_covariance: FloatArray
+    camera_covariance: FloatArray  # (6 C, 6 C)
+    # (6 P, 6 P): of right perturbations, all other poses marginalised; zeros for fixed ones. They
+    # are those of the corners' covariances, not scaled by the residuals.
     part_covariance: FloatArray
 
     @property
@@ -177,10 +149,6 @@ def adjust_bundle(
         Its poses are the start.
     outlier_sigma, outlier_px : float
         A view is wrong if its normalised error and its residuals (px) are larger than these.
-
-    Returns
-    -------
-    AdjustedBundle
 
     Raises
     ------

@@ -33,7 +33,7 @@ from camera.boards.points import find_board
 from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.files import read_json
+from redetect.groundtruth.files import numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
 from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
@@ -51,22 +51,16 @@ _WINDOW = 0.4
 class Checkerboard:
     """A board's inner corners.
 
-    Attributes
-    ----------
-    columns, rows : int
-        Numbers of inner corners; one even, one odd.
-    square_m : float
-        Side of a square.
-
     Raises
     ------
     GroundTruthError
         If the board is symmetric under rotation by 180 degrees, or is too small.
     """
 
+    # `columns`, `rows`: Numbers of inner corners; one even, one odd.
     columns: int
     rows: int
-    square_m: float
+    square_m: float  # Side of a square
 
     def __post_init__(self) -> None:
         try:
@@ -93,20 +87,8 @@ class Checkerboard:
 def find_checkerboard(image: NDArray[np.uint8], board: Checkerboard) -> FloatArray:
     """Find a board's inner corners (OpenCV).
 
-    Parameters
-    ----------
-    image : (H, W) uint8 array
-    board : Checkerboard
-
-    Returns
-    -------
-    (rows * columns, 2) array
-        Pixels (the top left pixel's centre is 0, 0) in the order of `Checkerboard.points`.
-
-    Raises
-    ------
-    GeometryError
-        If there is no such board in the image.
+    `image` (H, W). Returns (rows * columns, 2): pixels (the top left pixel's centre is 0, 0) in the
+    order of `Checkerboard.points`.
     """
     try:
         _, pixels = find_board(image, board.board, window=_WINDOW)
@@ -124,38 +106,21 @@ FIRST, SECOND, WORLD = "first", "second", "world"
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """A board in an image.
-
-    Attributes
-    ----------
-    camera : str
-    board : str
-    corners : (K, 2) float64
-        Pixels, in the order of `Checkerboard.points`.
-    """
+    """A board in an image."""
 
     camera: str
     board: str
-    corners: FloatArray
+    corners: FloatArray  # (K, 2): pixels, in the order of `Checkerboard.points`
 
 
 @dataclass(frozen=True, eq=False)
 class DoubleBoard:
-    """Two boards held together.
-
-    Attributes
-    ----------
-    first, second : str
-    offset : (4, 4) float64 or None
-        `first_from_second`; None if it is to be estimated.
-    covariance : (6, 6) float64
-        Of its right perturbation; zeros if it is exactly known.
-    """
+    """Two boards held together."""
 
     first: str
     second: str
-    offset: FloatArray | None
-    covariance: FloatArray
+    offset: FloatArray | None  # (4, 4): `first_from_second`; None if it is to be estimated.
+    covariance: FloatArray  # (6, 6): of its right perturbation; zeros if it is exactly known.
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,24 +136,13 @@ class BoardImage:
 
 @dataclass(frozen=True, eq=False)
 class BoardsFile:
-    """Content of a ``boards.json``.
-
-    Attributes
-    ----------
-    boards : dict of str to Checkerboard
-    world_from_board : (4, 4) float64
-    double : DoubleBoard or None
-    cameras : dict of str to Camera
-    calibrations : dict of str to str
-        Their files, relative to the folder.
-    images : tuple of BoardImage
-    """
+    """Content of a ``boards.json``."""
 
     boards: dict[str, Checkerboard]
-    world_from_board: FloatArray
+    world_from_board: FloatArray  # (4, 4)
     double: DoubleBoard | None
     cameras: dict[str, Camera]
-    calibrations: dict[str, str]
+    calibrations: dict[str, str]  # Their files, relative to the folder
     images: tuple[BoardImage, ...]
 
 
@@ -199,10 +153,6 @@ def read_boards(path: Path) -> BoardsFile:
     ----------
     path : path
         The file, or its folder.
-
-    Returns
-    -------
-    BoardsFile
 
     Raises
     ------
@@ -338,11 +288,6 @@ def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) 
             raise GroundTruthError(f"{place}: image is {excerpt(image)}: expected a file's name")
         path = _inside(place, folder, image)
         return BoardImage(camera, board, placement, path, None)
-    try:
-        array = np.asarray(corners, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    expected = (boards[board].rows * boards[board].columns, 2)
-    if array.shape != expected or not np.all(np.isfinite(array)):
-        raise GroundTruthError(f"{place}: corners: expected {expected[0]} pairs of finite numbers")
+    count = boards[board].rows * boards[board].columns
+    array = numbers(f"{place}: corners", corners, count, 2)
     return BoardImage(camera, board, placement, None, array)

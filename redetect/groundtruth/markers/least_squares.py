@@ -29,22 +29,12 @@ _COST_TOLERANCE = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Linearised(Generic[Poses]):
-    """A sum of losses about some poses.
+    """A sum of losses about some poses."""
 
-    Attributes
-    ----------
-    cost : float
-        Half the sum.
-    gradient : (n,) float64
-    normal : (n, n) float64, or a sparse array
-        J'J, weighted by the losses' curvature.
-    cost_at : callable
-        The cost at other poses, with the weights of these; infinite where there is none.
-    """
-
-    cost: float
-    gradient: FloatArray
-    normal: Any
+    cost: float  # Half the sum
+    gradient: FloatArray  # (n,)
+    normal: Any  # (n, n): J'J, weighted by the losses' curvature
+    # The cost at other poses, with the weights of these; infinite where there is none.
     cost_at: Callable[[Poses], float]
 
 
@@ -92,13 +82,7 @@ def minimised(
 
 
 def solved(normal: Any, right: FloatArray, added: FloatArray | float = 0.0) -> FloatArray:
-    """Solution of a symmetric system, sparse or dense, with numbers added to its diagonal.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If it is singular.
-    """
+    """Solution of a symmetric system, sparse or dense, with numbers added to its diagonal."""
     on_diagonal = np.broadcast_to(added, len(right))
     if not issparse(normal):
         return np.asarray(np.linalg.solve(normal + np.diag(on_diagonal), right))
@@ -114,13 +98,7 @@ def solved(normal: Any, right: FloatArray, added: FloatArray | float = 0.0) -> F
 
 
 def inverted_information(information: FloatArray) -> FloatArray:
-    """Covariance of an information matrix.
-
-    Raises
-    ------
-    GeometryError
-        If it is singular: something that is free was not seen.
-    """
+    """Covariance of an information matrix."""
     if not len(information):
         return information
     scale = np.sqrt(np.clip(np.diagonal(information), 0.0, None))

@@ -26,28 +26,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class NetworkEstimate:
-    """A network and what it was made from.
+    """A network and what it was made from."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The cameras.
-    world_from_camera : (C, 4, 4) float64
-    covariance : (6 C, 6 C) float64
-        Joint, scaled by the residuals.
-    offset : (4, 4) float64 or None
-        `first_from_second` of the double board, adjusted.
-    adjusted : AdjustedBundle
-    views : tuple of BoardView
-        The bundle's views.
-    """
-
-    names: tuple[str, ...]
-    world_from_camera: FloatArray
-    covariance: FloatArray
-    offset: FloatArray | None
+    names: tuple[str, ...]  # The cameras
+    world_from_camera: FloatArray  # (C, 4, 4)
+    covariance: FloatArray  # (6 C, 6 C): joint, scaled by the residuals
+    offset: FloatArray | None  # (4, 4): `first_from_second` of the double board, adjusted
     adjusted: AdjustedBundle
-    views: tuple[BoardView, ...]
+    views: tuple[BoardView, ...]  # The bundle's views
 
 
 def estimate_network(
@@ -62,19 +48,12 @@ def estimate_network(
 
     Parameters
     ----------
-    cameras : mapping of str to Camera
-    boards : mapping of str to Checkerboard
     world_from_board : mapping of str to (4, 4) array
         Boards that are fixed in the world.
     double : DoubleBoard or None
         None if all cameras see boards of the world.
     shots : sequence of sequences of BoardView
         Markers seen at one time.
-    settings : NetworkSettings
-
-    Returns
-    -------
-    NetworkEstimate
 
     Raises
     ------

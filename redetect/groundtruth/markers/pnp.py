@@ -26,18 +26,11 @@ _RANSAC_PX = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PnpSolution:
-    """A pose that explains the corners.
+    """A pose that explains the corners."""
 
-    Attributes
-    ----------
-    pose : (4, 4) float64
-        `camera_from_object`, or `world_from_robot` where there are several cameras.
-    rms_px : float
-        Root mean square of the residuals per coordinate, in the image as it is.
-    """
-
+    # (4, 4): `camera_from_object`, or `world_from_robot` where there are several cameras
     pose: FloatArray
-    rms_px: float
+    rms_px: float  # Root mean square of the residuals per coordinate, in the image as it is
 
 
 def solve_camera(
@@ -47,7 +40,6 @@ def solve_camera(
 
     Parameters
     ----------
-    camera : Camera
     points : (N, 3) array
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
         frame, as `redetect.groundtruth.markers.calibration.marker_corners` gives them.
@@ -94,7 +86,6 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
 
     Parameters
     ----------
-    problem : PoseProblem
     solver : str
         As in `solve_camera`.
 

@@ -42,30 +42,15 @@ _SMALLEST_STEP = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """The data on a robot's pose at one time.
-
-    Attributes
-    ----------
-    cameras : C cameras
-    world_from_camera : (C, 4, 4) float64
-    robot_from_marker : (M, 4, 4) float64
-    camera_covariance : (6 C, 6 C) float64
-        Of the cameras' right perturbations.
-    marker_covariance : (6 M, 6 M) float64
-        Of the markers' right perturbations.
-    seen : ChainPoints
-        Corners: `camera` and `part` point to cameras and markers, `body` is 0.
-    view : (N,) int64
-        Which marker in which image each corner is of: four of 0, four of 1, up to V - 1.
-    floor : Floor or None
-    """
+    """The data on a robot's pose at one time."""
 
     cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray
-    robot_from_marker: FloatArray
-    camera_covariance: FloatArray
-    marker_covariance: FloatArray
-    seen: ChainPoints
+    world_from_camera: FloatArray  # (C, 4, 4)
+    robot_from_marker: FloatArray  # (M, 4, 4)
+    camera_covariance: FloatArray  # (6 C, 6 C): of the cameras' right perturbations
+    marker_covariance: FloatArray  # (6 M, 6 M): of the markers' right perturbations
+    seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
+    # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
     view: IntArray
     floor: Floor | None = None
 
@@ -96,28 +81,16 @@ class PoseProblem:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A local minimum.
+    """A local minimum."""
 
-    Attributes
-    ----------
-    world_from_robot : (4, 4) float64
-    covariance : (6, 6) float64
-        Of the right perturbation: translation (m) and rotation (rad) in the robot's axes.
-    cost : float
-        Squared Mahalanobis length of all residuals, without robust weights.
-    degrees_of_freedom : int
-    view_errors : (V,) float64
-        Root mean square of each view's normalised residuals: about 1 where all is well.
-    view_rms_px : (V,) float64
-        Root mean square of each view's residuals, per coordinate.
-    """
-
-    world_from_robot: FloatArray
+    world_from_robot: FloatArray  # (4, 4)
+    # (6, 6): of the right perturbation: translation (m) and rotation (rad) in the robot's axes
     covariance: FloatArray
-    cost: float
+    cost: float  # Squared Mahalanobis length of all residuals, without robust weights
     degrees_of_freedom: int
+    # (V,): root mean square of each view's normalised residuals: about 1 where all is well
     view_errors: FloatArray
-    view_rms_px: FloatArray
+    view_rms_px: FloatArray  # (V,): root mean square of each view's residuals, per coordinate
 
     @property
     def rms_px(self) -> float:
@@ -140,7 +113,6 @@ def refine_pose(
 
     Parameters
     ----------
-    problem : PoseProblem
     start : (4, 4) array
         A pose `world_from_robot` in which all corners are in front of their cameras.
     loss : str
@@ -148,10 +120,6 @@ def refine_pose(
         marker's four corners are weighted together.
     loss_scale : float
         Normalised error of a view at which the weights begin to fall.
-
-    Returns
-    -------
-    RefinedPose
 
     Raises
     ------

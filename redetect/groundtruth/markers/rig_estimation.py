@@ -42,36 +42,18 @@ _WRONG_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """A rig in the frame of one of its markers, and what it was made from.
+    """A rig in the frame of one of its markers, and what it was made from."""
 
-    Attributes
-    ----------
-    rig : Rig
-        `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the
-        residuals where those are larger than the corners' covariances say.
-    reference : int
-        The marker whose frame it is.
-    pairs : dict of (int, int) to PairConsensus
-        By indices of the rig.
-    parents : tuple of int
-        The tree: each marker's index of the marker that it was chained to.
-    adjusted : AdjustedBundle
-    views : tuple of View
-        The bundle's views.
-    times : int
-        How many times (images, without a network) were used.
-    left_out : dict of int to str
-        Markers that were found but are not in the rig, with the reason.
-    """
-
+    # `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the residuals
+    # where those are larger than the corners' covariances say.
     rig: Rig
-    reference: int
-    pairs: dict[tuple[int, int], PairConsensus]
-    parents: tuple[int, ...]
+    reference: int  # The marker whose frame it is
+    pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
+    parents: tuple[int, ...]  # The tree: each marker's index of the marker that it was chained to
     adjusted: AdjustedBundle
-    views: tuple[View, ...]
-    times: int
-    left_out: dict[int, str]
+    views: tuple[View, ...]  # The bundle's views
+    times: int  # How many times (images, without a network) were used
+    left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
 
 
 def estimate_rig(
@@ -91,21 +73,14 @@ def estimate_rig(
     ----------
     groups : sequence of sequences of MarkerFrame
         Images taken at one time; single ones where the cameras are not calibrated to each other.
-    cameras : C cameras
     world_from_camera : (C, 4, 4) array
         Identities where the cameras are not calibrated to each other.
     widths_m : mapping of int to float
         Widths of the markers that may be in the rig, by ID.
-    dictionary : str
-    settings : RigSettings
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
     camera_covariance : (6 C, 6 C) array, optional
         Covariance of the cameras' relative poses, a prior of their adjustment.
-
-    Returns
-    -------
-    RigEstimate
 
     Raises
     ------
@@ -366,15 +341,9 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
 
     Parameters
     ----------
-    estimate : RigEstimate
     known : Rig
         One or more of its markers in the robot's frame; their covariances, apart from each other,
         are their priors'.
-    settings : RigSettings
-
-    Returns
-    -------
-    RigEstimate
 
     Raises
     ------
@@ -411,7 +380,6 @@ def rig_by_reference_poses(
 
     Returns
     -------
-    RigEstimate
     int
         How many times have a known pose.
 

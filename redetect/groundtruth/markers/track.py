@@ -42,32 +42,18 @@ STATUSES: tuple[Status, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class TrackedTime:
-    """Result for one time.
+    """Result for one time."""
 
-    Attributes
-    ----------
-    time_s : float
-        Mean of the images' times that show a marker of the rig.
-    images : tuple of MarkerFrame
-    views : tuple of View
-        The rig's markers in them.
-    status : str
-        `clear`, or `resolved` by the neighbours: there is a pose. `unresolved`: several poses are
-        possible; `rejected`: what was seen does not fit the times before and after; `failed`: no
-        pose explains the corners; `unseen`: no marker of the rig in any image.
-    estimate : PoseEstimate or None
-    choice : Choice or None
-    reason : str
-        Why there is no pose, or a remark on it.
-    """
-
-    time_s: float
+    time_s: float  # Mean of the images' times that show a marker of the rig
     images: tuple[MarkerFrame, ...]
-    views: tuple[View, ...]
+    views: tuple[View, ...]  # The rig's markers in them
+    # `clear`, or `resolved` by the neighbours: there is a pose. `unresolved`: several poses are
+    # possible; `rejected`: what was seen does not fit the times before and after; `failed`: no pose
+    # explains the corners; `unseen`: no marker of the rig in any image.
     status: Status
     estimate: PoseEstimate | None = None
     choice: Choice | None = None
-    reason: str = ""
+    reason: str = ""  # Why there is no pose, or a remark on it
 
     @property
     def pose(self) -> PoseCandidate | None:
@@ -81,17 +67,10 @@ class TrackedTime:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A robot's poses over time.
-
-    Attributes
-    ----------
-    times : tuple of TrackedTime
-    unknown_markers : int
-        Markers found in the images that are not on the rig.
-    """
+    """A robot's poses over time."""
 
     times: tuple[TrackedTime, ...]
-    unknown_markers: int
+    unknown_markers: int  # Markers found in the images that are not on the rig
 
     @property
     def posed(self) -> list[tuple[float, PoseCandidate]]:
@@ -138,17 +117,10 @@ def track_robot(
     ----------
     frames : sequence of MarkerFrame
         Of all cameras, their indices those of `network`.
-    rig : Rig
-    network : Network
-    settings : PoseSettings
     on_progress : callable, optional
         Called after each time.
     on_count : callable, optional
         Called first, with the number of times.
-
-    Returns
-    -------
-    Track
     """
     groups = group_by_time(frames, settings.time_tolerance_s)
     if on_count is not None:
@@ -272,22 +244,13 @@ _MOST_LEFT_OUT = 3
 
 @dataclass(frozen=True)
 class Choice:
-    """Which candidate of a frame is the robot's pose.
+    """Which candidate of a frame is the robot's pose."""
 
-    Attributes
-    ----------
-    candidate : int or None
-        None where the frame fits its neighbours with no candidate.
-    status : str
-        `clear` (there was only one), `resolved` by the neighbours, `unresolved` (the named
-        candidate is the likeliest but not likely enough), or `rejected`.
-    margin : float
-        Natural logarithm of the odds against the next candidate; infinite without one.
-    """
-
-    candidate: int | None
+    candidate: int | None  # None where the frame fits its neighbours with no candidate
+    # `clear` (there was only one), `resolved` by the neighbours, `unresolved` (the named candidate
+    # is the likeliest but not likely enough), or `rejected`
     status: Status
-    margin: float
+    margin: float  # Natural logarithm of the odds against the next candidate; infinite without one.
 
 
 def choose_candidates(
@@ -295,17 +258,7 @@ def choose_candidates(
 ) -> list[Choice]:
     """Decide between the candidates of each frame by its neighbours.
 
-    Parameters
-    ----------
-    times_s : N floats
-        Seconds, ascending.
-    estimates : N estimates
-    settings : PoseSettings
-        Its odds, and what the robot can do.
-
-    Returns
-    -------
-    list of N Choice
+    `times_s`: seconds, ascending. `settings`: its odds, and what the robot can do.
     """
     through, without = _cheapest_paths(times_s, estimates, settings)
     choices = []

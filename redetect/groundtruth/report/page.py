@@ -41,11 +41,7 @@ _VALIDATION_PX = (864, 410)
 def report_page(inputs: Inputs, version: str) -> bytes:
     """The whole page, UTF-8; the same inputs give the same bytes.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    version : str
-        Of the program, for the page's foot.
+    `version`: of the program, for the page's foot.
     """
     sections = [
         Section("state", "What there is", _state(inputs)),

@@ -33,15 +33,8 @@ _AGREES, _DIFFERS = "#2a78b5", "#d9822b"
 def draw_rig(estimate: RigEstimate) -> bytes:
     """Draw a rig's estimate.
 
-    Parameters
-    ----------
-    estimate : RigEstimate
-        Its pairwise estimates are drawn where they would put a marker, seen from the other one.
-
-    Returns
-    -------
-    bytes
-        A PNG of three views along the axes; the same input gives the same bytes.
+    `estimate`: its pairwise estimates are drawn where they would put a marker, seen from the other
+    one. Returns a PNG of three views along the axes; the same input gives the same bytes.
     """
     rig = estimate.rig
     agreeing, differing = _clouds(estimate, rig)
@@ -157,15 +150,8 @@ def draw_errors(
 
     The same input gives the same bytes.
 
-    Parameters
-    ----------
-    references : sequence of ReferencePose
-    errors : sequence of PoseError
-        At least one.
-    figures : Figures
-        Of the errors.
-    building : (S, 4) array, optional
-        Walls to draw on the map (m).
+    `errors`: at least one. `figures`: of the errors. `building` (S, 4): walls to draw on the map
+    (m).
     """
     with figure_file((13.5, 6.4), "png") as (figure, content):
         grid = figure.add_gridspec(2, 2, width_ratios=[1.25, 1.0])

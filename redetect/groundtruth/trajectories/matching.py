@@ -20,7 +20,6 @@ def interpolate_poses(
 
     Parameters
     ----------
-    poses : PlanarPoses
     times_s : (N,) array
         Ascending.
     largest_gap_s : float
@@ -74,11 +73,7 @@ def matched_streams(
         )
     still, moving = (poses, truth) if interpolate == "truth" else (truth, poses)
     at_times, known = interpolate_poses(moving, still.times_s, largest_gap_s)
-    kept = PlanarPoses(
-        still.times_s[known],
-        still.poses[known],
-        None if still.covariances is None else still.covariances[known],
-    )
+    kept = still.only(known)
     mine, theirs = (kept, at_times) if interpolate == "truth" else (at_times, kept)
     if len(mine) == 0:
         raise GroundTruthError(
@@ -94,11 +89,6 @@ def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
 
     Both have the same times. Least squares in the plane (Horn 1987), without scale, cannot mirror,
     as alignments in space can.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are fewer than two poses.
     """
     if len(poses) < 2:
         raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
@@ -103,14 +104,15 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
     return matrix
 
 
-def right_jacobian(tangents: ArrayLike) -> FloatArray:
-    """(..., 6, 6) matrices J with exp(xi + d) = exp(xi) exp(J d) for small d, of (..., 6) xi."""
-    xi = -np.asarray(tangents, dtype=np.float64)  # the left Jacobian of the opposite tangent
-    rotation_part = _left_jacobian_so3(xi[..., 3:])
-    matrix = np.zeros((*xi.shape[:-1], 6, 6))
-    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation_part
-    matrix[..., :3, 3:] = _left_jacobian_coupling(xi)
-    return matrix
+def right_jacobian(tangent: ArrayLike) -> FloatArray:
+    """(6, 6) matrix J with exp(xi + d) = exp(xi) exp(J d) for small d, of a (6,) tangent xi."""
+    v, w = hat(np.reshape(tangent, (2, 3)))
+    # The integral of exp(-s ad) over s from 0 to 1, with ad = [[w, v], [0, w]].
+    block = np.zeros((12, 12))
+    block[:3, :3] = block[3:6, 3:6] = -w
+    block[:3, 3:6] = -v
+    block[:6, 6:] = np.eye(6)
+    return np.asarray(expm(block)[:6, 6:])
 
 
 def rotation_angle(transforms: ArrayLike) -> FloatArray:
@@ -153,34 +155,6 @@ def _coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     return a, b
 
 
-def _left_jacobian_coupling(xi: FloatArray) -> FloatArray:
-    """Barfoot's Q(xi), the off-diagonal block of SE(3)'s left Jacobian."""
-    rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
-    angle = np.linalg.norm(xi[..., 3:], axis=-1)[..., None, None]
-    _, b = _coefficients(angle)
-    square = angle * angle
-    # The closed forms of the higher coefficients cancel more than those above.
-    small = angle < 0.1
-    t = np.where(small, 1.0, angle)
-    c = np.where(
-        small,
-        1.0 / 24.0 - square / 720.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)),
-        (t**2 + 2.0 * np.cos(t) - 2.0) / (2.0 * t**4),
-    )
-    d = np.where(
-        small,
-        1.0 / 120.0 - square / 2520.0 * (1.0 - square / 48.0 * (1.0 - square / 82.5)),
-        (2.0 * t - 3.0 * np.sin(t) + t * np.cos(t)) / (2.0 * t**5),
-    )
-    pr, rp, prp = phi @ rho, rho @ phi, phi @ rho @ phi
-    return np.asarray(
-        0.5 * rho
-        + b * (pr + rp + prp)
-        + c * (phi @ pr + rp @ phi - 3.0 * prp)
-        + d * (prp @ phi + phi @ prp)
-    )
-
-
 def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
     """(..., 3, 6) derivative of (x, y, theta) by the right perturbation of (..., 4, 4) poses."""
     rotation = np.asarray(world_from_robot, dtype=np.float64)[..., :3, :3]
@@ -197,11 +171,8 @@ def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
 def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> FloatArray:
     """(..., 3, 3) covariance of (x, y, theta) (m, m, rad).
 
-    Parameters
-    ----------
-    world_from_robot : (..., 4, 4) array
-    covariance : (..., 6, 6) array
-        Of the right perturbation (translation m, rotation rad).
+    `world_from_robot` (..., 4, 4). `covariance` (..., 6, 6): of the right perturbation (translation
+    m, rotation rad).
     """
     jacobian = planar_jacobian(world_from_robot)
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
@@ -228,21 +199,9 @@ def mean_pose(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Weighted mean of poses on SE(3).
 
-    Parameters
-    ----------
-    poses : (N, 4, 4) array
-        Close to each other.
-    covariances : (N, 6, 6) array
-        Of their right perturbations.
-
-    Returns
-    -------
-    (4, 4) array
-        The mean.
-    (6, 6) array
-        Its covariance, if the poses' errors are independent.
-    float
-        Squared normalised deviations over degrees of freedom; 1 for a single pose.
+    `poses` (N, 4, 4): close to each other. `covariances` (N, 6, 6): of their right perturbations.
+    Returns (4, 4): the mean. (6, 6): its covariance, if the poses' errors are independent. squared
+    normalised deviations over degrees of freedom; 1 for a single pose.
     """
     stack = np.asarray(poses, dtype=np.float64)
     mean, information = stack[0], np.linalg.inv(covariances)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import read_json, read_text
+from redetect.groundtruth.files import is_number, read_json, read_text
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -28,40 +28,20 @@ _FARTHEST_M = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Points between which distances are measured.
+    """Points between which distances are measured."""
 
-    Attributes
-    ----------
-    fiducials : dict of str to (2,) float64
-        Surveyed points in the world (m).
-    robot_points : dict of str to (2,) float64
-        Points on the robot, in its frame (m).
-    sigma_m : float
-        Standard deviation of a distance (m).
-    """
-
-    fiducials: dict[str, FloatArray]
-    robot_points: dict[str, FloatArray]
-    sigma_m: float
+    fiducials: dict[str, FloatArray]  # Surveyed points in the world (m)
+    robot_points: dict[str, FloatArray]  # Points on the robot, in its frame (m)
+    sigma_m: float  # Standard deviation of a distance (m)
 
 
 @dataclass(frozen=True)
 class Distance:
-    """A distance from a point on the robot to a fiducial.
+    """A distance from a point on the robot to a fiducial."""
 
-    Attributes
-    ----------
-    pose : int
-        Number of the reference pose.
-    time_s : float
-        When, on the ground truth's clock.
-    point, fiducial : str
-        The two ends.
-    distance_m : float
-    """
-
-    pose: int
-    time_s: float
+    pose: int  # Number of the reference pose
+    time_s: float  # When, on the ground truth's clock
+    # `point`, `fiducial`: The two ends
     point: str
     fiducial: str
     distance_m: float
@@ -79,7 +59,7 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     if content.get("version") != 1:
         raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
     sigma = content.get("sigma_m")
-    if sigma is None or not _is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
+    if not is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
         raise GroundTruthError(f"{path}: sigma_m is {excerpt(sigma)}: expected metres above 0")
     points = [_points(path, content, key) for key in ("fiducials", "robot_points")]
     return Survey(points[0], points[1], float(sigma))
@@ -90,7 +70,6 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
 
     Parameters
     ----------
-    path : path
     survey : Survey
         The file may contain only its points.
 
@@ -122,7 +101,7 @@ def _points(
         raise GroundTruthError(f"{path}: {key}: expected two or more points by name")
     points = {}
     for name, value in entries.items():
-        good = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+        good = isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
         if not good or not all(abs(x) < _FARTHEST_M for x in value):
             raise GroundTruthError(
                 f"{path}: {key}: {excerpt(name)} is {excerpt(value)}: expected [x, y]"
@@ -150,7 +129,3 @@ def _distance(
         if name not in known:
             raise StreamError(path, number, f"{excerpt(name)}: expected one of {', '.join(known)}")
     return Distance(pose, time, words[2], words[3], distance)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -28,40 +28,26 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class PoseScore:
-    """How far poses are from the truth.
+    """How far poses are from the truth."""
 
-    Attributes
-    ----------
-    poses : int
-        Poses compared with the truth.
-    unmatched : int
-        Poses without truth at their time.
-    position_mean_m, position_sigma_m, position_rmse_m, position_max_m : float
-        Of the distances from the truth; sigma with N - 1.
-    angle_mean_rad, angle_sigma_rad, angle_max_rad : float
-        Of the signed differences of heading; the largest without sign.
-    angle_abs_mean_rad : float
-        Mean of the differences without sign.
-    position_median_m : float
-    normalised : int
-        Poses whose covariance could be inverted.
-    normalised_error : float
-        Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances
-        are right. NaN without covariances.
-    """
-
-    poses: int
-    unmatched: int
+    poses: int  # Poses compared with the truth
+    unmatched: int  # Poses without truth at their time
+    # `position_mean_m`, `position_sigma_m`, `position_rmse_m`, `position_max_m`: Of the distances
+    # from the truth; sigma with N - 1.
     position_mean_m: float
     position_sigma_m: float
     position_rmse_m: float
     position_max_m: float
+    # `angle_mean_rad`, `angle_sigma_rad`, `angle_max_rad`: Of the signed differences of heading;
+    # the largest without sign.
     angle_mean_rad: float
     angle_sigma_rad: float
     angle_max_rad: float
-    angle_abs_mean_rad: float
+    angle_abs_mean_rad: float  # Mean of the differences without sign
     position_median_m: float
-    normalised: int
+    normalised: int  # Poses whose covariance could be inverted
+    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
+    # right. NaN without covariances.
     normalised_error: float
 
 
@@ -74,10 +60,6 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         With the same times. If the truth has covariances, they count in the normalised error.
     unmatched : int
         Handed through.
-
-    Returns
-    -------
-    PoseScore
 
     Raises
     ------
@@ -130,17 +112,12 @@ def compare_streams(
 
     Parameters
     ----------
-    poses, truth : PlanarPoses
     largest_gap_s : float
         Nothing is interpolated across longer gaps.
     interpolate : str
         `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
     align : bool
         Move the poses rigidly onto the truth first, for solutions with a world of their own.
-
-    Returns
-    -------
-    PoseScore
 
     Raises
     ------
@@ -164,18 +141,12 @@ _COLUMNS = 8
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Poses of the robot at one time relative to another.
+    """Poses of the robot at one time relative to another."""
 
-    Attributes
-    ----------
-    from_s, to_s : (N,) float64
-        The two times (s); either may be the earlier one.
-    from_to : (N, 3) float64
-        x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`.
-    """
-
+    # `from_s`, `to_s`: (N,): the two times (s); either may be the earlier one.
     from_s: FloatArray
     to_s: FloatArray
+    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
     from_to: FloatArray
 
     def __len__(self) -> int:
@@ -184,27 +155,18 @@ class Relations:
 
 @dataclass(frozen=True)
 class RelativeScore:
-    """Relative errors.
+    """Relative errors."""
 
-    Attributes
-    ----------
-    pairs : int
-        Pairs of times compared with the truth.
-    unmatched : int
-        Pairs that one side has no pose for, or that are too far apart.
-    position_mean_m, position_sigma_m, position_median_m, position_rmse_m, position_max_m : float
-        Of the lengths of the relative errors' translations; sigma with N - 1.
-    angle_rmse_rad, angle_abs_mean_rad, angle_max_rad : float
-        Of the relative errors' rotations.
-    """
-
-    pairs: int
-    unmatched: int
+    pairs: int  # Pairs of times compared with the truth
+    unmatched: int  # Pairs that one side has no pose for, or that are too far apart
+    # `position_mean_m`, `position_sigma_m`, `position_median_m`, `position_rmse_m`,
+    # `position_max_m`: Of the lengths of the relative errors' translations; sigma with N - 1.
     position_mean_m: float
     position_sigma_m: float
     position_median_m: float
     position_rmse_m: float
     position_max_m: float
+    # `angle_rmse_rad`, `angle_abs_mean_rad`, `angle_max_rad`: Of the relative errors' rotations
     angle_rmse_rad: float
     angle_abs_mean_rad: float
     angle_max_rad: float
@@ -231,14 +193,8 @@ def score_relations(
 
     Parameters
     ----------
-    poses : PlanarPoses
-    relations : Relations
     largest_gap_s : float
         Nothing is interpolated across longer gaps.
-
-    Returns
-    -------
-    RelativeScore
 
     Raises
     ------
@@ -267,10 +223,6 @@ def score_steps(
     longest_s : float
         Steps that take longer, as across a gap, do not count (s).
 
-    Returns
-    -------
-    RelativeScore
-
     Raises
     ------
     GroundTruthError
@@ -286,13 +238,7 @@ def score_steps(
 
 
 def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0) -> RelativeScore:
-    """Figures of the errors truth^-1 * estimate of (N, 3) relative poses.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is none.
-    """
+    """Figures of the errors truth^-1 * estimate of (N, 3) relative poses."""
     if not len(truth):
         raise GroundTruthError("no two times with poses to compare relative to each other")
     error = between(truth, estimates)

@@ -262,7 +262,7 @@ def test_a_boards_file_is_read(tmp_path: Path) -> None:
         (["images", 0, "placement"], "x", "placement is 'x': expected a whole number"),
         (["images", 0, "corners"], [[1, 2]], "expected either image or corners"),
         (["images", 0], {"camera": "a", "board": "first", "placement": 0, "corners": [[1, 2]]},
-         "corners: expected 42 pairs"),
+         "expected 42 x 2 finite"),
     ],
 )  # fmt: skip
 def test_boards_files_that_cannot_be_are_refused(

@@ -172,7 +172,7 @@ def test_the_command_writes_the_folder(session: Path, capsys: pytest.CaptureFixt
     assert "mean 20 mm, sigma 11; mean +0.15 deg, sigma 1.56 (published)" in printed
     content = json.loads((output / "validation.json").read_text())
     assert content["version"]
-    assert content["settings"]["scans"]["kept"] == 0.95
+    assert content["settings"] == {"refine": "scans"}
     assert set(content["files"]) >= {"distances.csv", "top.scans.npz", "clock.json", "poses.csv"}
     expected = np.hypot(*(noisy - STANDS)[:, :2].T)
     figures = content["figures"]
