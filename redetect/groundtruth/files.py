@@ -62,13 +62,7 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def numbers(place: str, value: Any, *shape: int | None) -> FloatArray:
-    """Numbers, or nested lists of them, as an array; None: any length.
-
-    Raises
-    ------
-    GroundTruthError
-        If they are none; the message begins with `place` and shows the value.
-    """
+    """Numbers, or nested lists of them, as an array; None: any length."""
     if not _has_shape(value, shape):
         expected = " x ".join("rows" if size is None else str(size) for size in shape)
         what = f"{expected} finite numbers" if shape else "a finite number"
@@ -85,13 +79,7 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
 
 
 def covariance_of(place: str, value: Any, size: int) -> FloatArray:
-    """A covariance (size, size) from JSON.
-
-    Raises
-    ------
-    GroundTruthError
-        If it is not symmetric, or has a negative eigenvalue beyond rounding.
-    """
+    """A covariance (size, size) from JSON."""
     matrix = numbers(place, value, size, size)
     scale = np.sqrt(np.clip(np.diagonal(matrix), 0.0, None))
     safe = np.where(scale > 0.0, scale, 1.0)

@@ -94,17 +94,12 @@ class MovementProblem:
 
     def _part(self, begin: int, end: int) -> MovementProblem:
         here = (self.nodes >= begin) & (self.nodes < end)
-        return MovementProblem(
-            self.times_s[begin:end],
-            self.controls[begin:end],
-            self.unseen[begin:end],
-            self.nodes[here] - begin,
-            self.measured[here],
-            self.covariances[here],
-            tuple(self.streams[i] for i in np.flatnonzero(here)),
-            self.repaired,
-            self.repeated,
-            self.settings,
+        return replace(
+            self.with_only(here),
+            times_s=self.times_s[begin:end],
+            controls=self.controls[begin:end],
+            unseen=self.unseen[begin:end],
+            nodes=self.nodes[here] - begin,
         )
 
     def split(self, longest_s: float) -> list[MovementProblem]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +20,9 @@ from redetect.groundtruth.lasers.outline import (
 )
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import (
+    BeamCounts,
     OutlineFit,
+    OutlinePose,
     Seen,
     explain_set,
     new_points,
@@ -51,18 +52,6 @@ class Body:
     symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
 
 
-class Refined(NamedTuple):
-    """Result of `redetect.groundtruth.lasers.tracking_kernels.refine_outline`."""
-
-    pose: FloatArray
-    covariance: FloatArray
-    by_scanner: FloatArray
-    summary: FloatArray
-    weak: FloatArray
-    information: FloatArray
-    gradient: FloatArray
-
-
 def refine(
     seen: Seen,
     start: FloatArray,
@@ -70,20 +59,20 @@ def refine(
     body: Body,
     settings: LaserSettings,
     prior_m: float,
-) -> Refined:
+) -> OutlinePose:
     """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     fit = OutlineFit(
         s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
         _STEPS,
     )  # fmt: skip
-    return Refined(*refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit))
+    return refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit)
 
 
 def explain(
     sets: ScanSets, index: int, tables: ScannerTables, body: Body, pose: FloatArray
-) -> FloatArray:
-    """(6,) beams of a set, as in `redetect.groundtruth.lasers.tracking_kernels.explain_set`."""
+) -> BeamCounts:
+    """How a pose explains the beams of a set."""
     return explain_set(
         sets.ranges_mm, sets.rows[index], tables.as_beams(), body.faces, body.middle,
         body.radius_m, pose, AGREES_M,
@@ -109,11 +98,9 @@ def acquire(
 
     Returns (3,): x, y (m), theta (rad); with a symmetric outline one of the equivalent poses.
     """
-    seen = Seen(
-        *new_points(
-            sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
-            np.zeros(5), sets.ages_s[index],
-        )
+    seen = new_points(
+        sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
+        np.zeros(5), sets.ages_s[index],
     )  # fmt: skip
     if len(seen.points) < settings.acquire_readings:
         return None
@@ -182,17 +169,14 @@ def _search(
             continue
         tried.append(pose)
         refined = refine(seen, pose, tables, body, settings, 0.1)
-        pose, summary = refined.pose, refined.summary
-        used = summary[0]
-        if used < settings.acquire_readings or summary[2] > 0.0:
+        if refined.used < settings.acquire_readings or refined.open_directions:
             continue
-        if summary[1] > _LARGEST_CHI2 * (used - 3.0):
+        if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
-        beams = explain(sets, index, tables, body, pose)
-        _, agree, through, hidden, _, beside = beams
+        _, agree, through, hidden, _, beside = explain(sets, index, tables, body, refined.pose)
         if agree < settings.least_agreement * (agree + through + hidden + beside):
             continue
-        found.append((agree - 2.0 * (through + beside) - hidden, pose))
+        found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 
 

@@ -27,7 +27,12 @@ from redetect.groundtruth.lasers.icp import (
 )
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
+from redetect.groundtruth.lasers.tracking_kernels import (
+    OutlineFit,
+    OutlinePose,
+    Seen,
+    refine_outline,
+)
 from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
@@ -162,11 +167,11 @@ def align_scanners(
     steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
     found, matched, rms, weak = [], [], [], []
     for scanner, scan, start in zip(scanners, scans, steps["map as a whole"]):
-        pose, covariance, summary = _to_map(scanner.name, scan, start, building, s)
+        pose, covariance, fit = _to_map(scanner.name, scan, start, building, s)
         found.append(replace(scanner, pose=pose, covariance=covariance))
-        matched.append(int(summary[0]))
-        rms.append(float(summary[3]))
-        if summary[2] > 0.0:
+        matched.append(fit.used)
+        rms.append(fit.rms_m)
+        if fit.open_directions:
             weak.append(scanner.name)
     steps["each to the map"] = np.stack([scanner.pose for scanner in found])
     moved = steps["each to the map"] - steps["map as a whole"]
@@ -288,8 +293,8 @@ def _whole_to_map(
 
 def _to_map(
     name: str, scan: StillScan, start: FloatArray, building: FloatArray, s: AlignmentSettings
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pose of one scanner on the map, its covariance, and the fit's summary.
+) -> tuple[FloatArray, FloatArray, OutlinePose]:
+    """Pose of one scanner on the map, its covariance, and the fit.
 
     The kernel moves faces to points: here the map to the scanner's frame. Walls are seen from both
     sides. Readings of objects in front of a wall are far from the wall that the beam would hit, and
@@ -303,20 +308,20 @@ def _to_map(
         # Last, the residuals themselves say how large the errors are.
         floor = narrow if narrow > 0.0 else floor
         fit = OutlineFit(floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M, 1.0, _LONE_STEPS)
-        result = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
-        pose, covariance, summary = result[0], result[1], result[3]
-        if summary[0] < 10:
+        found = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
+        pose = found.pose
+        if found.used < 10:
             raise GeometryError(
-                f"scanner {name}: {summary[0]:.0f} readings lie on the map: expected 10 or more"
+                f"scanner {name}: {found.used} readings lie on the map: expected 10 or more"
             )
         if narrow == _FLOOR_M:
-            ratio = summary[1] / (summary[0] - 3.0)
+            ratio = found.chi2 / (found.used - 3.0)
             floor = max(_FLOOR_M * math.sqrt(max(ratio, 1.0)), _FLOOR_M)
-    ratio = max(summary[1] / (summary[0] - 3.0), 0.1)
+    ratio = max(found.chi2 / (found.used - 3.0), 0.1)
     world = invert(pose)
     # The inverse's covariance: x' = -R' t and theta' = -theta.
     c, sn = math.cos(world[2]), math.sin(world[2])
     jacobian = np.array([[-c, sn, world[1]], [-sn, -c, -world[0]], [0.0, 0.0, -1.0]])
-    covariance = ratio * jacobian @ covariance @ jacobian.T
+    covariance = ratio * jacobian @ found.covariance @ jacobian.T
     world[2] = wrap_angle(world[2])
-    return world, 0.5 * (covariance + covariance.T), summary
+    return world, 0.5 * (covariance + covariance.T), found

@@ -89,21 +89,8 @@ def icp_to_segments(
 ) -> IcpResult:
     """Align points with line segments: an outline, a building map.
 
-    Parameters
-    ----------
-    points : (n, 2) array
-        To be moved (m).
-    segments : (k, 4) array
-        x1, y1, x2, y2 (m).
-    start : (3,) array
-        Pose to start from.
-
-    Raises
-    ------
-    GeometryError
-        If fewer than three pairs are within the gate.
-    GroundTruthError
-        If a shape is wrong or a number not finite.
+    `points` (n, 2): to be moved (m). `segments` (k, 4): x1, y1, x2, y2 (m). `start` (3,): pose to
+    start from.
     """
     s = IcpSettings() if settings is None else settings
     lines, cloud = _checked(segments, 4, "segments"), _checked(points, 2, "points")

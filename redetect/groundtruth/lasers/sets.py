@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,51 +19,26 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Background:
+# A beam's readings have at least this deviation; one is new if it is so many deviations nearer than
+# the nearest object that the beam saw, which is at this quantile of its readings.
+_LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
+
+
+class Background(NamedTuple):
     """A scanner's static background, beam by beam."""
 
-    range_m: FloatArray  # (readings,): median of the beam's readings; NaN where it has none.
-    # (readings,): their standard deviation by the median of deviations, at least `least_sigma_m`;
-    # NaN where the beam has none.
-    sigma_m: FloatArray
-    # (readings,): A reading below this is something that was not there; infinite where the beam
-    # sees nothing.
+    # (readings,): a reading below this is something that was not there; infinite where the beam
+    # sees nothing
     near_m: FloatArray
-    drop_out: FloatArray  # (readings,): share of the scans without a reading
     quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
-    scans: int  # Scans that it was learned from
 
 
-def learn_background(
-    ranges_mm: NDArray[np.uint16],
-    max_range_m: float,
-    *,
-    least_sigma_m: float = 0.005,
-    margin_sigma: float = 5.0,
-    passing: float = 0.02,
-) -> Background:
-    """Learn the background of the beams from scans of the empty area.
+def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
+    """Learn the background of the beams from scans (N, readings) of the empty area.
 
-    Parameters
-    ----------
-    ranges_mm : (N, readings) uint16
-        The scans; 0 or `max_range_m` and more where nothing came back.
-    max_range_m : float
-        The scanner's.
-    least_sigma_m : float
-        Standard deviation that a beam has at least (m).
-    margin_sigma : float
-        A reading is new if it is this many standard deviations nearer than the nearest object that
-        the beam saw.
-    passing : float
-        The nearest object is at this quantile of the beam's readings: beams along an edge see near
-        and far in turn, and nearer readings than that are treated as passing objects.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no scans.
+    Readings are 0, or `max_range_m` and more, where nothing came back. The nearest object of a beam
+    is at a low quantile of its readings: beams along an edge see near and far in turn, and nearer
+    readings than that are treated as passing objects.
     """
     if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
         raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
@@ -82,16 +58,12 @@ def learn_background(
     deviation = np.full_like(metres, np.inf)
     np.subtract(metres, median, out=deviation, where=hit)
     deviation = np.sort(np.abs(deviation), axis=0)
-    sigma = np.maximum(1.4826 * quantile(deviation, 0.5), least_sigma_m)
-    near = np.where(seen, quantile(ordered, passing), 0.0)
-    near -= margin_sigma * np.where(seen, sigma, 0.0)
+    sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
+    near = np.where(seen, quantile(ordered, _PASSING), 0.0)
+    near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
     return Background(
-        np.where(seen, median, np.nan),
-        np.where(seen, sigma, np.nan),
         np.where(seen, np.maximum(near, 0.0), np.inf),
-        1.0 - count / len(ranges_mm),
         1e-3 * float(np.gcd.reduce(ranges_mm, axis=None)),
-        len(ranges_mm),
     )
 
 
@@ -169,17 +141,7 @@ def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> Scan
     time, or where its first scan is more than the window ago. So each scan is in one set, and
     scanners that run slightly faster than others occasionally have a set of their own.
 
-    Parameters
-    ----------
-    scans : sequence of Scans
-        Per scanner.
-    window_s : float, optional
-        By default the median time between a scanner's scans.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no scans at all.
+    `scans`: per scanner. `window_s`: by default the median time between a scanner's scans.
     """
     total = sum(len(one) for one in scans)
     if total == 0:

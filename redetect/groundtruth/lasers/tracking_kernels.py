@@ -42,6 +42,35 @@ class Seen(NamedTuple):
         )
 
 
+class OutlinePose(NamedTuple):
+    """The most likely pose of an outline near a start."""
+
+    pose: FloatArray
+    # (3, 3): from the readings alone, but for open directions, which have the prior's
+    covariance: FloatArray
+    by_scanner: FloatArray  # (3, 3 scanners): derivatives of the pose by the scanners' poses
+    used: int  # Readings that it rests on
+    chi2: float  # Their squared normalised residuals
+    open_directions: int
+    rms_m: float  # Of their distances from the outline
+    # (3,): the least determined direction of (x, y, theta), theta times `scale_m`
+    weak: FloatArray
+    # (scanners, 3, 3), (scanners, 3): correction of each scanner's own pose by the residuals
+    information: FloatArray
+    gradient: FloatArray
+
+
+class BeamCounts(NamedTuple):
+    """How a pose explains the beams of a set."""
+
+    expected: int  # Beams that should see the robot before the background; of these
+    agree: int  # as far as they should,
+    through: int  # farther,
+    hidden: int  # nearer,
+    none: int  # without a reading
+    beside: int  # New readings in the outline's circle where the robot is not
+
+
 class OutlineFit(NamedTuple):
     """How an outline is fitted."""
 
@@ -65,7 +94,7 @@ def new_points(
     reach_m: float,
     motion: FloatArray,
     ages_s: FloatArray,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+) -> Seen:
     """Points of a set that are nearer than the background and within reach of a place.
 
     `ranges_mm` (scans, readings). `rows` (scanners,): each scanner's scan of the set. `centre`
@@ -105,7 +134,7 @@ def new_points(
             scanner[n] = s
             range_m[n] = 1e-3 * r
             n += 1
-    return points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy()
+    return Seen(points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy())
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,7 +145,7 @@ def refine_outline(
     origins: FloatArray,
     sigmas_m: FloatArray,
     fit: OutlineFit,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> OutlinePose:
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
@@ -124,13 +153,6 @@ def refine_outline(
     the face that its beam meets first, whatever its noise; at first, while the pose may be off, to
     the nearest one turned to the scanner. Readings beyond the gate do not count, and open
     directions hold on to the start (see `OutlineFit`).
-
-    Returns `pose` (3,). `covariance` (3, 3): of (x, y, theta), from the readings alone, but for
-    open directions, which have the prior's. `calibration` (3, 3 scanners): derivatives of the pose
-    by the scanners' poses. `summary` (4,): readings used, their squared normalised residuals, the
-    pose's open directions, the root mean square distance from the outline (m). `weak` (3,): the
-    least determined direction of (x, y, theta), theta times `scale_m`. `information`, `gradient`
-    (scanners, 3, 3), (scanners, 3): correction of each scanner's own pose by the residuals.
     """
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -144,7 +166,7 @@ def refine_outline(
     calibration = np.zeros((3, 3 * many))
     information = np.zeros((many, 3, 3))
     gradient = np.zeros((many, 3))
-    summary = np.zeros(4)
+    rms, open_count, used, chi2 = 0.0, 0, 0, 0.0
     weak = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
     for step in range(fit.steps):
@@ -212,10 +234,9 @@ def refine_outline(
                     h[a, b] += w * by_robot[a] * by_robot[b]
                     cross[a, 3 * q + b] += w * by_robot[a] * by_scanner[b]
                     information[q, a, b] += w * by_scanner[a] * by_scanner[b]
-        summary[0], summary[1] = used, chi2
         if used < 3:
-            return pose, covariance, calibration, summary, weak, information, gradient
-        summary[3] = math.sqrt(squares / used)
+            break
+        rms = math.sqrt(squares / used)
         # Undetermined directions are evaluated about the middle of the points, theta in metres.
         mx, my = sx / used, sy / used
         scale = fit.scale_m
@@ -237,7 +258,6 @@ def refine_outline(
                     g[a] -= p * row[a] * ahead
                     for b in range(3):
                         h[a, b] += p * row[a] * row[b]
-        summary[2] = open_count
         v = vectors[:, 0]
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance[:, :] = np.linalg.inv(h)
@@ -249,11 +269,14 @@ def refine_outline(
         pose[0] += c * delta[0] - s * delta[1]
         pose[1] += s * delta[0] + c * delta[1]
         pose[2] += delta[2]
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
-    calibration[:] = -(turn_world @ local_covariance) @ cross
-    return pose, covariance, calibration, summary, weak, information, gradient
+    if used >= 3:
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
+        calibration[:] = -(turn_world @ local_covariance) @ cross
+    return OutlinePose(
+        pose, covariance, calibration, used, chi2, open_count, rms, weak, information, gradient
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -266,14 +289,9 @@ def explain_set(
     radius_m: float,
     pose: FloatArray,
     tolerance_m: float,
-) -> FloatArray:
-    """How a pose explains the beams of a set, by casting each of them at the outline.
-
-    Returns (6,): beams that should see the robot before the background; of these: as far as they
-    should, farther (through it), nearer (hidden by something), without a reading; and new readings
-    in the outline's circle where the robot is not: objects beside it.
-    """
-    out = np.zeros(6)
+) -> BeamCounts:
+    """How a pose explains the beams of a set, by casting each of them at the outline."""
+    expected = agree = through = hidden = none = beside = 0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     centre_x = pose[0] + c * middle[0] - s * middle[1]
     centre_y = pose[1] + s * middle[0] + c * middle[1]
@@ -305,15 +323,15 @@ def explain_set(
                     best = r
             reading = 1e-3 * ranges_mm[rows[q], i]
             if best < 1e-3 * beams.near_mm[q, i]:
-                out[0] += 1
+                expected += 1
                 if reading <= 0.0:
-                    out[4] += 1
+                    none += 1
                 elif reading > best + tolerance_m:
-                    out[2] += 1
+                    through += 1
                 elif reading < best - tolerance_m:
-                    out[3] += 1
+                    hidden += 1
                 else:
-                    out[1] += 1
+                    agree += 1
             elif 0.0 < reading < 1e-3 * beams.near_mm[q, i] and abs(reading - ahead) < radius_m:
-                out[5] += 1
-    return out
+                beside += 1
+    return BeamCounts(expected, agree, through, hidden, none, beside)

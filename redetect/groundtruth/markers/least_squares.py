@@ -44,13 +44,7 @@ def minimised(
     moved: Callable[[Poses, FloatArray], Poses],
     tolerance: float,
 ) -> Poses:
-    """The poses at the nearest minimum; steps (m, rad) smaller than the tolerance end the search.
-
-    Raises
-    ------
-    GeometryError
-        If the equations are singular whatever is added to their diagonal.
-    """
+    """The poses at the nearest minimum; steps (m, rad) below the tolerance end the search."""
     poses, here, damping = start, linearise(start), _DAMPING
     for _ in range(_MOST_STEPS):
         diagonal = here.normal.diagonal()

@@ -70,7 +70,7 @@ def estimate_network(
         parts[double.first], parts[double.second] = np.eye(4), offset
     poses, bodies = _chained(names, seen, world_from_board, parts)
     bundle, views = _bundle(
-        names, cameras, boards, world_from_board, parts, double, seen, poses, bodies, settings
+        cameras, boards, world_from_board, parts, double, seen, (poses, bodies), settings
     )
     try:
         adjusted = adjust_bundle(
@@ -201,17 +201,16 @@ def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
 
 
 def _bundle(
-    names: tuple[str, ...],
     cameras: Mapping[str, Camera],
     boards: Mapping[str, Checkerboard],
     world_from_board: Mapping[str, FloatArray],
     parts: Mapping[str, FloatArray],
     double: DoubleBoard | None,
     seen: _Seen,
-    poses: Mapping[str, FloatArray],
-    bodies: Mapping[int, FloatArray],
+    placed: tuple[Mapping[str, FloatArray], Mapping[int, FloatArray]],
     settings: NetworkSettings,
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
+    names, (poses, bodies) = sorted(cameras), placed
     order = sorted(parts)
     body_index = {number: 1 + i for i, number in enumerate(sorted(bodies))}
     views: list[BoardView] = []

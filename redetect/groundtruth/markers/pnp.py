@@ -84,21 +84,8 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
     `pycolmap` works on all cameras at once; the others on one camera, so there is a solution for
     each camera, and for `ippe` two for each marker in each image.
 
-    Parameters
-    ----------
-    solver : str
-        As in `solve_camera`.
-
-    Returns
-    -------
-    list of PnpSolution
-        `world_from_robot`, with residuals over all cameras; the best first. Solutions in which a
-        corner is behind its camera are left out.
-
-    Raises
-    ------
-    GeometryError
-        If there is no solution.
+    `solver`: as in `solve_camera`. Returns `world_from_robot`, with residuals over all cameras; the
+    best first. Solutions in which a corner is behind its camera are left out.
     """
     used = np.unique(problem.seen.camera)
     if solver == "pycolmap" and len(used) > 1:

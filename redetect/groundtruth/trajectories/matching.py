@@ -18,19 +18,9 @@ def interpolate_poses(
 ) -> tuple[PlanarPoses, BoolArray]:
     """Poses at other times, linearly between neighbours, headings the short way round.
 
-    Parameters
-    ----------
-    times_s : (N,) array
-        Ascending.
-    largest_gap_s : float
-        Between neighbours farther apart than this there is no pose, but at their own times.
-
-    Returns
-    -------
-    PlanarPoses
-        At those of the times that have one; covariances interpolated like the poses.
-    (N,) bool array
-        Which times those are.
+    `times_s` (N,): ascending. `largest_gap_s`: between neighbours farther apart than this there is
+    no pose, but at their own times. Returns at those of the times that have one; covariances
+    interpolated like the poses. (N,): which times those are.
     """
     if len(poses) == 0:
         raise GroundTruthError("no poses to interpolate between")

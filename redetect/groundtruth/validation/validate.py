@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
 from redetect.groundtruth.validation.reference_poses import DistancePose
+from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 from redetect.landmarks import wrap_angle
-
-if TYPE_CHECKING:
-    from redetect.groundtruth.clocks.clock import ClockModel
-    from redetect.groundtruth.validation.reference_poses_scans import Onboard
 
 FloatArray = NDArray[np.float64]
 
@@ -163,8 +161,6 @@ def _refined(
     segments: FloatArray,
     clock: ClockModel | None,
 ) -> ReferencePose | None:
-    from redetect.groundtruth.validation.reference_poses_scans import refine_pose, still_points
-
     time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
     try:
         points = still_points(onboard, time)
