@@ -30,6 +30,8 @@ from redetect.groundtruth.trajectories.matching import (
     interpolate_poses,
     moved_poses,
     planar_alignment,
+    pose_differences,
+    squared_lengths,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
@@ -261,11 +263,10 @@ def _left_out(
     here = _during(truth, from_s, to_s)
     segment, others = truth.only(here), truth.only(~here)
     predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
-    error = _difference(predicted, segment.only(known))
+    error = pose_differences(predicted.poses, segment.only(known).poses)
     assert predicted.covariances is not None
     assert segment.covariances is not None
     covariances = predicted.covariances + segment.covariances[known]
-    weighted = np.linalg.solve(covariances, error[:, :, None])[:, :, 0]
     beside, aligned = interpolate_poses(odometry, others.times_s, _LARGEST_GAP_S)
     moved = moved_poses(odometry, planar_alignment(beside, others.only(aligned)))
     rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
@@ -274,19 +275,13 @@ def _left_out(
         to_s,
         len(predicted),
         *_rms(error),
-        float(np.mean(np.sum(error * weighted, axis=1)) / 3.0),
-        *_rms(_difference(rigid, segment.only(known))),
+        float(np.mean(squared_lengths(error, covariances)) / 3.0),
+        *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
     )
 
 
 def _during(poses: PlanarPoses, from_s: float, to_s: float) -> NDArray[np.bool_]:
     return np.asarray((poses.times_s >= from_s) & (poses.times_s <= to_s))
-
-
-def _difference(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
-    difference = poses.poses - truth.poses
-    difference[:, 2] = wrap_angle(difference[:, 2])
-    return difference
 
 
 def _rms(difference: FloatArray) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from redetect.groundtruth.trajectories.matching import (
     interpolate_poses,
     moved_poses,
     planar_alignment,
+    pose_differences,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
@@ -99,8 +100,7 @@ def localisation_problem(
     for _ in range(_TRIMMINGS):
         motion = planar_alignment(own.only(usual), measured.only(usual))
         beside = moved_poses(own, motion)
-        differences = measured.poses - beside.poses
-        differences[:, 2] = wrap_angle(differences[:, 2])
+        differences = pose_differences(measured.poses, beside.poses)
         off = np.column_stack([np.hypot(differences[:, 0], differences[:, 1]), differences[:, 2]])
         usual = np.all(np.abs(off) <= _USUAL * np.median(np.abs(off), axis=0), axis=1)
         if np.count_nonzero(usual) < 2:

@@ -17,9 +17,10 @@ from ezdxf.enums import InsertUnits
 from ezdxf.filemanagement import readfile
 from numpy.typing import NDArray
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories.streams import read_rows_of_numbers
 from redetect.storage.bounded import read_bounded
-from redetect.storage.messages import excerpt, one_line
+from redetect.storage.messages import one_line
 
 FloatArray = NDArray[np.float64]
 
@@ -63,53 +64,22 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
         If the file cannot be read, has no walls, more than `MOST_SEGMENTS` pieces, or one that ends
         a million metres away.
     """
-    try:
-        content = read_bounded(path, _LARGEST_FILE_BYTES)
-        is_drawing = Path(path).suffix.lower() == ".dxf"
-        segments = _read_drawing(path) if is_drawing else _read_rows(path, content)
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if not len(segments):
-        raise GroundTruthError(f"{path}: no walls: expected one or more of x1, y1, x2, y2")
+    if Path(path).suffix.lower() == ".dxf":
+        segments = _read_drawing(path)
+    else:
+        segments = read_rows_of_numbers(path, 4, "walls as x1, y1, x2, y2", head=HEAD)
+    if len(segments) > MOST_SEGMENTS:
+        raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
     # NaN fails this comparison too.
     if not np.all(np.abs(segments) < _FARTHEST_M):
         raise GroundTruthError(f"{path}: a wall ends {_FARTHEST_M:.0e} m or farther away")
     return segments
 
 
-def _read_rows(path: str | os.PathLike[str], file: bytes) -> FloatArray:
-    try:
-        text = file.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise StreamError(path, None, "is no text: expected rows of numbers") from None
-    rows: list[list[float]] = []
-    for number, line in enumerate(text.split("\n"), 1):
-        content = line.partition("#")[0].strip()
-        if not content or (not rows and content.replace(" ", "") == HEAD):
-            continue
-        words = content.split(",")
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        # NaN fails this comparison too.
-        if len(row) != 4 or not all(abs(x) < _FARTHEST_M for x in row):
-            raise StreamError(
-                path,
-                number,
-                f"{excerpt(content)}: expected x1, y1, x2, y2 within {_FARTHEST_M:.0e} m",
-            )
-        if len(rows) == MOST_SEGMENTS:
-            raise StreamError(path, number, f"more than {MOST_SEGMENTS} walls")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, 4)
-
-
 def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
     pieces: list[tuple[float, float, float, float]] = []
     try:
+        read_bounded(path, _LARGEST_FILE_BYTES)
         drawing = readfile(os.fspath(path))
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
         unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
@@ -119,7 +89,11 @@ def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
             pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
             if len(pieces) > MOST_SEGMENTS:
                 raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
-    except (FileNotFoundError, GroundTruthError):
+    except FileNotFoundError:
+        raise GroundTruthError(f"{path}: no such file") from None
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except GroundTruthError:
         raise
     except Exception as error:  # a damaged drawing may fail anywhere within the library
         text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)

@@ -17,11 +17,10 @@ from redetect.groundtruth.report.figures import (
     series_figure,
 )
 from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
-from redetect.groundtruth.trajectories.matching import matched_streams
+from redetect.groundtruth.trajectories.matching import matched_streams, pose_differences
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 from redetect.groundtruth.validation.validate import PUBLISHED
-from redetect.landmarks import wrap_angle
 from redetect.reporting.page import Part, Section, image_part, page_of
 
 # Differences remain without colour: dashes.
@@ -137,10 +136,10 @@ def _errors(inputs: Inputs) -> list[Part]:
             faults.append(Part("problem", f"{label}: {fault}"))
             continue
         rows.append((label, *_score_words(score_poses(mine, theirs))))
-        error = mine.poses - theirs.poses
+        error = pose_differences(mine.poses, theirs.poses)
         colour, dashes = _LOOKS[name]
         far = 1e3 * np.hypot(error[:, 0], error[:, 1])
-        bent = np.degrees(np.abs(wrap_angle(error[:, 2])))
+        bent = np.degrees(np.abs(error[:, 2]))
         short = STREAMS.get(name, name)
         place.append(Series(short, colour, dashes, mine.times_s, far))
         turn.append(Series(short, colour, dashes, mine.times_s, bent))

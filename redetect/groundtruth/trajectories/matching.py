@@ -111,3 +111,16 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
 def _rotation(angle: float) -> FloatArray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
+
+
+def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
+    """(N, 3) poses minus the truth's, headings the short way round."""
+    difference = poses - truth
+    difference[:, 2] = wrap_angle(difference[:, 2])
+    return difference
+
+
+def squared_lengths(differences: FloatArray, covariances: FloatArray) -> FloatArray:
+    """(N,) squared Mahalanobis lengths of differences (N, d)."""
+    weighted = np.linalg.solve(covariances, differences[..., None])[..., 0]
+    return np.asarray(np.sum(differences * weighted, axis=1))

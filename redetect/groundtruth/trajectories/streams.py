@@ -207,7 +207,9 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     return times
 
 
-def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: str) -> FloatArray:
+def read_rows_of_numbers(
+    path: str | os.PathLike[str], columns: int, expected: str, *, head: str = ""
+) -> FloatArray:
     """Read rows of numbers between commas or blanks; blank lines and `#` comments are skipped.
 
     Parameters
@@ -216,6 +218,8 @@ def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: s
         Numbers in every row.
     expected : str
         What they are, for messages.
+    head : str
+        Names between commas that may be on the first line.
 
     Returns
     -------
@@ -228,6 +232,8 @@ def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: s
     """
     rows: list[list[float]] = []
     for line, words in _rows(path):
+        if not rows and words == head.split(","):
+            continue
         if len(words) != columns:
             raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
         rows.append(_numbers(path, line, words))

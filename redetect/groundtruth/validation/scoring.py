@@ -13,6 +13,8 @@ from redetect.groundtruth.trajectories.matching import (
     align_poses,
     interpolate_poses,
     matched_streams,
+    pose_differences,
+    squared_lengths,
 )
 from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import (
@@ -20,7 +22,6 @@ from redetect.groundtruth.trajectories.streams import (
     is_positive_definite,
     read_rows_of_numbers,
 )
-from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -70,8 +71,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         raise GroundTruthError(
             f"{len(poses)} poses and {len(truth)} of the truth: expected as many, and at least one"
         )
-    error = poses.poses - truth.poses
-    error[:, 2] = wrap_angle(error[:, 2])
+    error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
     normalised, count = float("nan"), 0
     if poses.covariances is not None:
@@ -81,8 +81,8 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         usable = is_positive_definite(covariances)
         count = int(usable.sum())
         if count:
-            weighted = np.linalg.solve(covariances[usable], error[usable][..., None])[..., 0]
-            normalised = float(np.mean(np.sum(error[usable] * weighted, axis=1)) / 3.0)
+            squared = squared_lengths(error[usable], covariances[usable])
+            normalised = float(np.mean(squared) / 3.0)
     return PoseScore(
         len(poses),
         unmatched,

@@ -13,10 +13,10 @@ from scipy.special import chdtri
 
 from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.trajectories.matching import pose_differences, squared_lengths
 from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
-from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
@@ -219,15 +219,13 @@ def pose_errors(
         if not there
     ]
     assert stream.covariances is not None
-    error = at_times.poses - stream.poses[known]
-    error[:, 2] = wrap_angle(error[:, 2])
+    error = pose_differences(at_times.poses, stream.poses[known])
     nees = np.full(len(error), np.nan)
     sigma = np.full((len(error), 2), np.nan)
     if at_times.covariances is not None and len(error):
         both = at_times.covariances + stream.covariances[known]
         usable = is_positive_definite(at_times.covariances) & is_positive_definite(both)
-        weighted = np.linalg.solve(both[usable], error[usable][..., None])[..., 0]
-        nees[usable] = np.sum(error[usable] * weighted, axis=1)
+        nees[usable] = squared_lengths(error[usable], both[usable])
         sigma[usable, 0] = np.sqrt(both[usable, 0, 0] + both[usable, 1, 1])
         sigma[usable, 1] = np.sqrt(both[usable, 2, 2])
     there = [r for r, found in zip(references, known) if found]
