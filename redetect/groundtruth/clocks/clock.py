@@ -175,11 +175,9 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     """Put segments on the straight line through all of them, if that agrees with each.
 
     A clock that is neither disciplined nor set runs evenly over minutes. Segments that are minutes
-    apart then determine its rate much better than each alone, and its offset somewhat better.
-
-    `segments`: of one session, in order. Returns with the line's offsets, rates and deviations, and
-    a note; unchanged where fewer than two segments are determined, a clock was set, or one line
-    does not explain them: its squared error is larger than one session in a thousand has by chance.
+    apart then determine its rate much better than each alone, and its offset somewhat better. They
+    stay as they are where fewer than two are determined, a clock was set, or one line does not
+    explain them: its squared error is larger than one session in a thousand has by chance.
     """
     determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}

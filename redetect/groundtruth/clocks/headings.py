@@ -18,20 +18,12 @@ BoolArray = NDArray[np.bool_]
 
 
 def continuous_headings(poses: PlanarPoses) -> FloatArray:
-    """Headings without jumps of whole turns.
-
-    `poses`: sampled so often that the robot turns less than half a turn between neighbours. Returns
-    (N,): headings (rad), beyond +-pi where the robot went on turning.
-    """
+    """(N,) headings (rad) without jumps of whole turns, of poses less than half a turn apart."""
     return np.asarray(np.unwrap(poses.poses[:, 2]))
 
 
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
-    """Cut times where a pause is longer than a limit.
-
-    `times_s` (N,): ascending. `largest_gap_s`: longer pauses begin a new segment. Returns the
-    segments' samples.
-    """
+    """The samples (N,) of each segment between pauses that are longer than a limit."""
     cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
     ends = [0, *cuts.tolist(), len(times_s)]
     return [slice(a, b) for a, b in pairwise(ends) if b > a]
@@ -100,10 +92,10 @@ class HeadingIntegral:
 def windowed_means(
     times_s: FloatArray, headings_rad: FloatArray, window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Means of headings over windows side by side; windows with a gap in them are left out.
+    """Middles (M,) and means (M,) of headings over windows side by side, but those with a gap in
+    them.
 
-    `times_s`, `headings_rad` (N,): headings continuous. `window_s`: length of each window. Returns
-    `middles_s`, `means_rad` (M,): middles of the windows and the mean headings.
+    Headings are continuous.
     """
     count = int((times_s[-1] - times_s[0]) / window_s)
     edges = times_s[0] + window_s * np.arange(count + 1)
@@ -191,10 +183,8 @@ def pair_headings(
 ) -> HeadingPair | None:
     """The comparable part of two streams, fixed for a whole search of offset and drift.
 
-    `odometry`: on the robot's clock. `segment`: ground truth without long pauses, on its own clock.
-    `largest_offset_s`, `largest_drift`: bounds of the search. `fewest`: samples without which a
-    comparison is worth nothing. Returns none if the other stream covers too few samples in the
-    whole search range.
+    The segment is ground truth without long pauses. None if the other stream covers fewer samples
+    than `fewest` in the whole search range.
     """
     if len(segment) < fewest:
         return None

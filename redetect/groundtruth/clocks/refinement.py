@@ -42,11 +42,9 @@ def refine_by_movement(
 ) -> list[ClockSegment]:
     """Move each segment's offset and rate to where the movements fit best.
 
-    `segments`: the estimate by headings. `odometry`: the robot's own poses on its own clock.
-    `groundtruth`: poses with covariances. `largest` (float, float): bounds of the offset (s) and
-    the drift, either way. Returns refined if their status is `ok` or `jump`, the robot drove a
-    metre or more, and the result is near the estimate by headings and within the bounds; the others
-    unchanged.
+    Refined are segments with the status `ok` or `jump` in which the robot drove a metre or more, if
+    the result is near the estimate by headings and within the bounds `largest` of offset (s) and
+    drift; the ground truth has covariances.
     """
     if groundtruth.covariances is None:
         return list(segments)

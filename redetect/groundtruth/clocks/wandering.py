@@ -144,12 +144,11 @@ _SEARCH_S = 1.0
 
 
 def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
-    """When the clock was set, if it was.
+    """When the clock was set, on the ground truth's clock; None if it was not.
 
     A step of the offset at each of many places is compared with the drift: there was a jump if a
     step explains the headings better than the drift does, or much that the drift leaves over.
-
-    `offset_s`, `drift`: the best without a jump. Returns the time on the ground truth's clock.
+    `offset_s` and `drift` are the best without a jump.
     """
     jacobian = pair.sensitivities(offset_s, drift)
     information = np.cumsum(jacobian[:, 0] ** 2)

@@ -160,9 +160,8 @@ class Sync:
     # Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
     groundtruth: Positional[Path]
     largest_offset_s: float = 1.0  # Bound of the time offset, either way (s).
-    largest_drift: float = (
-        0.01  # Bound of the drift: the clocks' rates differ by at most this share.
-    )
+    # Bound of the drift: the clocks' rates differ by at most this share.
+    largest_drift: float = 0.01
     segment_gap_s: float = 5.0  # A longer pause in the ground truth begins a new segment (s).
     # Refine the estimate by headings with the whole movement if the ground truth has covariances.
     use_movement: bool = True

@@ -94,11 +94,10 @@ def bridge(
 ) -> Bridge:
     """Find the likeliest path between two known ends.
 
-    `controls`, `variances` (N, 4), (N, 3): of the movements to each node; the first are not used
-    (see `filter_forward`). `forward` (N - 1, 6): where odometry leads from the first node on, up to
-    the node before the last. `spread` (6, 6): covariance at the first node. `end`, `end_spread`
-    (3,), (3, 3): pose at the last node, and covariance. `gate`: largest squared normalised distance
-    of the end that odometry explains; beyond it, it is taken to err more in this gap than
+    `controls` (N, 4) and `variances` (N, 3) are those of the movements to each node; the first are
+    not used. `forward` (N - 1, 6) is where odometry leads from the first node, whose covariance is
+    `spread` (6, 6). `end` (3,) is the pose at the last node, with `end_spread` (3, 3). Beyond the
+    `gate`, a squared normalised distance of the end, odometry is taken to err more in this gap than
     elsewhere.
     """
     looser = 1.0
@@ -197,11 +196,10 @@ def _no_gate(nodes: int) -> Gating:
 def back_from(
     controls: FloatArray, variances: FloatArray, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States and covariances predicted backward by odometry from a gap's end.
+    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
 
-    `controls`, `variances` (N, 4), (N, 3): of the movements to each node; the first are not used.
-    `end`, `end_spread` (6,), (6, 6): at the last node. Returns `states`, `spreads` (N, 6), (N, 6,
-    6): in the order of the nodes.
+    `controls` (N, 4) and `variances` (N, 3) as for `bridge`; `end` (6,) and `end_spread` (6, 6) are
+    those at the last node.
     """
     count = len(controls)
     # Driven backward, all rates change their signs; the turn per metre does so by itself.

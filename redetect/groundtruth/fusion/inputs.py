@@ -103,10 +103,9 @@ _USUAL_RATES_QUANTILE = 0.9
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
-    """Pauses of odometry: only the resulting movement is known, not the path.
+    """Pauses of odometry, as the times of the samples before and after each.
 
-    `odometry`: no two samples of one time. Returns the times of the samples before and after each
-    pause.
+    Only the resulting movement is known of them, not the path. No two samples may have one time.
     """
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
@@ -124,10 +123,9 @@ def movements(
 ) -> tuple[FloatArray, FloatArray]:
     """Movements between nodes, each a share of an arc between two samples of odometry.
 
-    `odometry`: two samples or more, no two of one time. `node_times_s` (N,): ascending, within
-    odometry's time. Returns `controls` (N, 4): as in
-    `redetect.groundtruth.fusion.movement.MovementProblem`. `unseen` (N, 2): additional distance (m)
-    and turn (rad) that the robot may have made where odometry pauses, at its usual rates.
+    `odometry` has two samples or more, no two of one time; (N,) node times ascend within its time.
+    Returns the controls (N, 4) of a `MovementProblem`, and the additional distance (m) and turn
+    (rad) (N, 2) that the robot may have made where odometry pauses, at its usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
@@ -193,15 +191,14 @@ def variances_of(
     noise: Sequence[float] | FloatArray,
     settings: FuseSettings,
 ) -> FloatArray:
-    """Noise of movements, summed up.
+    """(N, 3) noise of movements to nodes: along the way, across it (m^2), of the turn (rad^2).
 
     All of it is proportional to way, turn and time, so that it adds up over parts of a movement;
     but for what pauses hide: there odometry's systematic bend has a way to act on that is not
     known, and what a wrong heading leads aside is taken to be that of a way out and back.
 
-    `times_s`, `controls`, `unseen` (N,), (N, 4), (N, 2): nodes, and the movements to them. `noise`
-    (4,): odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`. Returns (N,
-    3): along the way, across it (m^2), of the turn (rad^2).
+    `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
+    `redetect.groundtruth.fusion.learning.noise_of`.
     """
     along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])
@@ -227,10 +224,9 @@ def gather(
 ) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
-    `streams`: measured poses, by name. Returns `names`: the stream of each measurement. `times_s`,
-    `poses`, `covariances` (M,), (M, 3), (M, 3, 3). `repaired`: covariances that had to be raised,
-    by stream. `repeated`: rows that are the row before once more, to the last digit, by stream:
-    left out, since one measurement must not count twice.
+    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
+    stream how many covariances had to be raised and how many rows repeat the row before to the last
+    digit: these are left out, since one measurement must not count twice.
     """
     names: list[str] = []
     times, poses, covariances = [], [], []

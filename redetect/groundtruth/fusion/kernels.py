@@ -366,7 +366,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
         p = filtered_covariance[k]
         expected = predicted_covariance[k + 1].copy()
         for i in range(STATE):
-            # What is known exactly stays as it is.
+            # States without any variance stay as they are.
             if expected[i, i] == 0.0:
                 expected[i, i] = 1.0
         gain = np.ascontiguousarray(np.linalg.solve(expected, transitions[k + 1] @ p).T)

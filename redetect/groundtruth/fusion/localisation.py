@@ -89,10 +89,9 @@ class LocalisationProblem(NamedTuple):
 def localisation_problem(
     odometry: PlanarPoses, measured: PlanarPoses, gate: float
 ) -> LocalisationProblem:
-    """Align odometry with measured poses.
+    """Align odometry with two or more measured poses within its time.
 
-    `odometry`: no two samples of one time. `measured`: two or more, with covariances, within
-    odometry's time. `gate`: largest squared normalised innovation.
+    `odometry` has no two samples of one time; `gate` is the largest squared normalised innovation.
     """
     assert measured.covariances is not None
     own, _ = interpolate_poses(odometry, measured.times_s)
@@ -119,11 +118,10 @@ def localisation_problem(
 
 
 def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]:
-    """Deviations (m, rad) and correlation time that make the measurements likeliest.
+    """Deviations (m, rad) and correlation times (s) that make the measurements likeliest.
 
-    `problem`: of few measurements, seconds apart. Returns `errors` (4,): deviations of position and
-    heading, correlation times of both (s). `surprise`: minus twice the logarithm of the
-    measurements' likelihood.
+    From a few measurements, seconds apart. Returns the deviations of position and heading and their
+    correlation times (4,), and minus twice the logarithm of the measurements' likelihood.
     """
     start = np.array(_START)
     bound = math.log(_LARGEST_FACTOR)
@@ -245,11 +243,10 @@ def _smooth(
 def smooth_localisation(
     problem: LocalisationProblem, errors: FloatArray, times_s: FloatArray
 ) -> tuple[PlanarPoses, FloatArray, float]:
-    """The path from odometry that is a localisation.
+    """The path at some of odometry's times (N,), from odometry that is a localisation.
 
-    `errors` (4,): see `learn_localisation`. `times_s` (N,): odometry's times at which poses are
-    wanted. Returns `poses`: with covariances. `squared` (M,): squared normalised innovations of the
-    measurements. `heading_offset`: rad.
+    `errors` (4,) are those of `learn_localisation`. Returns poses with covariances, the squared
+    normalised innovations of the measurements (M,), and the heading's offset (rad).
     """
     there, _ = interpolate_poses(problem.odometry, times_s)
     all_times = np.concatenate([times_s, problem.times_s])
@@ -282,10 +279,9 @@ def as_localisation(
 ) -> tuple[PlanarPoses, FloatArray, LocalisationErrors] | None:
     """The path from odometry that is a localisation, if it clearly is one.
 
-    `odometry`: no two samples of one time. `problem`: the same with the measurements. `noise` (4,):
-    random errors of its movements over seconds. `times_s` (N,): odometry's times at which poses are
-    wanted. Returns `squared` (M,): squared normalised innovations of the measurements; infinite
-    where they were left out.
+    `problem` has the same odometry, `noise` (4,) its random errors over seconds, `times_s` (N,)
+    those of the path. The squared normalised innovations (M,) are infinite where measurements were
+    left out.
     """
     thin = problem.thinned(_SPACING_S)
     if len(thin.nodes) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:

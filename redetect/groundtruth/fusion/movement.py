@@ -49,7 +49,7 @@ class MeasurementAccount:
 
     squared: FloatArray  # (M,): squared normalised innovations
     accepted: NDArray[np.bool_]  # (M,)
-    # (N,): whether the filter was restarted at a node, and why (see `smoother_kernels`)
+    # (N,): whether the filter was restarted at a node, and why (see `kernels`)
     restarted: NDArray[np.int8]
     surprise: float  # Minus twice the logarithm of their likelihood
 
@@ -274,10 +274,9 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Bring odometry and measured poses to common nodes.
+    """Bring odometry and measured poses with covariances to common nodes.
 
-    `odometry`: on the measurements' clock. `streams`: measured poses with covariances, by name.
-    Returns from the first measurement within the odometry's time to the last.
+    From the first measurement within the odometry's time to the last, on the measurements' clock.
     """
     names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
     odometry = last_of_each_time(odometry)

@@ -89,14 +89,13 @@ def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_
 def acquire(
     sets: ScanSets, index: int, tables: ScannerTables, body: Body, settings: LaserSettings
 ) -> FloatArray | None:
-    """Find the robot in one set of scans.
+    """Find the robot in one set of scans: x, y (m), theta (rad), or None.
 
     New readings that are close to each other are heaps; at each heap the ICP is begun from every
     heading. A pose counts only if the beams that should see the robot see it: neither background
     through it nor much that hides it. Where the two best poses differ by more than one of the
-    outline's symmetries and explain the scans about as well, none is returned.
-
-    Returns (3,): x, y (m), theta (rad); with a symmetric outline one of the equivalent poses.
+    outline's symmetries and explain the scans about as well, none is returned; with a symmetric
+    outline it is one of the equivalent poses.
     """
     seen = new_points(
         sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,

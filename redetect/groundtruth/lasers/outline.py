@@ -68,9 +68,15 @@ class LaserSettings:
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:
-    """Faces of a closed outline, counter-clockwise: their outward normal is to the right.
+    """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    `outline` (k, 2): corners in order, either way round (m). Returns (k, 4): x1, y1, x2, y2.
+    Of corners (k, 2) in order, either way round (m).
+
+    Raises
+    ------
+    GroundTruthError
+        If there are fewer than three corners, two that follow each other are one, a number is not
+        finite, or faces cross.
     """
     corners = np.asarray(outline, dtype=np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -101,13 +107,11 @@ def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
 
 
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
-    """Motions other than none that map the outline onto itself.
+    """Motions (s, 3) other than none that map the outline onto itself, by rising theta from -pi on.
 
-    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`.
-
-    `faces` (k, 4): from `outline_faces`. `tolerance_m`: largest distance that a point of the turned
-    outline may have from the outline (m). Returns (s, 3): x, y (m), theta (rad), by rising theta
-    from -pi on; s is 0 for an outline that shows where the front is, 1 for a box, 3 for a square.
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
+    0 for an outline that shows where the front is, 1 for a box, 3 for a square. No point of the
+    turned outline is farther from the outline than the tolerance.
     """
     along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
     points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)

@@ -87,9 +87,9 @@ class Scanner:
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
-        """Points of readings in the scanner's frame.
+        """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
+        millimetres.
 
-        `ranges_mm` (..., readings): readings in millimetres. Returns (..., readings, 2): metres;
         NaN where nothing was hit.
         """
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)

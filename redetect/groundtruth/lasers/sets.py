@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-# A beam's readings have at least this deviation; one is new if it is so many deviations nearer than
-# the nearest object that the beam saw, which is at this quantile of its readings.
+# A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
+# than the nearest object that the beam saw, which is at this quantile of its readings.
 _LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
 
 

@@ -85,10 +85,14 @@ class Checkerboard:
 
 
 def find_checkerboard(image: NDArray[np.uint8], board: Checkerboard) -> FloatArray:
-    """Find a board's inner corners (OpenCV).
+    """A board's inner corners (rows * columns, 2) in an image (H, W) (OpenCV).
 
-    `image` (H, W). Returns (rows * columns, 2): pixels (the top left pixel's centre is 0, 0) in the
-    order of `Checkerboard.points`.
+    Pixels (the top left pixel's centre is 0, 0) in the order of `Checkerboard.points`.
+
+    Raises
+    ------
+    GeometryError
+        If there is no such board in the image.
     """
     try:
         _, pixels = find_board(image, board.board, window=_WINDOW)

@@ -109,8 +109,8 @@ def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairCo
 def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
     """Each marker's parent in the tree over the best supported pairs (Prim).
 
-    `pairs`: support of each pair. `count`: number of markers. Returns parents; the root's is
-    itself, -1 for unconnected ones.
+    The root's parent is itself; markers that are not connected have -1. `pairs` is each pair's
+    support.
     """
     parents = [-1] * count
     parents[root] = root

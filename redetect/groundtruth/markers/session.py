@@ -68,11 +68,10 @@ def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Pa
 def read_marker_frames(
     run: Path, camera: int, *, detected: Path | None = None, timed: bool = True
 ) -> list[MarkerFrame]:
-    """Read the markers found in a run's images, and the images' times.
+    """The markers found in a run's images, in the file's order, and the images' times.
 
-    `run`: folder with ``detected.markers`` and ``<name>.times``. `camera`: index that the frames
-    will carry. `detected`: the file of markers, if it is another one. `timed`: whether times are
-    needed; without, frames are numbered. Returns in the file's order.
+    The run folder has ``detected.markers`` (or `detected`) and ``<name>.times``. Frames are
+    numbered instead if they need not be `timed`.
     """
     path = detected if detected is not None else run / DETECTED_NAME
     times: dict[str, float] = {}
@@ -95,10 +94,9 @@ def read_marker_frames(
 def group_by_time(
     frames: Sequence[MarkerFrame], tolerance_s: float
 ) -> list[tuple[MarkerFrame, ...]]:
-    """Put images of different cameras together whose times agree.
+    """Groups of images of different cameras, in order of time.
 
-    `tolerance_s`: a group's images lie within this of its first; each camera is in it once. Returns
-    in the order of their times.
+    A group's images lie within the tolerance of its first; each camera is in it once.
     """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):

@@ -69,9 +69,8 @@ class RigSettings:
     # and its residual larger than --outlier-px.
     outlier_sigma: NotNegative = 5.0
     outlier_px: NotNegative = 1.0  # Root mean square residual of what may be left out (px).
-    corner_floor_px: NotNegative = (
-        0.01  # Standard deviation added to each corner's own covariance (px).
-    )
+    # Standard deviation added to each corner's own covariance (px).
+    corner_floor_px: NotNegative = 0.01
     # Images of different cameras whose times differ by at most this are used together (s).
     time_tolerance_s: NotNegative = 0.005
 

@@ -256,10 +256,7 @@ class Choice:
 def choose_candidates(
     times_s: Sequence[float], estimates: Sequence[PoseEstimate], settings: PoseSettings
 ) -> list[Choice]:
-    """Decide between the candidates of each frame by its neighbours.
-
-    `times_s`: seconds, ascending. `settings`: its odds, and what the robot can do.
-    """
+    """Decide between the candidates of each frame by its neighbours; times ascend."""
     through, without = _cheapest_paths(times_s, estimates, settings)
     choices = []
     for estimate, costs, left_out in zip(estimates, through, without):

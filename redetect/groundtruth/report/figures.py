@@ -27,7 +27,7 @@ _PAUSE = 0.02
 
 
 class Track(NamedTuple):
-    """A stream as it is drawn; on paper, dashes (on, off, ... in points) tell it from others."""
+    """A stream as it is drawn; dashes (on, off, ... in points) show without colour."""
 
     label: str
     colour: str

@@ -31,10 +31,9 @@ _AGREES, _DIFFERS = "#2a78b5", "#d9822b"
 
 
 def draw_rig(estimate: RigEstimate) -> bytes:
-    """Draw a rig's estimate.
+    """Draw a rig from three sides; a PNG's bytes, the same for the same input.
 
-    `estimate`: its pairwise estimates are drawn where they would put a marker, seen from the other
-    one. Returns a PNG of three views along the axes; the same input gives the same bytes.
+    Pairwise estimates are drawn where they would put a marker, seen from the other one.
     """
     rig = estimate.rig
     agreeing, differing = _clouds(estimate, rig)

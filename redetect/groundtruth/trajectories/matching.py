@@ -18,9 +18,9 @@ def interpolate_poses(
 ) -> tuple[PlanarPoses, BoolArray]:
     """Poses at other times, linearly between neighbours, headings the short way round.
 
-    `times_s` (N,): ascending. `largest_gap_s`: between neighbours farther apart than this there is
-    no pose, but at their own times. Returns at those of the times that have one; covariances
-    interpolated like the poses. (N,): which times those are.
+    Times (N,) ascend. Between neighbours farther apart than the largest gap there is no pose, but
+    at their own times. Returns the poses at those times that have one, covariances interpolated
+    like them, and which times those are (N,).
     """
     if len(poses) == 0:
         raise GroundTruthError("no poses to interpolate between")
@@ -50,7 +50,12 @@ def matched_streams(
 ) -> tuple[PlanarPoses, PlanarPoses, int]:
     """Both streams at common times, and how many times had to be left out.
 
-    See `compare_streams` for the parameters.
+    Parameters
+    ----------
+    largest_gap_s : float
+        Nothing is interpolated across longer gaps.
+    interpolate : str
+        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
 
     Raises
     ------

@@ -197,11 +197,11 @@ def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArr
 def mean_pose(
     poses: Sequence[FloatArray] | FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Weighted mean of poses on SE(3).
+    """Weighted mean of poses on SE(3) that are close to each other.
 
-    `poses` (N, 4, 4): close to each other. `covariances` (N, 6, 6): of their right perturbations.
-    Returns (4, 4): the mean. (6, 6): its covariance, if the poses' errors are independent. squared
-    normalised deviations over degrees of freedom; 1 for a single pose.
+    Of (N, 4, 4) poses and (N, 6, 6) covariances of their right perturbations. Returns the mean (4,
+    4), its covariance (6, 6) if the poses' errors are independent, and the squared normalised
+    deviations over degrees of freedom; 1 for a single pose.
     """
     stack = np.asarray(poses, dtype=np.float64)
     mean, information = stack[0], np.linalg.inv(covariances)

@@ -27,8 +27,8 @@ Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
 _HEADINGS = 24
 _SAME_M = 1e-4
-# Distances that fit less well than this share of right ones hold a gross error; of a pose's
-# distances at most so many are left out.
+# Distances that fit less well than this share of right ones hold a gross error; at most two of a
+# pose are left out.
 _GROSS_PROBABILITY = 1e-4
 _MOST_GROSS = 2
 # Another pose within this squared normalised misfit of the best makes it ambiguous.

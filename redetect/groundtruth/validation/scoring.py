@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.matching import (
-    align_poses,
     interpolate_poses,
-    matched_streams,
     pose_differences,
     squared_lengths,
 )
@@ -98,38 +96,6 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         count,
         normalised,
     )
-
-
-def compare_streams(
-    poses: PlanarPoses,
-    truth: PlanarPoses,
-    *,
-    largest_gap_s: float = 0.5,
-    interpolate: str = "truth",
-    align: bool = False,
-) -> PoseScore:
-    """Score two streams whose times differ.
-
-    Parameters
-    ----------
-    largest_gap_s : float
-        Nothing is interpolated across longer gaps.
-    interpolate : str
-        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
-    align : bool
-        Move the poses rigidly onto the truth first, for solutions with a world of their own.
-
-    Raises
-    ------
-    GroundTruthError
-        If no pose has a truth at its time.
-    """
-    mine, theirs, unmatched = matched_streams(
-        poses, truth, largest_gap_s=largest_gap_s, interpolate=interpolate
-    )
-    if align:
-        mine = align_poses(mine, theirs)
-    return score_poses(mine, theirs, unmatched)
 
 
 def _sigma(values: FloatArray) -> float:

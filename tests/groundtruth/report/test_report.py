@@ -25,8 +25,8 @@ from redetect.groundtruth.report.figures import (
 from redetect.groundtruth.report.inputs import Interval, gather
 from redetect.groundtruth.report.page import report_page, table
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
-from redetect.groundtruth.validation.scoring import compare_streams
 from redetect.reporting.page import Part, Section, page_of
+from tests.groundtruth.comparison import compare_streams
 from tools.simulator.laser.writers import write_building
 
 HOSTILE = "\"><script>alert(1)</script><img src=x onerror=alert(2)>\x00\ud800 </style> & 'onload="
