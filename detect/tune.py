@@ -23,7 +23,7 @@ from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
-from detect.report.figures import draw_rates, f1_score, figure_file, knee, pareto_front
+from detect.report.figures import draw_rates, f1_score, knee, pareto_front
 from detect.run import Run
 from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
@@ -40,6 +40,7 @@ from redetect.landmarks import (
     parse_rows,
     read_tilts,
 )
+from redetect.reporting.page import figure_file
 from redetect.storage import OutputExistsError, write_whole
 
 

@@ -1,20 +1,11 @@
-"""The parts of a report, of which ``page.html`` makes a page, and its figures.
-
-Figures are the same each time, whatever the user's own matplotlib settings are.
-"""
+"""The figures of a report."""
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
@@ -29,6 +20,7 @@ from detect.comparison.result import (
 from detect.drawing.inputs import SeenRows
 from detect.seen import circle_on_floor, summed_steps
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
+from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
     from io import BytesIO
@@ -36,63 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class Part(NamedTuple):
-    """A piece of a section; its kind says what the template makes of it.
-
-    `words` are the text or the caption. Rows of figures are names and values, those of a key
-    colours and words. `left` are the columns of a table that have text, `bold` the rows to point
-    out.
-    """
-
-    kind: str
-    words: str = ""
-    head: tuple[str, ...] = ()
-    rows: tuple[tuple[str, ...], ...] = ()
-    left: tuple[int, ...] = (0,)
-    bold: tuple[int, ...] = ()
-    address: str = ""
-    width: int = 0
-    height: int = 0
-
-
-class Section(NamedTuple):
-    """A section with its heading."""
-
-    key: str
-    name: str
-    parts: list[Part]
-
-
-def image_part(words: str, content: bytes, kind: str, width: float, height: float) -> Part:
-    """An image with its caption; `kind` is its type behind ``image/``."""
-    address = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-    return Part("image", words, address=address, width=round(width), height=round(height))
-
-
 FloatArray = NDArray[np.float64]
 
 #: Colours that stay apart in print and for the colour-blind; differences remain without them.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
-_DPI = 120
-
-
-@contextmanager
-def figure_file(
-    size: tuple[float, float], kind: Literal["png", "svg"]
-) -> Iterator[tuple[Figure, io.BytesIO]]:
-    """An empty figure of a width and height (inches) to draw into, and its file afterwards."""
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        # Names of parts are hashes with a fixed salt; text remains text, in the viewer's own font.
-        mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
-        mpl.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
-        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        content = io.BytesIO()
-        yield figure, content
-        # Without date, name and version of the program: the same bytes each time.
-        nameless = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
-        figure.savefig(content, format=kind, dpi=_DPI, metadata=nameless)
 
 
 def draw_rates(

@@ -1,17 +1,10 @@
-"""The command ``detect report``: files of rows in, one HTML page out.
-
-The page has no scripts and loads nothing: its figures are data: addresses.
-"""
+"""The command ``detect report``: files of rows in, one HTML page out."""
 
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
 from detect import __version__
 from detect.comparison.report import (
@@ -25,9 +18,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.markers.settings import MarkerSettings
 from detect.report.figures import (
-    Part,
     RateCurve,
-    Section,
     bearings_figure,
     counts_figure,
     disc_rates,
@@ -45,6 +36,7 @@ from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
 from detect.settings import CircleSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
+from redetect.reporting.page import Part, Section, page_of
 from redetect.storage import OutputExistsError, write_whole
 
 
@@ -70,8 +62,6 @@ def perform(options: Report) -> int:
 _NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
 _SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
-_TEMPLATE = Path(__file__).with_name("page.html")
-_FORBIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]")
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
 _TABLE_POINTS = 5
@@ -90,17 +80,7 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
         sections.append(Section("tilt", "Tilt", _tilt(inputs)))
     sections.append(Section("timing", "Timing", [_timing(inputs)]))
     sections.append(Section("settings", "Effective configuration", _settings(inputs)))
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=_clean
-    )
-    template = environment.from_string(_TEMPLATE.read_text("utf-8"))
-    page = template.render(title=f"Detections of {inputs.run.name}", sections=sections)
-    return (page.rstrip("\n") + "\n").encode("utf-8")
-
-
-def _clean(value: Any) -> Any:
-    """Text without characters that are not allowed in a page."""
-    return _FORBIDDEN.sub("\ufffd", value) if type(value) is str else value
+    return page_of(f"Detections of {inputs.run.name}", sections)
 
 
 def _summary(inputs: ReportInputs) -> list[Part]:

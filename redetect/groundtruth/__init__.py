@@ -1,15 +1,14 @@
 """Where the robot really was: markers, lasers, clocks, their fusion and its validation.
 
-Each package imports only from those named here; `errors` and the readers of files serve all:
+Each package imports only from those named here; `errors` and `files` serve all:
 
-- `geometry`: rigid motions in space and in the plane, covariances of poses.
-- `trajectories`: poses over time, their files, and poses at other times: `geometry`.
-- `markers`: poses from square markers, rigs and networks of cameras: `geometry`, `trajectories`.
-- `lasers`: scanners, scans, matching, alignment, tracking: `geometry`, `trajectories`.
-- `fusion`: odometry and measured poses together: `geometry`, `trajectories`.
+- `trajectories`: rigid motions in space and in the plane; poses over time and their files.
+- `markers`: poses from square markers, rigs and networks of cameras: `trajectories`.
+- `lasers`: scanners, scans, matching, alignment, tracking: `trajectories`.
+- `fusion`: odometry and measured poses together: `trajectories`.
 - `clocks`: the robot's clock against the ground truth's: `fusion`, `trajectories`.
 - `validation`: errors against a truth and at reference poses: `clocks`, `lasers` and before.
-- `report`: a session on one page: `validation` and before.
+- `report`: a session on one page, and pictures beside results: `validation` and before.
 - `commands`: files and messages round all of these; `cli` hands over to them.
 
 Frames: the *robot* has x forward, y left, z up; the *world* z up, and the robot's heading theta is

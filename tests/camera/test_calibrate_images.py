@@ -16,8 +16,7 @@ from camera.calibration.images import calibration_images, read_grey
 from detect.sources.gray import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards_file import BoardImage, find_boards
-from redetect.groundtruth.markers.checkerboard import Checkerboard
+from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
 from redetect.storage.image_header import without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from camera import write_camera
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.commands.outputs import progress
-from redetect.groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
 from redetect.groundtruth.markers.calibration import (
     Network,
     Rig,
@@ -29,6 +28,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, planar_transform
 from redetect.landmarks import Frame, Step, write_frames
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 from tests.groundtruth.markers.test_network import BOARDS, OFFSET, WORLD, shots
@@ -283,7 +283,7 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
         write_camera(lens(), folder / name / f"{name}.cam")
 
     def pose(matrix: FloatArray) -> dict[str, list[float]]:
-        from redetect.groundtruth.geometry.transforms import quaternion_xyzw
+        from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 
         return {
             "translation_m": matrix[:3, 3].tolist(),

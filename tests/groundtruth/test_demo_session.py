@@ -10,8 +10,8 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.groundtruth.validation.scoring import compare_streams
 from redetect.landmarks import Frame, MarkerCorner, MarkerLandmark, write_frames
+from tests.groundtruth.comparison import compare_streams
 
 
 @pytest.mark.long

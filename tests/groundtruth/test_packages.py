@@ -6,19 +6,18 @@ import ast
 from pathlib import Path
 
 BELOW = {
-    "geometry": set[str](),
-    "trajectories": {"geometry"},
-    "markers": {"geometry", "trajectories"},
-    "lasers": {"geometry", "trajectories"},
-    "fusion": {"geometry", "trajectories"},
+    "trajectories": set[str](),
+    "markers": {"trajectories"},
+    "lasers": {"trajectories"},
+    "fusion": {"trajectories"},
     "clocks": {"trajectories", "fusion"},
-    "validation": {"geometry", "trajectories", "lasers", "clocks"},
-    "report": {"trajectories", "lasers", "clocks", "validation"},
+    "validation": {"trajectories", "lasers", "clocks"},
+    "report": {"trajectories", "markers", "lasers", "clocks", "validation"},
     "commands": {
-        "geometry", "trajectories", "markers", "lasers", "fusion", "clocks", "validation", "report",
+        "trajectories", "markers", "lasers", "fusion", "clocks", "validation", "report",
     },
 }  # fmt: skip
-FOR_ALL = {"errors", "json_file", "text_file"}
+FOR_ALL = {"errors", "files"}
 
 
 def imported(module: Path) -> set[str]:
@@ -44,6 +43,5 @@ def test_arrows_point_downwards(project_root: Path) -> None:
             allowed = below | FOR_ALL | {package, "__version__"}
             assert imported(module) <= allowed, module
     assert imported(room / "errors.py") == set()
-    for name in ("json_file", "text_file"):
-        assert imported(room / f"{name}.py") == {"errors"}
+    assert imported(room / "files.py") == {"errors"}
     assert imported(room / "cli.py") == {"commands"}

@@ -14,8 +14,7 @@ from camera.calibration.images import read_grey
 from detect.errors import FrameError
 from detect.sources.gray import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards_file import BoardImage, find_boards
-from redetect.groundtruth.markers.checkerboard import Checkerboard
+from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
 from redetect.storage.image_header import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 

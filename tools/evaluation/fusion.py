@@ -18,9 +18,10 @@ from scipy.stats import chi2
 from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
-from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.fusion.inputs import FuseSettings
+from redetect.groundtruth.trajectories.matching import matched_streams
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from redetect.groundtruth.validation.scoring import compare_streams
+from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.tables import Table
@@ -101,9 +102,9 @@ def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float
         read_planar_poses(session / f"{name}.csv") for name in ("laser", "camera", "fused")
     )
     seen = _seen_by(laser, fused.times_s)
-    alone = compare_streams(laser, truth)
-    inside = compare_streams(_some(fused, seen), truth)
-    bridged = compare_streams(_some(fused, ~seen), truth)
+    alone = score_poses(*matched_streams(laser, truth))
+    inside = score_poses(*matched_streams(_some(fused, seen), truth))
+    bridged = score_poses(*matched_streams(_some(fused, ~seen), truth))
     instant = _some(fused, np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
     account = json.loads((session / "fused.json").read_text())
     return {
@@ -112,14 +113,14 @@ def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float
         "laser_rms_mm": 1e3 * alone.position_rmse_m,
         "laser_deg": float(np.degrees(alone.angle_sigma_rad)),
         "laser_nees": alone.normalised_error,
-        "camera_rms_mm": 1e3 * compare_streams(camera, truth).position_rmse_m,
+        "camera_rms_mm": 1e3 * score_poses(*matched_streams(camera, truth)).position_rmse_m,
         "seen_mm": 1e3 * inside.position_mean_m,
         "seen_rms_mm": 1e3 * inside.position_rmse_m,
         "seen_deg": float(np.degrees(inside.angle_sigma_rad)),
         "seen_nees": inside.normalised_error,
         "bridged_mm": 1e3 * bridged.position_mean_m,
         "bridged_nees": bridged.normalised_error,
-        "instant_nees": compare_streams(instant, truth).normalised_error,
+        "instant_nees": score_poses(*matched_streams(instant, truth)).normalised_error,
         "rejected": float(len(account["rejected"])),
         "restarts": float(len(account["restarts_s"])),
     }

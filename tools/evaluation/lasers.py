@@ -17,16 +17,22 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.plane import between
-from redetect.groundtruth.lasers.blocks import combined_poses
-from redetect.groundtruth.lasers.icp_scans import ScanMatchSettings, match_scans
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
-from redetect.groundtruth.lasers.session import load_session
-from redetect.groundtruth.lasers.suspects import track_robot, track_without_suspects
-from redetect.groundtruth.lasers.tracking import OK, REACQUIRED, UNDETERMINED, LaserTrack
+from redetect.groundtruth.lasers.sets import load_session
+from redetect.groundtruth.lasers.tracking import (
+    OK,
+    REACQUIRED,
+    UNDETERMINED,
+    LaserTrack,
+    combined_poses,
+    track_robot,
+    track_without_suspects,
+)
+from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray
+from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table
 
 _COLUMNS = {
@@ -217,16 +223,14 @@ class LaserLog:
     folder: Positional[Path]  # With the log's scans and poses.
     log: str = ""  # Its name; by default that of the only ``*.scans.csv.gz``.
     every: int = 1  # Only every so many-th pair.
-    heading_step_deg: float = ScanMatchSettings().heading_step_deg
+    heading_step_deg: float = 10.0
     """Distance of the headings that the matching begins from; 360: only no motion at all."""
     shortest_m: float = 0.05  # Shorter readings are taken for none.
     worst: Annotated[int, arg(aliases=["-n"])] = 0  # So many of the worst pairs are listed.
 
     def __call__(self) -> int:
         points, poses = read_log(self.folder, self.log, self.shortest_m)
-        settings = ScanMatchSettings(heading_step_deg=self.heading_step_deg)
         pairs = np.arange(0, len(points) - 1, self.every)
-        match_scans(points[1], points[0], settings)  # compiles
         found = np.full((len(pairs), 3), np.nan)
         share = np.zeros((len(pairs), 2))
         ambiguous = np.zeros(len(pairs), dtype=np.bool_)
@@ -234,7 +238,9 @@ class LaserLog:
         began = time.perf_counter()
         for row, i in enumerate(pairs):
             try:
-                match = match_scans(points[i + 1], points[i], settings)
+                match = match_scans(
+                    points[i + 1], points[i], heading_step_deg=self.heading_step_deg
+                )
             except GeometryError:
                 continue
             ambiguous[row], covariances[row] = match.ambiguous, match.covariance

@@ -17,7 +17,7 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners
 from redetect.groundtruth.lasers.scans import read_scans
-from redetect.groundtruth.markers.boards_file import read_boards
+from redetect.groundtruth.markers.boards import read_boards
 from redetect.groundtruth.markers.calibration import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
@@ -25,7 +25,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_times,
 )
 from redetect.groundtruth.validation.fiducials import Survey, read_distances, read_survey
-from redetect.groundtruth.validation.relative_errors import read_relations
+from redetect.groundtruth.validation.scoring import read_relations
 from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NUMBERS, Reader
 
 

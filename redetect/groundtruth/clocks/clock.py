@@ -10,18 +10,21 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import read_json_value
+from redetect.groundtruth.files import read_json_value
 
 FloatArray = NDArray[np.float64]
+
+
 Status = Literal["ok", "no turns", "jump", "at a bound"]
 
 _MOST_SEGMENTS = 100_000
@@ -31,73 +34,40 @@ _LARGEST_NUMBER = 1e15
 
 @dataclass(frozen=True)
 class ClockSegment:
-    """The two clocks over one segment of the ground truth.
+    """The two clocks over one segment of the ground truth."""
 
-    Attributes
-    ----------
-    from_s, to_s : float
-        The segment, on the ground truth's clock.
-    reference_s : float
-        Where in it the offset holds, on the ground truth's clock.
-    offset_s : float
-        Robot time minus ground truth time there.
-    rate : float
-        Seconds of the robot's clock per second of the ground truth's.
-    angle_rad : float
-        Heading of the ground truth minus heading of the odometry.
-    sigma_offset_s, sigma_rate, sigma_angle_rad : float
-        Standard deviations; infinite where the segment does not determine the value.
-    turned_rad : float
-        Sum of the absolute values of the robot's turns.
-    status : str
-        `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
-        `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at
-        the limit of the search range.
-    note : str
-        Details of the status.
-    """
-
+    # `from_s`, `to_s`: The segment, on the ground truth's clock
     from_s: float
     to_s: float
-    reference_s: float
-    offset_s: float
-    rate: float
-    angle_rad: float
-    sigma_offset_s: float
-    sigma_rate: float
-    sigma_angle_rad: float
-    turned_rad: float
-    status: Status
-    note: str = ""
+    reference_s: float  # Where in it the offset holds, on the ground truth's clock
+    offset_s: float = 0.0  # Robot time minus ground truth time there
+    rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
+    angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
+    # `sigma_offset_s`, `sigma_rate`, `sigma_angle_rad`: Standard deviations; infinite where the
+    # segment does not determine the value.
+    sigma_offset_s: float = math.inf
+    sigma_rate: float = math.inf
+    sigma_angle_rad: float = math.inf
+    turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
+    # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
+    # `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at the
+    # limit of the search range.
+    status: Status = "ok"
+    note: str = ""  # Details of the status
 
 
 @dataclass(frozen=True)
 class ClockModel:
-    """The robot's clock against the ground truth's over a session.
+    """The robot's clock against the ground truth's over a session."""
 
-    Attributes
-    ----------
-    segments : tuple of ClockSegment
-        In order; at least one whose offset is determined.
-    """
-
-    segments: tuple[ClockSegment, ...]
+    segments: tuple[ClockSegment, ...]  # In order; at least one whose offset is determined.
 
     def __post_init__(self) -> None:
         if not self.segments:
             raise GroundTruthError("a clock without segments: expected at least one")
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
-        """Robot times of times on the ground truth's clock.
-
-        Parameters
-        ----------
-        times_s : (N,) array_like
-
-        Returns
-        -------
-        (N,) float64
-        """
+        """Robot times of times on the ground truth's clock."""
         knots, offsets = self._knots()
         times = np.asarray(times_s, dtype=np.float64)
         offset = np.interp(times, knots, offsets)
@@ -108,22 +78,7 @@ class ClockModel:
         return np.asarray(times + offset)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
-        """Times on the ground truth's clock of robot times: the inverse of `robot_times`.
-
-        Parameters
-        ----------
-        robot_times_s : (N,) array_like
-
-        Returns
-        -------
-        (N,) float64
-
-        Raises
-        ------
-        GroundTruthError
-            If the clock stops or runs backward between two segments (it was set back): then a robot
-            time has no unique ground truth time.
-        """
+        """Times on the ground truth's clock of robot times: the inverse of `robot_times`."""
         knots, offsets = self._knots()
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
@@ -166,14 +121,6 @@ def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
 
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
-
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    ClockModel
 
     Raises
     ------
@@ -219,3 +166,50 @@ def _segment(place: Path, number: int, row: Any) -> ClockSegment:
         raise GroundTruthError(f"{place}: segment {number}: its status is unknown")
     note = row.get("note", "")
     return ClockSegment(**values, status=status, note=note if isinstance(note, str) else "")
+
+
+_AGREEMENT = 0.999
+
+
+def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
+    """Put segments on the straight line through all of them, if that agrees with each.
+
+    A clock that is neither disciplined nor set runs evenly over minutes. Segments that are minutes
+    apart then determine its rate much better than each alone, and its offset somewhat better. They
+    stay as they are where fewer than two are determined, a clock was set, or one line does not
+    explain them: its squared error is larger than one session in a thousand has by chance.
+    """
+    determined = [segment for segment in segments if segment.status == "ok"]
+    others = {segment.status for segment in segments} - {"ok", "no turns"}
+    if len(determined) < 2 or others:
+        return list(segments)
+    middle = float(np.mean([segment.reference_s for segment in determined]))
+    rows, values, sigmas = [], [], []
+    for segment in determined:
+        rows += [(1.0, segment.reference_s - middle), (0.0, 1.0)]
+        values += [segment.offset_s, segment.rate - 1.0]
+        sigmas += [segment.sigma_offset_s, segment.sigma_rate]
+    weight = 1.0 / np.array(sigmas)
+    design = np.array(rows) * weight[:, None]
+    target = np.array(values) * weight
+    covariance = np.linalg.inv(design.T @ design)
+    line = covariance @ design.T @ target
+    squared = float(np.sum((target - design @ line) ** 2))
+    freedom = len(values) - 2
+    if squared > chdtri(freedom, 1.0 - _AGREEMENT):
+        return list(segments)
+    note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {freedom}"
+    result = []
+    for segment in segments:
+        at = np.array([1.0, segment.reference_s - middle])
+        if segment.status == "ok":
+            segment = replace(
+                segment,
+                offset_s=float(at @ line),
+                rate=1.0 + float(line[1]),
+                sigma_offset_s=math.sqrt(at @ covariance @ at),
+                sigma_rate=math.sqrt(covariance[1, 1]),
+                note=note,
+            )
+        result.append(segment)
+    return result

@@ -1,8 +1,8 @@
-"""Headings over time as the synchronisation of clocks needs them: continuous, cut at gaps."""
+"""Headings over time: continuous, cut at gaps; and those of two clocks side by side."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -11,42 +11,19 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
 def continuous_headings(poses: PlanarPoses) -> FloatArray:
-    """Headings without jumps of whole turns.
-
-    Parameters
-    ----------
-    poses : PlanarPoses
-        Sampled so often that the robot turns less than half a turn between neighbours.
-
-    Returns
-    -------
-    (N,) float64
-        Headings (rad), beyond +-pi where the robot went on turning.
-    """
+    """(N,) headings (rad) without jumps of whole turns, of poses less than half a turn apart."""
     return np.asarray(np.unwrap(poses.poses[:, 2]))
 
 
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
-    """Cut times where a pause is longer than a limit.
-
-    Parameters
-    ----------
-    times_s : (N,) array
-        Ascending.
-    largest_gap_s : float
-        Longer pauses begin a new segment.
-
-    Returns
-    -------
-    list of slice
-        The segments' samples.
-    """
+    """The samples (N,) of each segment between pauses that are longer than a limit."""
     cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
     ends = [0, *cuts.tolist(), len(times_s)]
     return [slice(a, b) for a, b in pairwise(ends) if b > a]
@@ -57,14 +34,7 @@ def heading_noise(times_s: FloatArray, headings_rad: FloatArray) -> float:
 
     Third differences cancel whatever turns smoothly; their median does not mind single jumps.
 
-    Parameters
-    ----------
-    times_s, headings_rad : (N,) arrays
-        At least 5 samples, headings continuous.
-
-    Returns
-    -------
-    float
+    `times_s`, `headings_rad` (N,): at least 5 samples, headings continuous.
     """
     if len(times_s) < 5:
         raise GroundTruthError(f"{len(times_s)} headings: expected 5 or more")
@@ -80,30 +50,16 @@ def sampling_interval(times_s: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class HeadingIntegral:
-    """Headings as a function of time, straight between samples, of which exact means are taken.
+    """Headings as a function of time, straight between samples, of which exact means are taken."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Ascending.
-    headings_rad : (N,) float64
-        Continuous.
-    """
-
-    times_s: FloatArray
-    headings_rad: FloatArray
+    times_s: FloatArray  # (N,): ascending
+    headings_rad: FloatArray  # (N,): continuous
 
     def means(self, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
         """Mean headings between pairs of times.
 
-        Parameters
-        ----------
-        from_s, to_s : (M,) arrays
-            Ends of the windows, `to_s` later; outside the samples the first or last heading holds.
-
-        Returns
-        -------
-        (M,) float64
+        `from_s`, `to_s` (M,): ends of the windows, `to_s` later; outside the samples the first or
+        last heading holds.
         """
         return np.asarray((self._integral(to_s) - self._integral(from_s)) / (to_s - from_s))
 
@@ -136,19 +92,10 @@ class HeadingIntegral:
 def windowed_means(
     times_s: FloatArray, headings_rad: FloatArray, window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Means of headings over windows side by side; windows with a gap in them are left out.
+    """Middles (M,) and means (M,) of headings over windows side by side, but those with a gap in
+    them.
 
-    Parameters
-    ----------
-    times_s, headings_rad : (N,) arrays
-        Headings continuous.
-    window_s : float
-        Length of each window.
-
-    Returns
-    -------
-    middles_s, means_rad : (M,) arrays
-        Middles of the windows and the mean headings.
+    Headings are continuous.
     """
     count = int((times_s[-1] - times_s[0]) / window_s)
     edges = times_s[0] + window_s * np.arange(count + 1)
@@ -156,3 +103,154 @@ def windowed_means(
     whole = integral.covers(edges[:-1], edges[1:], 0.5 * window_s)
     means = integral.means(edges[:-1], edges[1:])
     return (0.5 * (edges[1:] + edges[:-1]))[whole], means[whole]
+
+
+_SLOWEST_INTERPOLATED_S = 0.25
+_WINDOW_S = 0.4
+# Between slow samples one must not interpolate: they are met by a short window of the other stream.
+_FEWEST_PER_WINDOW = 5
+_SHORT_WINDOW_S = 0.1
+_LARGEST_STREAM_GAP_S = 0.5
+_STRIDE_S = 0.5
+# Systematic errors of a robot's odometry: a share of each turn, and a curvature.
+_TURN_SCALE_SIGMA = 0.03
+_TURN_PER_METRE_SIGMA = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingPair:
+    """One segment's two streams: means of one over windows, and the other to take means of.
+
+    Windows, since single samples of odometry are rough: shifting them against the other stream
+    changes how the roughness is met, which would pass for a better or worse fit.
+
+    `sign` is 1 where the windows are the ground truth's. `systematic` holds what odometry's heading
+    may be off by in proportion to the way turned and driven, (N, 2), in deviations.
+    """
+
+    times_s: FloatArray
+    headings: FloatArray
+    window_s: float
+    other: HeadingIntegral
+    reference_s: float
+    sign: int
+    systematic: FloatArray
+
+    def warped(self, times_s: FloatArray, offset_s: float, drift: float) -> FloatArray:
+        """Times of the windowed stream on the other's clock."""
+        if self.sign > 0:
+            return times_s + offset_s + drift * (times_s - self.reference_s)
+        return (times_s - offset_s + drift * self.reference_s) / (1.0 + drift)
+
+    def differences(self, offset_s: float, drift: float) -> FloatArray:
+        """Heading of the ground truth minus heading of the odometry, as far as time goes."""
+        half = 0.5 * self.window_s
+        means = self.other.means(
+            self.warped(self.times_s - half, offset_s, drift),
+            self.warped(self.times_s + half, offset_s, drift),
+        )
+        return np.asarray(self.sign * (self.headings - means))
+
+    def kept(self, which: BoolArray) -> HeadingPair:
+        return replace(
+            self,
+            times_s=self.times_s[which],
+            headings=self.headings[which],
+            systematic=self.systematic[which],
+        )
+
+    def sensitivities(self, offset_s: float, drift: float) -> FloatArray:
+        """(N, 2) derivatives of the differences by offset and drift."""
+        step_s = 0.25 * self.window_s
+        half_length = max(float(np.ptp(self.times_s)) / 2.0, step_s)
+        by_offset = self.differences(offset_s + step_s, drift) - self.differences(
+            offset_s - step_s, drift
+        )
+        step = step_s / half_length
+        by_drift = self.differences(offset_s, drift + step) - self.differences(
+            offset_s, drift - step
+        )
+        return np.column_stack([by_offset / (2.0 * step_s), by_drift / (2.0 * step)])
+
+
+def pair_headings(
+    odometry: PlanarPoses,
+    segment: PlanarPoses,
+    *,
+    largest_offset_s: float,
+    largest_drift: float,
+    fewest: int,
+) -> HeadingPair | None:
+    """The comparable part of two streams, fixed for a whole search of offset and drift.
+
+    The segment is ground truth without long pauses. None if the other stream covers fewer samples
+    than `fewest` in the whole search range.
+    """
+    if len(segment) < fewest:
+        return None
+    reach = largest_offset_s + largest_drift * (segment.times_s[-1] - segment.times_s[0])
+    near = (odometry.times_s >= segment.times_s[0] - 2.0 * reach) & (
+        odometry.times_s <= segment.times_s[-1] + 2.0 * reach
+    )
+    if np.count_nonzero(near) < fewest:
+        return None
+    odometry = PlanarPoses(odometry.times_s[near], odometry.poses[near])
+    streams = [(poses.times_s, continuous_headings(poses)) for poses in (segment, odometry)]
+    reference = float(np.mean(segment.times_s))
+    sampled = 0 if _odometry_is_interpolated(*streams) else 1
+    times, headings = streams[sampled]
+    other = HeadingIntegral(*streams[1 - sampled])
+    window = _WINDOW_S
+    if sampling_interval(times) * _FEWEST_PER_WINDOW <= window:
+        times, headings = windowed_means(times, headings, window)
+    else:
+        window = _SHORT_WINDOW_S
+    sign = 1 if sampled == 0 else -1
+    driven = _way_driven(segment if sampled == 0 else odometry, times)
+    systematic = np.column_stack([_TURN_SCALE_SIGMA * headings, _TURN_PER_METRE_SIGMA * driven])
+    if len(times):
+        systematic -= systematic.mean(axis=0)
+    pair = HeadingPair(times, headings, window, other, reference, sign, systematic)
+    if len(times) == 0:
+        return None
+    # The other stream must cover the samples in the whole search range.
+    corners = [
+        pair.warped(times + end * window, offset, drift)
+        for end in (-0.5, 0.5)
+        for offset in (-largest_offset_s, largest_offset_s)
+        for drift in (-largest_drift, largest_drift)
+    ]
+    covered = other.covers(np.min(corners, axis=0), np.max(corners, axis=0), _LARGEST_STREAM_GAP_S)
+    pair = pair.kept(covered)
+    return pair if len(pair.times_s) >= fewest else None
+
+
+def _odometry_is_interpolated(
+    groundtruth: tuple[FloatArray, FloatArray], odometry: tuple[FloatArray, FloatArray]
+) -> bool:
+    """Whether odometry is the smoother, faster stream, between whose samples one interpolates."""
+    slow = [
+        sampling_interval(times) > _SLOWEST_INTERPOLATED_S for times, _ in (groundtruth, odometry)
+    ]
+    if slow[0] != slow[1]:
+        return slow[0]
+    return heading_noise(*odometry) <= heading_noise(*groundtruth)
+
+
+def _way_driven(poses: PlanarPoses, times_s: FloatArray) -> FloatArray:
+    """Metres driven until each of the times, in half seconds: noise lengthens those little."""
+    coarse = np.arange(poses.times_s[0], poses.times_s[-1] + _STRIDE_S, _STRIDE_S)
+    xy = np.column_stack([np.interp(coarse, poses.times_s, poses.poses[:, k]) for k in (0, 1)])
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    return np.asarray(np.interp(times_s, coarse, way))
+
+
+def without_turns(differences: FloatArray, *, keep_mean: bool = False) -> FloatArray:
+    """Differences of headings without whole turns: all within half a turn of their mean angle.
+
+    `differences` (N,). `keep_mean`: whether their mean angle stays in; else it is subtracted, which
+    eliminates the angle between the streams' axes.
+    """
+    middle = float(np.angle(np.mean(np.exp(1j * differences))))
+    level = wrap_angle(differences - middle)
+    return np.asarray(level + middle if keep_mean else level)

@@ -42,33 +42,16 @@ _OFFSET = "offset from master"
 
 @dataclass(frozen=True, eq=False)
 class PtpdLog:
-    """Reports of ptpd.
+    """Reports of ptpd."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Times of the reports (UTC seconds); NaN where the log has none.
-    offset_s : (N,) float64
-        Clock minus master.
-    drift : (N,) float64
-        Observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
-    """
-
-    times_s: FloatArray
-    offset_s: FloatArray
+    times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
+    offset_s: FloatArray  # (N,): clock minus master
+    # (N,): observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
     drift: FloatArray
 
 
 def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     """Read a log of ptpd.
-
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    PtpdLog
 
     Raises
     ------

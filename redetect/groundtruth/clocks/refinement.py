@@ -18,9 +18,9 @@ from scipy.optimize import Bounds, minimize
 
 from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.learning import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.fusion.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 FloatArray = NDArray[np.float64]
@@ -42,22 +42,9 @@ def refine_by_movement(
 ) -> list[ClockSegment]:
     """Move each segment's offset and rate to where the movements fit best.
 
-    Parameters
-    ----------
-    segments : sequence of ClockSegment
-        The estimate by headings.
-    odometry : PlanarPoses
-        The robot's own poses on its own clock.
-    groundtruth : PlanarPoses
-        Poses with covariances.
-    largest : (float, float)
-        Bounds of the offset (s) and the drift, either way.
-
-    Returns
-    -------
-    list of ClockSegment
-        Refined if their status is `ok` or `jump`, the robot drove a metre or more, and the result
-        is near the estimate by headings and within the bounds; the others unchanged.
+    Refined are segments with the status `ok` or `jump` in which the robot drove a metre or more, if
+    the result is near the estimate by headings and within the bounds `largest` of offset (s) and
+    drift; the ground truth has covariances.
     """
     if groundtruth.covariances is None:
         return list(segments)
@@ -87,9 +74,7 @@ def _refined(
         or float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))) < _LEAST_WAY_M
     ):
         return segment
-    measured = PlanarPoses(
-        groundtruth.times_s[here], groundtruth.poses[here], groundtruth.covariances[here]
-    )
+    measured = groundtruth.only(here)
     robot_times, own = odometry.times_s[near], odometry.poses[near]
     settings = FuseSettings()
     noise = noise_of(settings)

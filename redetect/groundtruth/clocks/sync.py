@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, direct, minimize
 
-from redetect.groundtruth.clocks.clock import ClockSegment, Status
-from redetect.groundtruth.clocks.heading_pair import HeadingPair, pair_headings, without_turns
-from redetect.groundtruth.clocks.headings import continuous_headings, segments_between_gaps
-from redetect.groundtruth.clocks.jump import find_jump
-from redetect.groundtruth.clocks.line import on_one_line
+from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
+from redetect.groundtruth.clocks.headings import (
+    HeadingPair,
+    continuous_headings,
+    pair_headings,
+    segments_between_gaps,
+    without_turns,
+)
 from redetect.groundtruth.clocks.refinement import refine_by_movement
-from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering
+from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering, find_jump
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
@@ -42,6 +45,7 @@ _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 _FEWEST_SAMPLES = 20
+_SIMPLEX_SIZE = 0.02
 # Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
 _MUCH_LESS_CERTAIN = 4.0
 
@@ -50,26 +54,16 @@ _MUCH_LESS_CERTAIN = 4.0
 class SyncSettings:
     """Bounds of the search.
 
-    Parameters
-    ----------
-    largest_offset_s : float
-        Of the time offset, either way (s).
-    largest_drift : float
-        The clocks' rates differ by at most this share.
-    segment_gap_s : float
-        A longer pause in the ground truth begins a new segment (s).
-    use_movement : bool
-        Refine the estimate by headings with the whole movement if the ground truth has covariances.
-
     Raises
     ------
     GroundTruthError
         If one is not finite or not positive, or the drift is half or more.
     """
 
-    largest_offset_s: float = 1.0
-    largest_drift: float = 0.01
-    segment_gap_s: float = 5.0
+    largest_offset_s: float = 1.0  # Of the time offset, either way (s)
+    largest_drift: float = 0.01  # The clocks' rates differ by at most this share
+    segment_gap_s: float = 5.0  # A longer pause in the ground truth begins a new segment (s)
+    # Refine the estimate by headings with the whole movement if the ground truth has covariances
     use_movement: bool = True
 
     def __post_init__(self) -> None:
@@ -92,7 +86,6 @@ def synchronise(
         The robot's own poses on its own clock; only headings and times are used.
     groundtruth : PlanarPoses
         Poses on the ground truth's clock. Of several of one time, in either, the last counts.
-    settings : SyncSettings, optional
 
     Returns
     -------
@@ -118,12 +111,9 @@ def synchronise(
     by_movement: list[ClockSegment] = []
     limits = (bounds.largest_offset_s, bounds.largest_drift)
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
-        covariances = groundtruth.covariances
-        segment = PlanarPoses(
-            groundtruth.times_s[part],
-            groundtruth.poses[part],
-            covariances[part] if covariances is not None and bounds.use_movement else None,
-        )
+        segment = groundtruth.only(part)
+        if not bounds.use_movement:
+            segment = replace(segment, covariances=None)
         own = _segment(odometry, segment, bounds, _MOST_JUMPS)
         refined = refine_by_movement(own, odometry, segment, limits)
         if len(refined) > 1 and not _differ(refined):
@@ -141,7 +131,7 @@ def synchronise(
     best, alone = on_one_line(by_movement), on_one_line(by_headings)
     if _uncertainty(best) > _MUCH_LESS_CERTAIN * _uncertainty(alone):
         best = alone
-    return tuple(_told_by_the_others(best))
+    return tuple(_interpolated(best))
 
 
 def _uncertainty(segments: list[ClockSegment]) -> float:
@@ -167,11 +157,11 @@ def _segment(
     )
     turned = float(np.sum(np.abs(np.diff(_smoothed(continuous_headings(segment))))))
     if pair is None:
-        return [_untold(segment, 0.0, "no odometry")]
+        return [_undetermined(segment, 0.0, "no odometry")]
     offset, drift = _search(pair, bounds)
     pair = pair.kept(_inliers(pair, offset, drift))
     if len(pair.times_s) < _FEWEST_SAMPLES:
-        return [_untold(segment, turned, "the headings have nothing in common")]
+        return [_undetermined(segment, turned, "the headings have nothing in common")]
     for _ in range(2):
         wandering = estimate_wandering(
             pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
@@ -182,7 +172,7 @@ def _segment(
     if not math.sqrt(covariance[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
         alone = _covariance(pair, wandering, offset, drift, with_drift=False)
         if not math.sqrt(alone[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
-            return [_untold(segment, turned, "turns too little to determine the offset")]
+            return [_undetermined(segment, turned, "turns too little to determine the offset")]
     if not math.sqrt(covariance[1, 1]) < _LEAST_DETERMINED * bounds.largest_drift:
         note = "too short to determine the drift: assumed to be 0"
         drift = 0.0
@@ -195,7 +185,7 @@ def _segment(
         if place is not None:
             parts = []
             for which in (segment.times_s < place, segment.times_s >= place):
-                part = PlanarPoses(segment.times_s[which], segment.poses[which])
+                part = segment.only(which)
                 if len(part) >= _FEWEST_SAMPLES:
                     parts += _segment(odometry, part, bounds, jumps_left - 1)
             if _differ(parts):
@@ -276,16 +266,16 @@ def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:
         found.x,
         method="Nelder-Mead",
         bounds=box,
-        options={"xatol": 1e-6, "fatol": 1e-14, "initial_simplex": _simplex(found.x, 0.02)},
+        options={"xatol": 1e-6, "fatol": 1e-14, "initial_simplex": _simplex(found.x)},
     )
     offset, drift = best.x * scale
     return float(offset), float(drift)
 
 
-def _simplex(start: FloatArray, size: float) -> FloatArray:
+def _simplex(start: FloatArray) -> FloatArray:
     """A first simplex inside the box of -1 to 1."""
-    inward = np.where(start > 0.0, -size, size)
-    return start + np.diag([*inward, 0.0])[[2, 0, 1], :2]
+    inward = np.where(start > 0.0, -_SIMPLEX_SIZE, _SIMPLEX_SIZE)
+    return np.asarray(start + np.vstack([np.zeros(len(start)), np.diag(inward)]))
 
 
 def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> NDArray[np.bool_]:
@@ -304,26 +294,24 @@ def _refine(
     *,
     with_drift: bool = True,
 ) -> tuple[float, float]:
-    """Least whitened squares near a result of the global search."""
+    """Least whitened squares near a result of the global search; without drift, it stays."""
     scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
-    x0 = np.clip(np.array(start) / scale, -1.0, 1.0)
-    if not with_drift:
-        alone = minimize(
-            lambda x: wandering.squared(without_turns(pair.differences(x[0] * scale[0], start[1]))),
-            x0[:1],
-            method="Nelder-Mead",
-            bounds=Bounds([-1.0], [1.0]),
-            options={"xatol": 1e-7, "fatol": 1e-9},
-        )
-        return float(alone.x[0] * scale[0]), start[1]
-    found = minimize(
-        lambda x: wandering.squared(without_turns(pair.differences(*(x * scale)))),
-        x0,
+    best = np.clip(np.array(start) / scale, -1.0, 1.0)
+    free = slice(0, 2 if with_drift else 1)
+
+    def squared(x: FloatArray) -> float:
+        tried = best.copy()
+        tried[free] = x
+        return wandering.squared(without_turns(pair.differences(*(tried * scale))))
+
+    best[free] = minimize(
+        squared,
+        best[free],
         method="Nelder-Mead",
-        bounds=Bounds([-1.0, -1.0], [1.0, 1.0]),
-        options={"xatol": 1e-7, "fatol": 1e-9, "initial_simplex": _simplex(x0, 0.02)},
-    )
-    offset, drift = found.x * scale
+        bounds=Bounds(-1.0, 1.0),
+        options={"xatol": 1e-7, "fatol": 1e-9, "initial_simplex": _simplex(best[free])},
+    ).x
+    offset, drift = best * scale
     return float(offset), float(drift)
 
 
@@ -350,24 +338,18 @@ def _covariance(
     return np.asarray(np.linalg.inv(correlation) / scale[:, None] / scale)
 
 
-def _untold(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
+def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
     return ClockSegment(
         from_s=float(segment.times_s[0]),
         to_s=float(segment.times_s[-1]),
         reference_s=float(np.mean(segment.times_s)),
-        offset_s=0.0,
-        rate=1.0,
-        angle_rad=0.0,
-        sigma_offset_s=math.inf,
-        sigma_rate=math.inf,
-        sigma_angle_rad=math.inf,
         turned_rad=turned_rad,
         status="no turns",
         note=note,
     )
 
 
-def _told_by_the_others(segments: list[ClockSegment]) -> list[ClockSegment]:
+def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
     """Interpolate the offsets of undetermined segments from the others."""
     determined = [segment for segment in segments if segment.status != "no turns"]
     if not determined:

@@ -12,8 +12,7 @@ from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.commands.options import Fuse
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
-from redetect.groundtruth.fusion.leave_out import leave_out
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
-from redetect.groundtruth.lasers.blocks import combined_poses
+from redetect.groundtruth.lasers.outline import LaserSettings
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.session import load_session
-from redetect.groundtruth.lasers.settings import LaserSettings
-from redetect.groundtruth.lasers.suspects import excess_shifts, track_without_suspects
+from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -24,7 +22,11 @@ from redetect.groundtruth.lasers.tracking import (
     STATUS,
     UNDETERMINED,
     LaserTrack,
+    combined_poses,
+    excess_shifts,
+    track_without_suspects,
 )
+from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_whole
 
@@ -80,13 +82,12 @@ def perform(options: Laser) -> int:
 def account_lines(track: LaserTrack) -> list[str]:
     """A line of JSON for every set of scans."""
     lines = []
-    names = ("expected", "agree", "through", "hidden", "none", "beside")
     for i, status in enumerate(track.status.tolist()):
         line: dict[str, Any] = {"t": round(float(track.times_s[i]), 6), "status": STATUS[status]}
         if status != LOST:
             line["visit"] = int(track.segment[i])
         if status not in (LOST, COASTING):
-            beams = {name: int(n) for name, n in zip(names, track.beams[i])}
+            beams = {name: int(n) for name, n in zip(BeamCounts._fields, track.beams[i])}
             line["readings"] = int(track.readings[i])
             line["rms_m"] = round(float(track.rms_m[i]), 5)
             line["chi2_per_freedom"] = round(float(track.chi2[i]), 3)

@@ -10,10 +10,10 @@ import numpy as np
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.lasers.alignment import AlignmentSettings, align_scanners, still_scan
-from redetect.groundtruth.lasers.alignment_picture import draw_alignment
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners, write_scanners
 from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.landmarks import wrap_angle
 from redetect.storage import write_whole
 
@@ -31,7 +31,7 @@ def perform(options: Lasers) -> int:
     by_hand = session / "scanners.json"
     measured = read_scanners(by_hand)
     map_file = options.building or find_building(session)
-    building = read_building(map_file).segments
+    building = read_building(map_file)
     empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
     alignment = align_scanners(measured, empties, building, settings)
 

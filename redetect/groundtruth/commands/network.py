@@ -9,13 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from redetect.groundtruth.commands.options import Network as NetworkCommand
-from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
-from redetect.groundtruth.commands.tables import print_sigmas, print_table, residual_figures
+from redetect.groundtruth.commands.outputs import (
+    check_outputs,
+    print_sigmas,
+    print_table,
+    progress,
+    provenance,
+    residual_figures,
+)
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards_file import find_boards, read_boards
+from redetect.groundtruth.markers.boards import BoardView, find_boards, read_boards
 from redetect.groundtruth.markers.calibration import Network, write_network
 from redetect.groundtruth.markers.network_estimation import (
-    BoardView,
     NetworkEstimate,
     estimate_network,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import write_json
+from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.calibration import Network, read_network, read_rig
 from redetect.groundtruth.markers.session import (
     RIG_NAME,
@@ -82,13 +82,7 @@ def perform(command: Poses) -> int:
 
 
 def read_all_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
-    """The markers found in all runs, whose folders' names are the cameras'.
-
-    Raises
-    ------
-    GroundTruthError
-        If a folder's name is no camera of the network.
-    """
+    """The markers found in all runs, whose folders' names are the cameras'."""
     frames = []
     for run in runs:
         name = run.resolve().name

@@ -12,15 +12,25 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from redetect.groundtruth.commands.options import Rig as RigCommand
-from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
+from redetect.groundtruth.commands.outputs import (
+    check_outputs,
+    print_sigmas,
+    print_table,
+    progress,
+    provenance,
+    residual_figures,
+)
 from redetect.groundtruth.commands.poses import read_all_frames
-from redetect.groundtruth.commands.tables import print_sigmas, print_table, residual_figures
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.calibration import Network, read_network, read_rig, write_rig
-from redetect.groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
-from redetect.groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
-from redetect.groundtruth.markers.rig_picture import draw_rig
+from redetect.groundtruth.markers.rig_estimation import (
+    RigEstimate,
+    estimate_rig,
+    rig_by_known_markers,
+    rig_by_reference_poses,
+)
 from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, read_marker_frames
+from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_whole
 

@@ -8,16 +8,19 @@ from typing import Any
 
 from redetect.groundtruth.commands.options import Score
 from redetect.groundtruth.commands.outputs import check_outputs
-from redetect.groundtruth.json_file import write_json
-from redetect.groundtruth.trajectories.alignment import moved_poses, planar_alignment
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.trajectories.matching import (
+    matched_streams,
+    moved_poses,
+    planar_alignment,
+)
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.groundtruth.validation.relative_errors import (
+from redetect.groundtruth.validation.scoring import (
     read_relations,
+    score_poses,
     score_relations,
     score_steps,
 )
-from redetect.groundtruth.validation.scoring import score_poses
 
 
 def perform(command: Score) -> int:

@@ -60,23 +60,13 @@ def perform(options: Sync) -> int:
 def compare_with_ptpd(
     model: ClockModel, determined: list[ClockSegment], log: PtpdLog
 ) -> dict[str, float | int | None]:
-    """Compare the clocks estimated from headings with ptpd's reports.
+    """Compare the clocks estimated from headings with ptpd's reports, which are on the robot's
+    clock.
 
-    Parameters
-    ----------
-    model : ClockModel
-    determined : list of ClockSegment
-        Those whose offset is determined.
-    log : PtpdLog
-        Its times are those of the robot's clock; an offset is the robot's minus the master's.
-
-    Returns
-    -------
-    dict
-        Reports, how many of them lie in a segment, the root mean square of the difference between
-        their offsets and the model's there (s), the mean drift of both, and by how much ptpd's
-        offsets leave the best straight line through them (s): how far piecewise linear is true.
-        None where nothing can be said.
+    Reports, how many of them lie in a segment that is determined, the root mean square of the
+    difference between their offsets and the model's there (s), the mean drift of both, and by how
+    much ptpd's offsets leave the best straight line through them (s). None where nothing can be
+    said.
     """
     timed = np.isfinite(log.times_s)
     times, offsets = log.times_s[timed], log.offset_s[timed]

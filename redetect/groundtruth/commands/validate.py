@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,11 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import read_robot
 from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.report.pictures import draw_errors
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation.fiducials import read_distances, read_survey
-from redetect.groundtruth.validation.picture import draw_errors
-from redetect.groundtruth.validation.reference_poses import DistanceSettings, poses_from_distances
-from redetect.groundtruth.validation.reference_poses_scans import Onboard, RefineSettings
+from redetect.groundtruth.validation.reference_poses import poses_from_distances
+from redetect.groundtruth.validation.reference_poses_scans import Onboard
 from redetect.groundtruth.validation.validate import (
     PUBLISHED,
     Figures,
@@ -41,15 +41,10 @@ from redetect.storage import write_whole
 #: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
 
-_FARTHEST_S = 0.5
-
 
 @dataclass(frozen=True)
 class _Settings:
     refine: str
-    distances: DistanceSettings = field(default_factory=DistanceSettings)
-    scans: Any = None
-    farthest_s: float = _FARTHEST_S
 
 
 def perform(options: Validate) -> int:
@@ -65,11 +60,9 @@ def perform(options: Validate) -> int:
     files = [session / "fiducials.json", session / "distances.csv", options.poses]
     onboard: list[Onboard] = []
     clock, segments, clock_path = None, None, None
-    settings = _Settings(options.refine)
     if options.refine == "scans":
-        settings = _Settings(options.refine, scans=RefineSettings())
         map_file = find_building(session)
-        segments = read_building(map_file).segments
+        segments = read_building(map_file)
         onboard, scan_files = _onboard(session)
         clock_path = _clock_path(session, options.clock)
         if onboard and clock_path is None:
@@ -80,15 +73,15 @@ def perform(options: Validate) -> int:
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     elif (session / "building.csv").is_file() or (session / "building.dxf").is_file():
-        segments = read_building(find_building(session)).segments  # for the picture
-    solved = poses_from_distances(survey, measured, settings.distances)
-    references, refused = reference_poses(solved, onboard, segments, clock, settings.scans)
+        segments = read_building(find_building(session))  # for the picture
+    solved = poses_from_distances(survey, measured)
+    references, refused = reference_poses(solved, onboard, segments, clock)
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
         print("error: not a single reference pose", file=sys.stderr)
         return 1
-    errors, without = pose_errors(references, poses, settings.farthest_s)
+    errors, without = pose_errors(references, poses)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
     if not errors:
@@ -97,7 +90,7 @@ def perform(options: Validate) -> int:
     figures = figures_of(errors)
     rows = table_rows(references, errors)
     content = {
-        **provenance(settings, files),
+        **provenance(_Settings(options.refine), files),
         "poses": str(options.poses.name),
         "clock": None if clock_path is None else clock_path.name,
         **document(figures, [*refused, *without]),

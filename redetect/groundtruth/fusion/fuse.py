@@ -14,9 +14,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.controls import pauses_of
+from redetect.groundtruth.fusion.inputs import FuseSettings, pauses_of
 from redetect.groundtruth.fusion.learning import (
     likeliest_noise,
     looser_over_seconds,
@@ -25,99 +26,77 @@ from redetect.groundtruth.fusion.learning import (
 )
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.fusion.settings import FuseSettings
+from redetect.groundtruth.trajectories.matching import (
+    interpolate_poses,
+    moved_poses,
+    planar_alignment,
+    pose_differences,
+    squared_lengths,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
 
 __all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
 
 
 @dataclass(frozen=True)
 class Rejected:
-    """A measurement that the gate kept out.
+    """A measurement that the gate kept out."""
 
-    Attributes
-    ----------
-    stream : str
-        Its stream.
-    time_s : float
-    squared_innovation : float
-        Squared normalised innovation.
-    """
-
-    stream: str
+    stream: str  # Its stream
     time_s: float
-    squared_innovation: float
+    squared_innovation: float  # Squared normalised innovation
 
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """Odometry's errors estimated from the measurements.
+    """Odometry's errors estimated from the measurements."""
 
-    Attributes
-    ----------
-    turn_scale, turn_bias_per_metre, distance_scale : float
-        By what share turns are longer than odometry says, the turn it misses per metre (rad), by
-        what share ways are longer.
-    turn_scale_sigma, turn_bias_per_metre_sigma, distance_scale_sigma : float
-        Their standard deviations.
-    distance_sigma, lateral_sigma, turn_sigma, turn_per_metre_sigma : float
-        Its random errors, as in `FuseSettings`.
-    looser_in_gaps : float
-        By what factor their variances were raised where nothing was measured for more than a
-        second, since odometry erred more over seconds than from sample to sample; 1 if it did not.
-    """
-
+    # `turn_scale`, `turn_bias_per_metre`, `distance_scale`: By what share turns are longer than
+    # odometry says, the turn it misses per metre (rad), by what share ways are longer
     turn_scale: float
     turn_bias_per_metre: float
     distance_scale: float
+    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Their standard
+    # deviations
     turn_scale_sigma: float
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
+    # `distance_sigma`, `lateral_sigma`, `turn_sigma`, `turn_per_metre_sigma`: Its random errors, as
+    # in `FuseSettings`
     distance_sigma: float
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
+    # By what factor their variances were raised where nothing was measured for more than a second,
+    # since odometry erred more over seconds than from sample to sample; 1 if it did not.
     looser_in_gaps: float
 
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
-    """The robot's path from all streams.
+    """The robot's path from all streams."""
 
-    Attributes
-    ----------
-    poses : PlanarPoses
-        At the odometry's times from the first measurement to the last, with covariances; headings
-        within +-pi.
-    rejected : tuple of Rejected
-        In order of time.
-    restarts_s : tuple of float
-        When the filter was restarted because no measurement fitted any more.
-    used : dict of str to int
-        Measurements that went in, by stream.
-    odometry : OdometryErrors
-        The estimated errors of odometry.
-    localisation : LocalisationErrors or None
-        Errors of odometry that is a localisation, along which the path was estimated then.
-    repaired : dict of str to int
-        Covariances that were not positive definite as written, by stream; they were raised by their
-        file's rounding.
-    repeated : dict of str to int
-        Rows that were the row before once more, by stream; they counted once.
-    pauses_s : tuple of (float, float)
-        Between which times odometry was not written, within the poses' time. What may have been
-        driven there besides, at the rates at which the robot usually goes, makes it less certain.
-    """
-
+    # At the odometry's times from the first measurement to the last, with covariances; headings
+    # within +-pi.
     poses: PlanarPoses
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[Rejected, ...]  # In order of time
+    # When the filter was restarted because no measurement fitted any more
     restarts_s: tuple[float, ...]
-    used: dict[str, int]
-    odometry: OdometryErrors
+    used: dict[str, int]  # Measurements that went in, by stream
+    odometry: OdometryErrors  # The estimated errors of odometry
+    # Errors of odometry that is a localisation, along which the path was estimated then
     localisation: LocalisationErrors | None
+    # Covariances that were not positive definite as written, by stream; they were raised by their
+    # file's rounding.
     repaired: dict[str, int]
+    # Rows that were the row before once more, by stream; they counted once.
     repeated: dict[str, int]
+    # Between which times odometry was not written, within the poses' time. What may have been
+    # driven there besides, at the rates at which the robot usually goes, makes it less certain.
     pauses_s: tuple[tuple[float, float], ...]
 
 
@@ -134,11 +113,6 @@ def fuse(
         The robot's own poses, on the measurements' clock; only movements between them count.
     streams : mapping of str to PlanarPoses
         Measured poses with covariances, by name.
-    settings : FuseSettings, optional
-
-    Returns
-    -------
-    Fusion
 
     Raises
     ------
@@ -206,3 +180,113 @@ def fuse(
             if end > first and begin < last
         ),
     )
+
+
+# A longer pause in the ground truth begins another segment; fused poses and odometry are not
+# interpolated over a longer one.
+_SEGMENT_GAP_S = 5.0
+_LARGEST_GAP_S = 2.0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A segment of the ground truth, predicted without it."""
+
+    # `from_s`, `to_s`: The segment
+    from_s: float
+    to_s: float
+    poses: int  # Of the ground truth in it that have a prediction
+    # `position_rms_m`, `heading_rms_rad`: Root of the mean squared error of the fused path
+    position_rms_m: float
+    heading_rms_rad: float
+    normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
+    # `aligned_position_rms_m`, `aligned_heading_rms_rad`: The same of odometry after the rigid
+    # motion that fits it to the other segments best
+    aligned_position_rms_m: float
+    aligned_heading_rms_rad: float
+
+
+def leave_out(
+    odometry: PlanarPoses,
+    streams: Mapping[str, PlanarPoses],
+    settings: FuseSettings | None = None,
+) -> tuple[LeftOut, ...]:
+    """Leave each segment of the ground truth between two others out, and predict it.
+
+    Parameters
+    ----------
+    odometry, streams, settings
+        As of `redetect.groundtruth.fusion.fuse.fuse`. Segments are those of the first stream; the
+        others are left out at the same times.
+
+    Returns
+    -------
+    tuple of LeftOut
+        In order of time. The first segment and the last are not among them, since a fused path goes
+        from the first measured pose to the last.
+
+    Raises
+    ------
+    GroundTruthError
+        If there are fewer than three segments within the odometry's time.
+    """
+    truth = next(iter(streams.values()))
+    own = last_of_each_time(odometry)
+    inside = (truth.times_s >= own.times_s[0]) & (truth.times_s <= own.times_s[-1])
+    truth = truth.only(inside)
+    cuts = np.flatnonzero(np.diff(truth.times_s) > _SEGMENT_GAP_S) + 1
+    parts = [times for times in np.split(truth.times_s, cuts) if len(times)]
+    if len(parts) < 3:
+        raise GroundTruthError(
+            f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "
+            "more, to leave one out between two others"
+        )
+    return tuple(
+        _left_out(own, streams, truth, float(times[0]), float(times[-1]), settings)
+        for times in parts[1:-1]
+    )
+
+
+def _left_out(
+    odometry: PlanarPoses,
+    streams: Mapping[str, PlanarPoses],
+    truth: PlanarPoses,
+    from_s: float,
+    to_s: float,
+    settings: FuseSettings | None,
+) -> LeftOut:
+    fusion = fuse(
+        odometry,
+        {name: one.only(~_during(one, from_s, to_s)) for name, one in streams.items()},
+        settings,
+    )
+    here = _during(truth, from_s, to_s)
+    segment, others = truth.only(here), truth.only(~here)
+    predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
+    error = pose_differences(predicted.poses, segment.only(known).poses)
+    assert predicted.covariances is not None
+    assert segment.covariances is not None
+    covariances = predicted.covariances + segment.covariances[known]
+    beside, aligned = interpolate_poses(odometry, others.times_s, _LARGEST_GAP_S)
+    moved = moved_poses(odometry, planar_alignment(beside, others.only(aligned)))
+    rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
+    return LeftOut(
+        from_s,
+        to_s,
+        len(predicted),
+        *_rms(error),
+        float(np.mean(squared_lengths(error, covariances)) / 3.0),
+        *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
+    )
+
+
+def _during(poses: PlanarPoses, from_s: float, to_s: float) -> NDArray[np.bool_]:
+    return np.asarray((poses.times_s >= from_s) & (poses.times_s <= to_s))
+
+
+def _rms(difference: FloatArray) -> tuple[float, float]:
+    """Of the position (m) and of the heading (rad)."""
+    if len(difference) == 0:
+        return np.nan, np.nan
+    squared = np.mean(np.square(difference), axis=0)
+    return float(np.sqrt(squared[0] + squared[1])), float(np.sqrt(squared[2]))

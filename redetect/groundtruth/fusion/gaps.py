@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.motion_kernels import POSE, STATE
-from redetect.groundtruth.fusion.smoother_kernels import (
+from redetect.groundtruth.fusion.kernels import (
     AFTER_REJECTIONS,
+    POSE,
+    STATE,
     WHERE_LOST,
     Gating,
     MeasuredPoses,
@@ -46,19 +47,12 @@ _TURN_PER_METRE = 4
 
 @dataclass(frozen=True, eq=False)
 class Bridge:
-    """The likeliest path over a gap.
+    """The likeliest path over a gap."""
 
-    Attributes
-    ----------
-    path : (N, 6) float64 or None
-        States from the gap's begin to its end; headings have no jumps. None if more than one
-        number of whole turns may be, or if none explains the end.
-    looser : float
-        By what factor odometry's variances had to be raised to explain it, 1 or more.
-    """
-
+    # (N, 6): states from the gap's begin to its end; headings have no jumps. None if more than one
+    # number of whole turns may be, or if none explains the end.
     path: FloatArray | None
-    looser: float
+    looser: float  # By what factor odometry's variances had to be raised to explain it, 1 or more
 
 
 def gaps_where_lost(
@@ -100,23 +94,11 @@ def bridge(
 ) -> Bridge:
     """Find the likeliest path between two known ends.
 
-    Parameters
-    ----------
-    controls, variances : (N, 4), (N, 3) arrays
-        Of the movements to each node; the first are not used (see `filter_forward`).
-    forward : (N - 1, 6) array
-        Where odometry leads from the first node on, up to the node before the last.
-    spread : (6, 6) array
-        Covariance at the first node.
-    end, end_spread : (3,), (3, 3) arrays
-        Pose at the last node, and covariance.
-    gate : float
-        Largest squared normalised distance of the end that odometry explains; beyond it, it is
-        taken to err more in this gap than elsewhere.
-
-    Returns
-    -------
-    Bridge
+    `controls` (N, 4) and `variances` (N, 3) are those of the movements to each node; the first are
+    not used. `forward` (N - 1, 6) is where odometry leads from the first node, whose covariance is
+    `spread` (6, 6). `end` (3,) is the pose at the last node, with `end_spread` (3, 3). Beyond the
+    `gate`, a squared normalised distance of the end, odometry is taken to err more in this gap than
+    elsewhere.
     """
     looser = 1.0
     for _ in range(_MOST_LOOSENINGS):
@@ -214,19 +196,10 @@ def _no_gate(nodes: int) -> Gating:
 def back_from(
     controls: FloatArray, variances: FloatArray, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States and covariances predicted backward by odometry from a gap's end.
+    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
 
-    Parameters
-    ----------
-    controls, variances : (N, 4), (N, 3) arrays
-        Of the movements to each node; the first are not used.
-    end, end_spread : (6,), (6, 6) arrays
-        At the last node.
-
-    Returns
-    -------
-    states, spreads : (N, 6), (N, 6, 6) arrays
-        In the order of the nodes.
+    `controls` (N, 4) and `variances` (N, 3) as for `bridge`; `end` (6,) and `end_spread` (6, 6) are
+    those at the last node.
     """
     count = len(controls)
     # Driven backward, all rates change their signs; the turn per metre does so by itself.

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtri
 
-from redetect.groundtruth.fusion.motion_kernels import POSE
+from redetect.groundtruth.fusion.inputs import FuseSettings
+from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-from redetect.groundtruth.fusion.settings import FuseSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -77,18 +77,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
 
     A localisation, or odometry that was filtered, errs smoothly: hardly from sample to sample, and
     yet over a gap. So most measurements are left out, and what odometry makes of the ways between
-    those that are left is compared with them.
-
-    Parameters
-    ----------
-    problem : MovementProblem
-    noise : (4,) array
-        Odometry's random errors.
-
-    Returns
-    -------
-    float
-        1 unless errors are beyond what chance explains.
+    those that are left is compared with them. 1 unless errors are beyond what chance explains.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -117,23 +106,12 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
 def terms_that_pay(
     problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
 ) -> NDArray[np.bool_]:
-    """Which of odometry's systematic errors, as estimated, make better predictions over seconds.
+    """(3,) which of odometry's systematic errors, as estimated, make better predictions over
+    seconds.
 
     They are estimated from sample to sample. Where odometry's own jitter is a part of these
     samples, measured poses deny it, and a share of turns comes out that is none (regression
     dilution). Over seconds, and over gaps, such an estimate predicts worse than none.
-
-    Parameters
-    ----------
-    problem : MovementProblem
-    noise : (4,) array
-        Odometry's random errors over seconds.
-    means, deviations : (3,) arrays
-        The estimates.
-
-    Returns
-    -------
-    (3,) bool
     """
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0

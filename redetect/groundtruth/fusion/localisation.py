@@ -19,10 +19,14 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from redetect.groundtruth.fusion.motion_kernels import POSE
+from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-from redetect.groundtruth.trajectories.alignment import moved_poses, planar_alignment
-from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.matching import (
+    interpolate_poses,
+    moved_poses,
+    planar_alignment,
+    pose_differences,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 
@@ -54,73 +58,48 @@ _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 
 @dataclass(frozen=True)
 class LocalisationErrors:
-    """How odometry errs that is a localisation.
+    """How odometry errs that is a localisation."""
 
-    Attributes
-    ----------
-    position_sigma, heading_sigma : float
-        Standard deviations of x and y (m each), and of the heading (rad).
-    position_correlation_s, heading_correlation_s : float
-        After which time errors are alike by 1/e only.
-    heading_offset : float
-        Heading of the ground truth beyond that of the aligned localisation (rad).
-    """
-
+    # `position_sigma`, `heading_sigma`: Standard deviations of x and y (m each), and of the heading
+    # (rad)
     position_sigma: float
     heading_sigma: float
+    # `position_correlation_s`, `heading_correlation_s`: After which time errors are alike by 1/e
+    # only
     position_correlation_s: float
     heading_correlation_s: float
+    # Heading of the ground truth beyond that of the aligned localisation (rad)
     heading_offset: float
 
 
 class LocalisationProblem(NamedTuple):
-    """Measured poses beside odometry's, aligned.
+    """Measured poses beside odometry's, aligned."""
 
-    Attributes
-    ----------
-    odometry : PlanarPoses
-        Aligned rigidly with the measured poses.
-    times_s : (M,) float64
-    differences, covariances : (M, 3), (M, 3, 3) float64
-        Measured poses minus odometry's at their times; covariances of the former.
-    offsets : (M, 2) float64
-        Odometry's positions less the centroid (m).
-    centroid : (2,) float64
-    gate : float
-        Largest squared normalised innovation.
-    """
-
-    odometry: PlanarPoses
-    times_s: FloatArray
+    odometry: PlanarPoses  # Aligned rigidly with the measured poses
+    times_s: FloatArray  # (M,)
+    # `differences`, `covariances`: (M, 3), (M, 3, 3): measured poses minus odometry's at their
+    # times; covariances of the former.
     differences: FloatArray
     covariances: FloatArray
-    offsets: FloatArray
-    centroid: FloatArray
-    gate: float
+    offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
+    centroid: FloatArray  # (2,)
+    gate: float  # Largest squared normalised innovation
 
 
 def localisation_problem(
     odometry: PlanarPoses, measured: PlanarPoses, gate: float
 ) -> LocalisationProblem:
-    """Align odometry with measured poses.
+    """Align odometry with two or more measured poses within its time.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        No two samples of one time.
-    measured : PlanarPoses
-        Two or more, with covariances, within odometry's time.
-    gate : float
-        Largest squared normalised innovation.
+    `odometry` has no two samples of one time; `gate` is the largest squared normalised innovation.
     """
     assert measured.covariances is not None
     own, _ = interpolate_poses(odometry, measured.times_s)
     usual = np.ones(len(measured), dtype=np.bool_)
     for _ in range(_TRIMMINGS):
-        motion = planar_alignment(_some(own, usual), _some(measured, usual))
+        motion = planar_alignment(own.only(usual), measured.only(usual))
         beside = moved_poses(own, motion)
-        differences = measured.poses - beside.poses
-        differences[:, 2] = wrap_angle(differences[:, 2])
+        differences = pose_differences(measured.poses, beside.poses)
         off = np.column_stack([np.hypot(differences[:, 0], differences[:, 1]), differences[:, 2]])
         usual = np.all(np.abs(off) <= _USUAL * np.median(np.abs(off), axis=0), axis=1)
         if np.count_nonzero(usual) < 2:
@@ -138,24 +117,11 @@ def localisation_problem(
     )
 
 
-def _some(poses: PlanarPoses, which: NDArray[np.bool_]) -> PlanarPoses:
-    return PlanarPoses(poses.times_s[which], poses.poses[which])
-
-
 def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]:
-    """Deviations (m, rad) and correlation time that make the measurements likeliest.
+    """Deviations (m, rad) and correlation times (s) that make the measurements likeliest.
 
-    Parameters
-    ----------
-    problem : LocalisationProblem
-        Of few measurements, seconds apart.
-
-    Returns
-    -------
-    errors : (4,) float64
-        Deviations of position and heading, correlation times of both (s).
-    surprise : float
-        Minus twice the logarithm of the measurements' likelihood.
+    From a few measurements, seconds apart. Returns the deviations of position and heading and their
+    correlation times (4,), and minus twice the logarithm of the measurements' likelihood.
     """
     start = np.array(_START)
     bound = math.log(_LARGEST_FACTOR)
@@ -277,24 +243,10 @@ def _smooth(
 def smooth_localisation(
     problem: LocalisationProblem, errors: FloatArray, times_s: FloatArray
 ) -> tuple[PlanarPoses, FloatArray, float]:
-    """The path from odometry that is a localisation.
+    """The path at some of odometry's times (N,), from odometry that is a localisation.
 
-    Parameters
-    ----------
-    problem : LocalisationProblem
-    errors : (4,) array
-        See `learn_localisation`.
-    times_s : (N,) array
-        Odometry's times at which poses are wanted.
-
-    Returns
-    -------
-    poses : PlanarPoses
-        With covariances.
-    squared : (M,) float64
-        Squared normalised innovations of the measurements.
-    heading_offset : float
-        Rad.
+    `errors` (4,) are those of `learn_localisation`. Returns poses with covariances, the squared
+    normalised innovations of the measurements (M,), and the heading's offset (rad).
     """
     there, _ = interpolate_poses(problem.odometry, times_s)
     all_times = np.concatenate([times_s, problem.times_s])
@@ -327,23 +279,9 @@ def as_localisation(
 ) -> tuple[PlanarPoses, FloatArray, LocalisationErrors] | None:
     """The path from odometry that is a localisation, if it clearly is one.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        No two samples of one time.
-    problem : MovementProblem
-        The same with the measurements.
-    noise : (4,) array
-        Random errors of its movements over seconds.
-    times_s : (N,) array
-        Odometry's times at which poses are wanted.
-
-    Returns
-    -------
-    poses : PlanarPoses
-    squared : (M,) float64
-        Squared normalised innovations of the measurements; infinite where they were left out.
-    errors : LocalisationErrors
+    `problem` has the same odometry, `noise` (4,) its random errors over seconds, `times_s` (N,)
+    those of the path. The squared normalised innovations (M,) are infinite where measurements were
+    left out.
     """
     thin = problem.thinned(_SPACING_S)
     if len(thin.nodes) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:

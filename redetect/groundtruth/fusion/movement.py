@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from redetect.groundtruth.fusion.controls import movements, variances_of
 from redetect.groundtruth.fusion.gaps import (
     UNMEASURED_S,
     Bridge,
@@ -20,10 +19,10 @@ from redetect.groundtruth.fusion.gaps import (
     ends_that_did_not_fit,
     gaps_where_lost,
 )
-from redetect.groundtruth.fusion.measurements import gather
-from redetect.groundtruth.fusion.motion_kernels import POSE, STATE
-from redetect.groundtruth.fusion.settings import FuseSettings
-from redetect.groundtruth.fusion.smoother_kernels import (
+from redetect.groundtruth.fusion.inputs import FuseSettings, gather, movements, variances_of
+from redetect.groundtruth.fusion.kernels import (
+    POSE,
+    STATE,
     FilterHistory,
     Gating,
     MeasuredPoses,
@@ -46,23 +45,13 @@ _RELINEARISATIONS_WHERE_LOST = 3
 
 @dataclass(frozen=True, eq=False)
 class MeasurementAccount:
-    """How the measurements were used.
+    """How the measurements were used."""
 
-    Attributes
-    ----------
-    squared : (M,) float64
-        Squared normalised innovations.
-    accepted : (M,) bool
-    restarted : (N,) int8
-        Whether the filter was restarted at a node, and why (see `smoother_kernels`).
-    surprise : float
-        Minus twice the logarithm of their likelihood.
-    """
-
-    squared: FloatArray
-    accepted: NDArray[np.bool_]
+    squared: FloatArray  # (M,): squared normalised innovations
+    accepted: NDArray[np.bool_]  # (M,)
+    # (N,): whether the filter was restarted at a node, and why (see `kernels`)
     restarted: NDArray[np.int8]
-    surprise: float
+    surprise: float  # Minus twice the logarithm of their likelihood
 
 
 class Smoothed(NamedTuple):
@@ -74,40 +63,22 @@ class Smoothed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MovementProblem:
-    """Odometry and measured poses on common nodes, whatever odometry errs at random.
+    """Odometry and measured poses on common nodes, whatever odometry errs at random."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        The nodes.
-    controls : (N, 4) float64
-        Odometry's movement to each node: way forward, way to the left (m) and turn (rad), each
-        summed up in the robot's turning frame; and the turn again where it is a distinct one, else
-        0.
-    unseen : (N, 2) float64
-        Way (m) and turn (rad) that it may have made besides, where odometry pauses.
-    nodes : (M,) int64
-        At which node each measurement was made, ascending.
-    measured, covariances : (M, 3), (M, 3, 3) float64
-        The measured poses.
-    streams : tuple of M str
-        Their streams.
-    repaired : dict of str to int
-        Covariances that had to be raised, by stream.
-    repeated : dict of str to int
-        Rows that repeated the row before and were left out, by stream.
-    settings : FuseSettings
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (N,): the nodes
+    # (N, 4): odometry's movement to each node: way forward, way to the left (m) and turn (rad),
+    # each summed up in the robot's turning frame; and the turn again where it is a distinct one,
+    # else 0.
     controls: FloatArray
+    # (N, 2): way (m) and turn (rad) that it may have made besides, where odometry pauses
     unseen: FloatArray
-    nodes: NDArray[np.int64]
+    nodes: NDArray[np.int64]  # (M,): at which node each measurement was made, ascending
+    # `measured`, `covariances`: (M, 3), (M, 3, 3): the measured poses
     measured: FloatArray
     covariances: FloatArray
-    streams: tuple[str, ...]
-    repaired: dict[str, int]
-    repeated: dict[str, int]
+    streams: tuple[str, ...]  # Their streams
+    repaired: dict[str, int]  # Covariances that had to be raised, by stream
+    repeated: dict[str, int]  # Rows that repeated the row before and were left out, by stream
     settings: FuseSettings
 
     def shortened(self, count: int) -> MovementProblem:
@@ -123,17 +94,12 @@ class MovementProblem:
 
     def _part(self, begin: int, end: int) -> MovementProblem:
         here = (self.nodes >= begin) & (self.nodes < end)
-        return MovementProblem(
-            self.times_s[begin:end],
-            self.controls[begin:end],
-            self.unseen[begin:end],
-            self.nodes[here] - begin,
-            self.measured[here],
-            self.covariances[here],
-            tuple(self.streams[i] for i in np.flatnonzero(here)),
-            self.repaired,
-            self.repeated,
-            self.settings,
+        return replace(
+            self.with_only(here),
+            times_s=self.times_s[begin:end],
+            controls=self.controls[begin:end],
+            unseen=self.unseen[begin:end],
+            nodes=self.nodes[here] - begin,
         )
 
     def split(self, longest_s: float) -> list[MovementProblem]:
@@ -191,17 +157,9 @@ class MovementProblem:
     ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
         """Smoothed states, their covariances, and what became of the measurements.
 
-        Parameters
-        ----------
-        noise : (4,) array
-            Odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
-        looser_in_gaps : float
-            Factor on the variances they make where nothing is measured.
-
-        Returns
-        -------
-        states, covariances : (N, 6), (N, 6, 6) arrays
-        account : MeasurementAccount
+        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
+        `looser_in_gaps`: factor on the variances they make where nothing is measured. Returns
+        `states`, `covariances` (N, 6), (N, 6, 6).
         """
         variances = self._variances(noise)
         as_sampled = variances.copy()
@@ -316,26 +274,9 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Bring odometry and measured poses to common nodes.
+    """Bring odometry and measured poses with covariances to common nodes.
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        On the measurements' clock.
-    streams : mapping of str to PlanarPoses
-        Measured poses with covariances, by name.
-    settings : FuseSettings
-
-    Returns
-    -------
-    MovementProblem
-        From the first measurement within the odometry's time to the last.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no measurement within the odometry's time, a stream has no covariances, or one
-        of them cannot be repaired.
+    From the first measurement within the odometry's time to the last, on the measurements' clock.
     """
     names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
     odometry = last_of_each_time(odometry)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,18 +11,24 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from redetect.groundtruth.geometry.plane import compose
-from redetect.groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
+from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import (
+    LaserSettings,
+    outline_faces,
+    outline_radius_m,
+    outline_symmetries,
+)
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
-from redetect.groundtruth.lasers.settings import LaserSettings
 from redetect.groundtruth.lasers.tracking_kernels import (
+    BeamCounts,
     OutlineFit,
+    OutlinePose,
     Seen,
     explain_set,
-    fit_outline,
     new_points,
     refine_outline,
 )
+from redetect.groundtruth.trajectories.plane import compose
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -39,36 +44,12 @@ _LARGEST_CHI2 = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """The robot's data for the kernels.
+    """The robot's data for the kernels."""
 
-    Attributes
-    ----------
-    faces : (k, 4) float64
-        Counter-clockwise.
-    middle : (2,) float64
-        Of its bounding box, in its frame.
-    radius_m : float
-        Of its farthest corner from there.
-    symmetries : (s, 3) float64
-        Motions that its outline does not show, or not clearly.
-    """
-
-    faces: FloatArray
-    middle: FloatArray
-    radius_m: float
-    symmetries: FloatArray
-
-
-class Refined(NamedTuple):
-    """Result of `redetect.groundtruth.lasers.tracking_kernels.refine_outline`."""
-
-    pose: FloatArray
-    covariance: FloatArray
-    by_scanner: FloatArray
-    summary: FloatArray
-    weak: FloatArray
-    information: FloatArray
-    gradient: FloatArray
+    faces: FloatArray  # (k, 4): counter-clockwise
+    middle: FloatArray  # (2,): of its bounding box, in its frame
+    radius_m: float  # Of its farthest corner from there
+    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
 
 
 def refine(
@@ -78,20 +59,20 @@ def refine(
     body: Body,
     settings: LaserSettings,
     prior_m: float,
-) -> Refined:
+) -> OutlinePose:
     """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     fit = OutlineFit(
         s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
         _STEPS,
     )  # fmt: skip
-    return Refined(*refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit))
+    return refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit)
 
 
 def explain(
     sets: ScanSets, index: int, tables: ScannerTables, body: Body, pose: FloatArray
-) -> FloatArray:
-    """(6,) beams of a set, as in `redetect.groundtruth.lasers.tracking_kernels.explain_set`."""
+) -> BeamCounts:
+    """How a pose explains the beams of a set."""
     return explain_set(
         sets.ranges_mm, sets.rows[index], tables.as_beams(), body.faces, body.middle,
         body.radius_m, pose, AGREES_M,
@@ -108,23 +89,17 @@ def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_
 def acquire(
     sets: ScanSets, index: int, tables: ScannerTables, body: Body, settings: LaserSettings
 ) -> FloatArray | None:
-    """Find the robot in one set of scans.
+    """Find the robot in one set of scans: x, y (m), theta (rad), or None.
 
     New readings that are close to each other are heaps; at each heap the ICP is begun from every
     heading. A pose counts only if the beams that should see the robot see it: neither background
     through it nor much that hides it. Where the two best poses differ by more than one of the
-    outline's symmetries and explain the scans about as well, none is returned.
-
-    Returns
-    -------
-    (3,) float64 or None
-        x, y (m), theta (rad); with a symmetric outline one of the equivalent poses.
+    outline's symmetries and explain the scans about as well, none is returned; with a symmetric
+    outline it is one of the equivalent poses.
     """
-    seen = Seen(
-        *new_points(
-            sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
-            np.zeros(5), sets.ages_s[index],
-        )
+    seen = new_points(
+        sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
+        np.zeros(5), sets.ages_s[index],
     )  # fmt: skip
     if len(seen.points) < settings.acquire_readings:
         return None
@@ -185,25 +160,22 @@ def _search(
         c, s = math.cos(theta), math.sin(theta)
         x, y = body.middle
         start = np.array([place[0] - c * x + s * y, place[1] - s * x - c * y, theta])
-        pose, _, count, _ = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
-        pose, _, count, _ = fit_outline(
+        pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
+        pose, _, count = fit_outline(
             seen.points, body.faces, pose, settings.gate_m, settings.kept, 1e-4, settings.most_steps
         )
         if count < settings.acquire_readings or any(_close(pose, other) for other in tried):
             continue
         tried.append(pose)
         refined = refine(seen, pose, tables, body, settings, 0.1)
-        pose, summary = refined.pose, refined.summary
-        used = summary[0]
-        if used < settings.acquire_readings or summary[2] > 0.0:
+        if refined.used < settings.acquire_readings or refined.open_directions:
             continue
-        if summary[1] > _LARGEST_CHI2 * (used - 3.0):
+        if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
-        beams = explain(sets, index, tables, body, pose)
-        _, agree, through, hidden, _, beside = beams
+        _, agree, through, hidden, _, beside = explain(sets, index, tables, body, refined.pose)
         if agree < settings.least_agreement * (agree + through + hidden + beside):
             continue
-        found.append((agree - 2.0 * (through + beside) - hidden, pose))
+        found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 
 

@@ -8,22 +8,34 @@ nothing moves; and the whole, then each scanner, to the building map.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.plane import apply, between, compose, invert
-from redetect.groundtruth.lasers.icp import IcpSettings, icp_to_segments
-from redetect.groundtruth.lasers.icp_kernels import rigid_fit
-from redetect.groundtruth.lasers.icp_scan_kernels import align_scans, explained, scan_normals
+from redetect.groundtruth.lasers.icp import (
+    IcpSettings,
+    Scan,
+    align_scans,
+    explained,
+    icp_to_segments,
+    rigid_fit,
+    scan_normals,
+)
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
+from redetect.groundtruth.lasers.tracking_kernels import (
+    OutlineFit,
+    OutlinePose,
+    Seen,
+    refine_outline,
+)
+from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
-from redetect.storage.bounds import ABOVE_0, LIMIT_OR_0, SHARE_ABOVE_0, demand, from_to
+from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 
@@ -38,22 +50,15 @@ _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
 _FLOOR_M = 0.001
 _WEAK_M = 0.02
 _LONE_STEPS = 30
+# Pairs are begun from the measured headings turned by these.
+_TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
+# A scanner whose place on the map is farther from that among the other scanners is named.
+_INCONSISTENT_M = 0.05
 
 
 @dataclass(frozen=True)
 class AlignmentSettings:
     """Settings of the scanners' alignment.
-
-    Parameters
-    ----------
-    gate_m : float
-        Farthest that a reading may lie from what it is matched with at first (m).
-    kept : float
-        Share of the matches that counts: the best.
-    turns_deg : tuple of float
-        Pairs are begun from the measured headings turned by these (deg).
-    inconsistent_m : float
-        A scanner whose place on the map is farther from that among the other scanners is named (m).
 
     Raises
     ------
@@ -61,79 +66,37 @@ class AlignmentSettings:
         If a number is out of range.
     """
 
-    gate_m: float = 0.5
-    kept: float = 0.95
-    turns_deg: tuple[float, ...] = (0.0, -2.0, 2.0, -4.0, 4.0)
-    inconsistent_m: float = 0.05
+    gate_m: float = 0.5  # Farthest that a reading may lie from what it is matched with at first (m)
+    kept: float = 0.95  # Share of the matches that counts: the best
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            GroundTruthError,
-            gate_m=ABOVE_0,
-            kept=SHARE_ABOVE_0,
-            turns_deg=from_to(-360.0, 360.0),
-            inconsistent_m=LIMIT_OR_0,
-        )
-        if not self.turns_deg:
-            raise GroundTruthError("turns_deg is empty: expected one or more")
+        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
 
 
 @dataclass(frozen=True, eq=False)
 class StillScan:
-    """Points of a scanner in the empty area, averaged over its scans.
+    """Points of a scanner in the empty area, averaged over its scans."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        In the scanner's frame, in the order of the beams (m).
-    range_m : (n,) float64
-    direction : (n, 2) float64
-        Of the beams.
-    sigma_m : float
-        Of the averaged readings.
-    normals : (n, 2) float64
-    good : (n,) bool
-        Which normals are good.
-    """
-
-    points: FloatArray
-    range_m: FloatArray
-    direction: FloatArray
-    sigma_m: float
-    normals: FloatArray
-    good: NDArray[np.bool_]
+    points: FloatArray  # (n, 2): in the scanner's frame, in the order of the beams (m)
+    range_m: FloatArray  # (n,)
+    direction: FloatArray  # (n, 2): of the beams
+    sigma_m: float  # Of the averaged readings
+    normals: FloatArray  # (n, 2): of lines through the points; zeros where there is none.
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where the scanners were found.
+    """Where the scanners were found."""
 
-    Attributes
-    ----------
-    scanners : tuple of Scanner
-        With poses on the map and their covariances.
-    steps : dict of str to (scanners, 3) float64
-        Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
-    pairs : dict of (int, int) to float
-        Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1.
-    matched : (scanners,) int64
-        Number of beams that hit the map.
-    rms_m : (scanners,) float64
-        Their root mean square distance from it.
-    undetermined : tuple of str
-        Scanners whose view of the map leaves a direction open.
-    inconsistent : tuple of str
-        Scanners whose place on the map is not that among the others.
-    """
-
-    scanners: tuple[Scanner, ...]
+    scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
+    # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
     steps: dict[str, FloatArray]
+    # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
     pairs: dict[tuple[int, int], float]
-    matched: NDArray[np.int64]
-    rms_m: FloatArray
-    undetermined: tuple[str, ...]
-    inconsistent: tuple[str, ...]
+    matched: NDArray[np.int64]  # (scanners,): number of beams that hit the map
+    rms_m: FloatArray  # (scanners,): their root mean square distance from it
+    undetermined: tuple[str, ...]  # Scanners whose view of the map leaves a direction open
+    inconsistent: tuple[str, ...]  # Scanners whose place on the map is not that among the others
 
 
 def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
@@ -141,11 +104,6 @@ def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
 
     Beams without a reading in half of the scans, and those along an edge, which see near and far
     in turn, are left out; a beam's readings far off its median, which passed by, too.
-
-    Raises
-    ------
-    GroundTruthError
-        If fewer than ten beams see something.
     """
     metres = empty.ranges_mm * 1e-3
     hit = scanner.has_return(empty.ranges_mm)
@@ -166,9 +124,9 @@ def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
     angle = scanner.angles_rad[usable]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     points = np.ascontiguousarray(mean[:, None] * direction)
-    normals, good = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
+    normals = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
     sigma = max(scanner.sigma_m, 0.003) / math.sqrt(float(np.median(count[usable])))
-    return StillScan(points, mean, direction, sigma, normals, good)
+    return StillScan(points, mean, direction, sigma, normals)
 
 
 def align_scanners(
@@ -187,11 +145,6 @@ def align_scanners(
         Scans of the empty area, as many.
     building : (k, 4) float64
         The map's walls x1, y1, x2, y2 (m).
-    settings : AlignmentSettings, optional
-
-    Returns
-    -------
-    Alignment
 
     Raises
     ------
@@ -214,23 +167,19 @@ def align_scanners(
     steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
     found, matched, rms, weak = [], [], [], []
     for scanner, scan, start in zip(scanners, scans, steps["map as a whole"]):
-        pose, covariance, summary = _to_map(scanner.name, scan, start, building, s)
+        pose, covariance, fit = _to_map(scanner.name, scan, start, building, s)
         found.append(replace(scanner, pose=pose, covariance=covariance))
-        matched.append(int(summary[0]))
-        rms.append(float(summary[3]))
-        if summary[2] > 0.0:
+        matched.append(fit.used)
+        rms.append(fit.rms_m)
+        if fit.open_directions:
             weak.append(scanner.name)
     steps["each to the map"] = np.stack([scanner.pose for scanner in found])
     moved = steps["each to the map"] - steps["map as a whole"]
-    far = np.hypot(moved[:, 0], moved[:, 1]) > s.inconsistent_m
+    far = np.hypot(moved[:, 0], moved[:, 1]) > _INCONSISTENT_M
     names = tuple(scanner.name for scanner, is_far in zip(found, far) if is_far)
     return Alignment(
         tuple(found), steps, shares, np.array(matched), np.array(rms), tuple(weak), names
     )
-
-
-def _gates(first_m: float, last_m: float, count: int) -> FloatArray:
-    return np.asarray(np.geomspace(first_m, last_m, count))
 
 
 def _pairs(
@@ -239,20 +188,18 @@ def _pairs(
     """ICP of every pair, from the measured poses: shares explained, and poses j in i."""
     shares: dict[tuple[int, int], float] = {}
     relative: dict[tuple[int, int], FloatArray] = {}
-    gates = _gates(max(2.0 * s.gate_m, 0.1), 0.1, 12)
-    for i in range(len(scans)):
-        for j in range(i + 1, len(scans)):
-            best = (-1.0, between(measured[i], measured[j]))
-            for turn in s.turns_deg:
-                start = between(measured[i], measured[j]) + np.array([0.0, 0.0, math.radians(turn)])
-                pose, _, _ = align_scans(
-                    scans[j].points, scans[i].points, scans[i].normals, scans[i].good, start,
-                    gates, s.kept, 1e-6,
-                )  # fmt: skip
-                if np.isfinite(pose).all():
-                    share = explained(scans[j].points, scans[i].points, pose, _JUDGED_M)
-                    best = max(best, (share, pose), key=lambda entry: entry[0])
-            shares[i, j], relative[i, j] = max(best[0], 0.0), best[1]
+    gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
+    for i, j in combinations(range(len(scans)), 2):
+        apart = between(measured[i], measured[j])
+        target, points = Scan(scans[i].points, scans[i].normals), scans[j].points
+        best = (0.0, apart)
+        for turn in np.radians(_TURNS_DEG):
+            start = apart + np.array([0.0, 0.0, turn])
+            pose = align_scans(points, target, start, gates, s.kept, 1e-6)
+            if np.isfinite(pose).all():
+                share = explained(points, target, pose, _JUDGED_M)
+                best = max(best, (share, pose), key=lambda entry: entry[0])
+        shares[i, j], relative[i, j] = best
     return shares, relative
 
 
@@ -278,24 +225,18 @@ def _chained(
     return poses
 
 
-def _merge(
-    scans: list[StillScan], poses: FloatArray, members: list[int]
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Points, normals and which of these are good, of several scans in one frame."""
-    turned = [apply(np.array([0.0, 0.0, poses[k][2]]), scans[k].normals) for k in members]
-    return (
+def _merge(scans: list[StillScan], poses: FloatArray, members: Iterable[int]) -> Scan:
+    """Several scans in one frame."""
+    return Scan(
         np.concatenate([apply(poses[k], scans[k].points) for k in members]),
-        np.concatenate(turned),
-        np.concatenate([scans[k].good for k in members]),
+        np.concatenate([apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]),
     )
 
 
 def _align_one(
-    scans: list[StillScan], poses: FloatArray, k: int, members: list[int], gates: FloatArray,
-    s: AlignmentSettings,
-) -> FloatArray:  # fmt: skip
-    points, normals, good = _merge(scans, poses, members)
-    pose, _, _ = align_scans(scans[k].points, points, normals, good, poses[k], gates, s.kept, 1e-7)
+    scans: list[StillScan], poses: FloatArray, k: int, target: Scan, gates: FloatArray, kept: float
+) -> FloatArray:
+    pose = align_scans(scans[k].points, target, poses[k], gates, kept, 1e-7)
     return pose if np.isfinite(pose).all() else poses[k]
 
 
@@ -306,10 +247,11 @@ def _merged(
     """One scan after the other, best overlapping first, aligned with those merged already."""
     poses = poses.copy()
     members = [0]
+    gates = np.geomspace(s.gate_m, 0.08, 8)
     while len(members) < len(scans):
         outside = [k for k in range(len(scans)) if k not in members]
         k = max(outside, key=lambda k: max(shares[min(k, m), max(k, m)] for m in members))
-        poses[k] = _align_one(scans, poses, k, members, _gates(s.gate_m, 0.08, 8), s)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, members), gates, s.kept)
         members.append(k)
     return poses
 
@@ -317,9 +259,10 @@ def _merged(
 def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
     """Each scanner but the first aligned again with the merged scans of all others."""
     poses = poses.copy()
+    gates = np.geomspace(0.15, 0.06, 4)
     for k in range(1, len(scans)):
         others = [m for m in range(len(scans)) if m != k]
-        poses[k] = _align_one(scans, poses, k, others, _gates(0.15, 0.06, 4), s)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, others), gates, s.kept)
     return poses
 
 
@@ -342,7 +285,7 @@ def _whole_to_map(
         body = rigid_fit(poses[:, :2].copy(), measured[:, :2].copy(), np.ones(len(poses), bool))
     else:
         body = compose(measured[0], invert(poses[0]))
-    everything, _, _ = _merge(scans, poses, list(range(len(scans))))
+    everything = _merge(scans, poses, range(len(scans))).points
     for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
         body = icp_to_segments(everything, building, body, IcpSettings(gate, s.kept, 1e-5)).pose
     return compose(np.broadcast_to(body, poses.shape), poses)
@@ -350,8 +293,8 @@ def _whole_to_map(
 
 def _to_map(
     name: str, scan: StillScan, start: FloatArray, building: FloatArray, s: AlignmentSettings
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pose of one scanner on the map, its covariance, and the fit's summary.
+) -> tuple[FloatArray, FloatArray, OutlinePose]:
+    """Pose of one scanner on the map, its covariance, and the fit.
 
     The kernel moves faces to points: here the map to the scanner's frame. Walls are seen from both
     sides. Readings of objects in front of a wall are far from the wall that the beam would hit, and
@@ -365,20 +308,20 @@ def _to_map(
         # Last, the residuals themselves say how large the errors are.
         floor = narrow if narrow > 0.0 else floor
         fit = OutlineFit(floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M, 1.0, _LONE_STEPS)
-        result = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
-        pose, covariance, summary = result[0], result[1], result[3]
-        if summary[0] < 10:
+        found = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
+        pose = found.pose
+        if found.used < 10:
             raise GeometryError(
-                f"scanner {name}: {summary[0]:.0f} readings lie on the map: expected 10 or more"
+                f"scanner {name}: {found.used} readings lie on the map: expected 10 or more"
             )
         if narrow == _FLOOR_M:
-            ratio = summary[1] / (summary[0] - 3.0)
+            ratio = found.chi2 / (found.used - 3.0)
             floor = max(_FLOOR_M * math.sqrt(max(ratio, 1.0)), _FLOOR_M)
-    ratio = max(summary[1] / (summary[0] - 3.0), 0.1)
+    ratio = max(found.chi2 / (found.used - 3.0), 0.1)
     world = invert(pose)
     # The inverse's covariance: x' = -R' t and theta' = -theta.
     c, sn = math.cos(world[2]), math.sin(world[2])
     jacobian = np.array([[-c, sn, world[1]], [-sn, -c, -world[0]], [0.0, 0.0, -1.0]])
-    covariance = ratio * jacobian @ covariance @ jacobian.T
+    covariance = ratio * jacobian @ found.covariance @ jacobian.T
     world[2] = wrap_angle(world[2])
-    return world, 0.5 * (covariance + covariance.T), summary
+    return world, 0.5 * (covariance + covariance.T), found

@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,10 @@ from ezdxf.enums import InsertUnits
 from ezdxf.filemanagement import readfile
 from numpy.typing import NDArray
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.storage import write_whole
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories.streams import read_rows_of_numbers
 from redetect.storage.bounded import read_bounded
-from redetect.storage.messages import excerpt, one_line
+from redetect.storage.messages import one_line
 
 FloatArray = NDArray[np.float64]
 
@@ -29,63 +28,22 @@ FloatArray = NDArray[np.float64]
 CURVE_TOLERANCE_M = 0.002
 MOST_SEGMENTS = 1_000_000
 
-_HEAD = "x1_m,y1_m,x2_m,y2_m"
+HEAD = "x1_m,y1_m,x2_m,y2_m"
 _LARGEST_FILE_BYTES = 1 << 28
 _FARTHEST_M = 1e6
 _SHORTEST_M = 1e-6
 _DEEPEST = 32
 
 
-@dataclass(frozen=True, eq=False)
-class Building:
-    """The walls of a building as a scanner's plane cuts them.
-
-    Attributes
-    ----------
-    segments : (S, 4) float64
-        x1, y1, x2, y2 of straight pieces in the world (m).
-
-    Raises
-    ------
-    GroundTruthError
-        If the shape is another, there is no piece, or an end is not within a million metres.
-    """
-
-    segments: FloatArray
-
-    def __post_init__(self) -> None:
-        if self.segments.ndim != 2 or self.segments.shape[1:] != (4,) or not len(self.segments):
-            raise GroundTruthError(
-                f"walls of shape {self.segments.shape}: expected one or more of x1, y1, x2, y2"
-            )
-        # NaN fails this comparison too.
-        if not np.all(np.abs(self.segments) < _FARTHEST_M):
-            raise GroundTruthError(f"a wall ends {_FARTHEST_M:.0e} m or farther away")
-
-    def __len__(self) -> int:
-        return len(self.segments)
-
-
 def find_building(folder: str | os.PathLike[str]) -> Path:
-    """The building map of a session: ``building.csv`` or else ``building.dxf``.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is neither.
-    """
+    """The building map of a session: ``building.csv`` or else ``building.dxf``."""
     for name in ("building.csv", "building.dxf"):
         if (path := Path(folder) / name).is_file():
             return path
     raise GroundTruthError(f"{Path(folder)}: neither building.csv nor building.dxf in it")
 
 
-def read_building(
-    path: str | os.PathLike[str],
-    *,
-    layers: Sequence[str] | None = None,
-    unit_m: float | None = None,
-) -> Building:
+def read_building(path: str | os.PathLike[str]) -> FloatArray:
     """Read a building map.
 
     Parameters
@@ -94,118 +52,59 @@ def read_building(
         ``.dxf``: lines, polylines and curves of its model space, those in blocks included; height
         is left out. Other entities (texts, dimensions, hatches, ...) are no walls. Anything else
         is read as rows of four numbers.
-    layers : sequence of str, optional
-        The drawing's layers that hold walls, upper and lower case alike; by default all.
-    unit_m : float, optional
-        Metres per unit of the drawing; by default what the drawing says, or 1 if it says nothing.
 
     Returns
     -------
-    Building
+    (S, 4) float64
+        x1, y1, x2, y2 of straight pieces of wall in the world (m), as a scanner's plane cuts them.
 
     Raises
     ------
     GroundTruthError
-        If the file cannot be read, has no walls, or more than `MOST_SEGMENTS` pieces.
+        If the file cannot be read, has no walls, more than `MOST_SEGMENTS` pieces, or one that ends
+        a million metres away.
     """
-    try:
-        content = read_bounded(path, _LARGEST_FILE_BYTES)
-        if Path(path).suffix.lower() == ".dxf":
-            segments = _read_drawing(path, layers, unit_m)
-        else:
-            segments = _read_rows(path, content)
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror or error}") from None
-    try:
-        return Building(segments)
-    except GroundTruthError as error:
-        raise GroundTruthError(f"{path}: {error}") from None
+    if Path(path).suffix.lower() == ".dxf":
+        segments = _read_drawing(path)
+    else:
+        segments = read_rows_of_numbers(path, 4, "walls as x1, y1, x2, y2", head=HEAD)
+    if len(segments) > MOST_SEGMENTS:
+        raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
+    # NaN fails this comparison too.
+    if not np.all(np.abs(segments) < _FARTHEST_M):
+        raise GroundTruthError(f"{path}: a wall ends {_FARTHEST_M:.0e} m or farther away")
+    return segments
 
 
-def write_building(
-    path: str | os.PathLike[str], building: Building, *, overwrite: bool = False
-) -> None:
-    """Write a ``building.csv``, whole or not at all; in micrometres."""
-    rows = (",".join(f"{x:.6f}" for x in segment) + "\n" for segment in building.segments)
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((_HEAD + "\n" + "".join(rows)).encode())
-
-
-def write_drawing(
-    path: str | os.PathLike[str], building: Building, *, overwrite: bool = False
-) -> None:
-    """Write walls as LINE entities on the layer WALLS of a drawing in metres (DXF R12)."""
-    lines = ["0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n9\n$INSUNITS\n70\n6\n0\nENDSEC\n"]
-    lines.append("0\nSECTION\n2\nENTITIES\n")
-    for x1, y1, x2, y2 in building.segments:
-        lines.append(
-            f"0\nLINE\n8\nWALLS\n10\n{x1:.6f}\n20\n{y1:.6f}\n30\n0.0\n"
-            f"11\n{x2:.6f}\n21\n{y2:.6f}\n31\n0.0\n"
-        )
-    lines.append("0\nENDSEC\n0\nEOF\n")
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write("".join(lines).encode())
-
-
-def _read_rows(path: str | os.PathLike[str], file: bytes) -> FloatArray:
-    try:
-        text = file.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise StreamError(path, None, "is no text: expected rows of numbers") from None
-    rows: list[list[float]] = []
-    for number, line in enumerate(text.split("\n"), 1):
-        content = line.partition("#")[0].strip()
-        if not content or (not rows and content.replace(" ", "") == _HEAD):
-            continue
-        words = content.split(",")
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        # NaN fails this comparison too.
-        if len(row) != 4 or not all(abs(x) < _FARTHEST_M for x in row):
-            raise StreamError(
-                path,
-                number,
-                f"{excerpt(content)}: expected x1, y1, x2, y2 within {_FARTHEST_M:.0e} m",
-            )
-        if len(rows) == MOST_SEGMENTS:
-            raise StreamError(path, number, f"more than {MOST_SEGMENTS} walls")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, 4)
-
-
-def _read_drawing(
-    path: str | os.PathLike[str], layers: Sequence[str] | None, unit_m: float | None
-) -> FloatArray:
-    wanted = None if layers is None else {layer.casefold() for layer in layers}
+def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
     pieces: list[tuple[float, float, float, float]] = []
     try:
+        read_bounded(path, _LARGEST_FILE_BYTES)
         drawing = readfile(os.fspath(path))
-        if unit_m is None:
-            unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
-            unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
-        for curve in _curves(path, drawing.modelspace(), wanted, CURVE_TOLERANCE_M / unit_m):
+        unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
+        unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
+        for curve in _curves(path, drawing.modelspace(), CURVE_TOLERANCE_M / unit_m):
             # Equal neighbours occur where curves meet, and where a line is vertical.
             far = np.hypot(*np.diff(curve, axis=0).T) * unit_m > _SHORTEST_M
             pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
             if len(pieces) > MOST_SEGMENTS:
                 raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
-    except (FileNotFoundError, GroundTruthError):
+    except FileNotFoundError:
+        raise GroundTruthError(f"{path}: no such file") from None
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except GroundTruthError:
         raise
     except Exception as error:  # a damaged drawing may fail anywhere within the library
         text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
         raise GroundTruthError(f"{path}: is no DXF that can be read: {text}") from None
     if not pieces:
-        where = "" if layers is None else f" on the layers {', '.join(layers)}"
-        raise GroundTruthError(f"{path}: no lines or curves{where}: expected walls")
+        raise GroundTruthError(f"{path}: no lines or curves: expected walls")
     return unit_m * np.array(pieces, dtype=np.float64)
 
 
 def _curves(
-    path: str | os.PathLike[str], space: Iterable[Any], wanted: set[str] | None, tolerance: float
+    path: str | os.PathLike[str], space: Iterable[Any], tolerance: float
 ) -> Iterator[list[tuple[float, float]]]:
     """Lines and curves of a drawing as chains of points, in its units."""
     # Not ezdxf's own decomposition: it makes lines of dimensions and leaders, too.
@@ -226,8 +125,6 @@ def _curves(
                 raise GroundTruthError(f"{path}: blocks nested more than {_DEEPEST} deep")
             copies = iter((entity,)) if entity.mcount == 1 else entity.multi_insert()
             waiting.append((depth + 1, (e for copy in copies for e in copy.virtual_entities())))
-        elif wanted is not None and entity.dxf.layer.casefold() not in wanted:
-            continue
         elif kind in ("LWPOLYLINE", "POLYLINE"):
             waiting.append((depth, iter(entity.virtual_entities())))  # its lines and arcs
         elif kind == "LINE":

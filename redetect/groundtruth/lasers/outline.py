@@ -1,30 +1,76 @@
-"""The robot's outline: faces with outward normals, and the motions that map it onto itself."""
+"""The robot's outline and how it is followed: settings, faces, and its symmetries."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.icp_kernels import moved, nearest_on_segments, rigid_fit
+from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
+from redetect.groundtruth.trajectories.plane import invert
+from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class LaserSettings:
+    """Settings of laser tracking.
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is out of range.
+    """
+
+    gate_m: float = 0.2  # Farthest that a reading may lie from the robot's outline (m)
+    kept: float = 0.95  # Share of the readings within the gate that the ICP counts: the best
+
+    # The ICP ends when its root mean square error changes by less, or after as many steps.
+    threshold_m: ClassVar[float] = 1e-5
+    most_steps: ClassVar[int] = 60
+    # Standard deviation of a reading's distance from the outline that does not depend on the
+    # scanner's noise: the outline is drawn to millimetres.
+    floor_m: ClassVar[float] = 0.001
+    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
+    # their distances from the face are small whatever the pose.
+    least_slope: ClassVar[float] = 0.35
+    # The final pose uses readings up to this many standard deviations off.
+    gate_sigma: ClassVar[float] = 3.5
+    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
+    # by what it does to the farthest corner).
+    weak_sigma_m: ClassVar[float] = 0.03
+    # Readings that a pose needs, and that a robot needs which is found again.
+    least_readings: ClassVar[int] = 8
+    acquire_readings: ClassVar[int] = 16
+    # The robot is lost after so long without a pose; then it is searched this often.
+    coast_s: ClassVar[float] = 0.25
+    acquire_s: ClassVar[float] = 0.05
+    # Headings that the search begins from.
+    headings: ClassVar[int] = 24
+    # New readings nearer to each other than this may be of one object.
+    link_m: ClassVar[float] = 0.3
+    # Share of the beams that should see the robot, or see something beside it, that must agree.
+    least_agreement: ClassVar[float] = 0.75
+    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
+    symmetry_m: ClassVar[float] = 0.12
+    # The readings identify the front if the residuals differ by this many standard errors; else it
+    # is known after the robot has driven this much farther forward than backward.
+    front_sigma: ClassVar[float] = 5.0
+    forward_m: ClassVar[float] = 0.3
+
+    def __post_init__(self) -> None:
+        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
+
+
 def outline_faces(outline: ArrayLike) -> FloatArray:
-    """Faces of a closed outline, counter-clockwise: their outward normal is to the right.
+    """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    Parameters
-    ----------
-    outline : (k, 2) array
-        Corners in order, either way round (m).
-
-    Returns
-    -------
-    (k, 4) float64
-        x1, y1, x2, y2.
+    Of corners (k, 2) in order, either way round (m).
 
     Raises
     ------
@@ -61,22 +107,11 @@ def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
 
 
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
-    """Motions other than none that map the outline onto itself.
+    """Motions (s, 3) other than none that map the outline onto itself, by rising theta from -pi on.
 
-    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`.
-
-    Parameters
-    ----------
-    faces : (k, 4) array
-        From `outline_faces`.
-    tolerance_m : float
-        Largest distance that a point of the turned outline may have from the outline (m).
-
-    Returns
-    -------
-    (s, 3) float64
-        x, y (m), theta (rad), by rising theta from -pi on; s is 0 for an outline that shows where
-        the front is, 1 for a box, 3 for a square.
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
+    0 for an outline that shows where the front is, 1 for a box, 3 for a square. No point of the
+    turned outline is farther from the outline than the tolerance.
     """
     along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
     points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)
@@ -97,7 +132,10 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
     for i, error in enumerate(errors):
         if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
             continue
-        pose = _settled(points, faces, poses[i])
+        # Where an ICP of the whole outline to itself ends.
+        pose, _, _ = fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)
+        pose = invert(pose)
+        pose[2] = _turn(pose[2])
         far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
         if far and _farthest_m(points, faces, pose) <= tolerance_m:
             found.append(pose)
@@ -107,17 +145,6 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
 def _farthest_m(points: FloatArray, faces: FloatArray, pose: FloatArray) -> float:
     _, _, squared = nearest_on_segments(moved(points, pose), faces)
     return math.sqrt(float(squared.max()))
-
-
-def _settled(points: FloatArray, faces: FloatArray, start: FloatArray) -> FloatArray:
-    """Where an ICP of the whole outline to itself ends."""
-    everything = np.ones(len(points), dtype=np.bool_)
-    pose = start
-    for _ in range(200):
-        near, _, _ = nearest_on_segments(moved(points, pose), faces)
-        pose = rigid_fit(points, near, everything)
-    pose[2] = _turn(pose[2])
-    return pose
 
 
 def _turn(angle: float) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import read_json, write_json
+from redetect.groundtruth.files import covariance_of, numbers, read_json, write_json
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -32,37 +32,24 @@ _MILLIMETRE = 1e-3
 class Scanner:
     """A laser scanner.
 
-    Attributes
-    ----------
-    name : str
-        Its scans are in ``<name>.scans.npz``.
-    pose : (3,) float64
-        x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame.
-    covariance : (3, 3) float64
-        Of the pose, (x, y, theta) in the same frame; zeros where it is known exactly.
-    first_angle_rad, angle_step_rad : float
-        Beam i points to first_angle + i step in the scanner's frame; the step is above 0.
-    readings : int
-        Beams per scan.
-    max_range_m : float
-        A reading as long as this or longer is none.
-    sigma_m : float
-        Standard deviation of a reading (m).
-
     Raises
     ------
     GroundTruthError
         If a shape or value is impossible.
     """
 
-    name: str
+    name: str  # Its scans are in ``<name>.scans.npz``
+    # (3,): x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame
     pose: FloatArray
+    # (3, 3): of the pose, (x, y, theta) in the same frame; zeros where it is known exactly.
     covariance: FloatArray
+    # `first_angle_rad`, `angle_step_rad`: Beam i points to first_angle + i step in the scanner's
+    # frame; the step is above 0.
     first_angle_rad: float
     angle_step_rad: float
-    readings: int
-    max_range_m: float
-    sigma_m: float
+    readings: int  # Beams per scan
+    max_range_m: float  # A reading as long as this or longer is none
+    sigma_m: float  # Standard deviation of a reading (m)
 
     def __post_init__(self) -> None:
         place = f"scanner {excerpt(self.name)}"
@@ -100,17 +87,10 @@ class Scanner:
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
-        """Points of readings in the scanner's frame.
+        """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
+        millimetres.
 
-        Parameters
-        ----------
-        ranges_mm : (..., readings) array
-            Readings in millimetres.
-
-        Returns
-        -------
-        (..., readings, 2) float64
-            Metres; NaN where nothing was hit.
+        NaN where nothing was hit.
         """
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
         angles = self.angles_rad
@@ -119,22 +99,14 @@ class Scanner:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot as laser tracking needs it.
+    """A robot as laser tracking needs it."""
 
-    Attributes
-    ----------
-    outline : (K, 2) float64
-        Corners of the closed polygon that the scanners see, in the robot's frame (m).
-    largest_speed_m_s, largest_turn_rad_s : float
-        It moves no faster.
-    scanners : tuple of Scanner
-        Those on board, with their poses in the robot's frame.
-    """
-
+    # (K, 2): corners of the closed polygon that the scanners see, in the robot's frame (m)
     outline: FloatArray
+    # `largest_speed_m_s`, `largest_turn_rad_s`: It moves no faster
     largest_speed_m_s: float
     largest_turn_rad_s: float
-    scanners: tuple[Scanner, ...] = ()
+    scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
     def __post_init__(self) -> None:
         if self.outline.ndim != 2 or self.outline.shape[1:] != (2,) or len(self.outline) < 3:
@@ -167,7 +139,7 @@ def write_scanners(
     overwrite: bool = False,
 ) -> None:
     """Write a ``scanners.json`` with covariances, and other entries, whole or not at all."""
-    content = {"version": 1, "scanners": [_scanner_entry(s) for s in scanners], **(extra or {})}
+    content = {"version": 1, "scanners": [scanner_entry(s) for s in scanners], **(extra or {})}
     write_json(path, content, overwrite=overwrite)
 
 
@@ -182,8 +154,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
     content = read_json(path)
     limits = []
     for key in ("largest_speed_m_s", "largest_turn_rad_s"):
-        limits.append(_number(f"{path}: {key}", content.get(key)))
-    outline = _numbers(f"{path}: outline", content.get("outline"), None, 2)
+        limits.append(float(numbers(f"{path}: {key}", content.get(key))))
+    outline = numbers(f"{path}: outline", content.get("outline"), None, 2).reshape(-1, 2)
     scanners = _scanners(path, content) if "scanners" in content else ()
     try:
         return Robot(outline, limits[0], limits[1], scanners)
@@ -191,26 +163,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
         raise GroundTruthError(f"{path}: {error}") from None
 
 
-def write_robot(
-    path: str | os.PathLike[str],
-    robot: Robot,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Write a ``robot.json``, and other entries, whole or not at all."""
-    content = {
-        "version": 1,
-        "outline": robot.outline.tolist(),
-        "largest_speed_m_s": robot.largest_speed_m_s,
-        "largest_turn_rad_s": robot.largest_turn_rad_s,
-        "scanners": [_scanner_entry(s) for s in robot.scanners],
-        **(extra or {}),
-    }
-    write_json(path, content, overwrite=overwrite)
-
-
-def _scanner_entry(scanner: Scanner) -> dict[str, Any]:
+def scanner_entry(scanner: Scanner) -> dict[str, Any]:
+    """A scanner as files have it."""
     return {
         "name": scanner.name,
         "pose": scanner.pose.tolist(),
@@ -245,16 +199,14 @@ def _scanner(place: str, entry: dict[str, Any]) -> Scanner:
         raise GroundTruthError(f"{place}: name is {excerpt(name)}: expected a text")
     if not isinstance(readings, int) or isinstance(readings, bool):
         raise GroundTruthError(f"{place}: readings is {excerpt(readings)}: expected a whole number")
-    pose = _numbers(f"{place}: pose", [entry.get("pose")], 1, 3)[0]
-    numbers = [
-        _number(f"{place}: {key}", entry.get(key))
+    pose = numbers(f"{place}: pose", entry.get("pose"), 3)
+    first, step, most, sigma = (
+        float(numbers(f"{place}: {key}", entry.get(key)))
         for key in ("first_angle_rad", "angle_step_rad", "max_range_m", "sigma_m")
-    ]
+    )
     try:
-        return Scanner(
-            name, pose, _pose_covariance(place, entry), numbers[0], numbers[1], readings,
-            numbers[2], numbers[3],
-        )  # fmt: skip
+        covariance = _pose_covariance(place, entry)
+        return Scanner(name, pose, covariance, first, step, readings, most, sigma)
     except GroundTruthError as error:
         raise GroundTruthError(f"{place}: {error}") from None
 
@@ -264,34 +216,10 @@ def _pose_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
     if "covariance" in entry and "pose_sigma" in entry:
         raise GroundTruthError(f"{place}: has covariance and pose_sigma: expected one of them")
     if "pose_sigma" in entry:
-        sigma = _numbers(f"{place}: pose_sigma", [entry["pose_sigma"]], 1, 3)[0]
+        sigma = numbers(f"{place}: pose_sigma", entry["pose_sigma"], 3)
         if np.any(sigma < 0.0):
             raise GroundTruthError(f"{place}: pose_sigma: expected 0 or more")
         return np.diag(sigma**2)
     if "covariance" not in entry:
         return np.zeros((3, 3))
-    matrix = _numbers(f"{place}: covariance", entry["covariance"], 3, 3)
-    largest = float(np.abs(matrix).max())
-    if np.abs(matrix - matrix.T).max() > 1e-9 * largest:
-        raise GroundTruthError(f"{place}: covariance: expected a symmetric matrix")
-    if np.linalg.eigvalsh(matrix)[0] < -1e-9 * largest:
-        raise GroundTruthError(f"{place}: covariance: has a negative eigenvalue")
-    return matrix
-
-
-def _number(place: str, value: Any) -> float:
-    return float(_numbers(place, [[value]], 1, 1)[0, 0])
-
-
-def _numbers(place: str, value: Any, rows: int | None, columns: int) -> FloatArray:
-    """A list of lists as an array; raises an error that shows the value if it is none."""
-    expected = f"{'rows' if rows is None else rows} x {columns} finite numbers"
-    good = isinstance(value, list) and (rows is None or len(value) == rows)
-    for row in value if good else ():
-        good = good and isinstance(row, list) and len(row) == columns
-        for number in row if good else ():
-            good = good and isinstance(number, int | float) and not isinstance(number, bool)
-            good = good and abs(number) < 1e12  # NaN fails this
-    if not good:
-        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {expected}")
-    return np.array(value, dtype=np.float64).reshape(-1, columns)
+    return covariance_of(f"{place}: covariance", entry["covariance"], 3)

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.lasers.scanners import MOST_READINGS
-from redetect.storage import write_whole
 from redetect.storage.bounded import read_plain_array
 from redetect.storage.messages import excerpt, one_line
 
@@ -43,21 +42,16 @@ _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 class Scans:
     """Scans of one scanner over time.
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In some
-        real logs they step back.
-    ranges_mm : (N, readings) uint16
-        Readings in millimetres, 0 where nothing came back.
-
     Raises
     ------
     GroundTruthError
         If shapes or types disagree or a time is not finite.
     """
 
+    # (N,): seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In
+    # some real logs they step back.
     times_s: FloatArray
+    # (N, readings): readings in millimetres, 0 where nothing came back
     ranges_mm: NDArray[np.uint16]
 
     def __post_init__(self) -> None:
@@ -142,12 +136,6 @@ def read_scans(
             f"before it from {scans.times_s[i]:.6f} s: expected times in order"
         )
     return scans
-
-
-def write_scans(path: str | os.PathLike[str], scans: Scans, *, overwrite: bool = False) -> None:
-    """Write scans as a ``.npz``, whole or not at all; the same scans give the same bytes."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        np.savez_compressed(stream, times_s=scans.times_s, ranges_mm=scans.ranges_mm)
 
 
 def _read_npz(path: str | os.PathLike[str]) -> Scans:

@@ -1,48 +1,82 @@
-"""Scans of several scanners as sets, and the tables by which the kernels work on them."""
+"""Scans of several scanners as sets, the background that they see, and the kernels' tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.background import Background
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, read_robot, read_scanners
+from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.groundtruth.lasers.tracking_kernels import Beams
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+# A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
+# than the nearest object that the beam saw, which is at this quantile of its readings.
+_LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
+
+
+class Background(NamedTuple):
+    """A scanner's static background, beam by beam."""
+
+    # (readings,): a reading below this is something that was not there; infinite where the beam
+    # sees nothing
+    near_m: FloatArray
+    quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
+
+
+def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
+    """Learn the background of the beams from scans (N, readings) of the empty area.
+
+    Readings are 0, or `max_range_m` and more, where nothing came back. The nearest object of a beam
+    is at a low quantile of its readings: beams along an edge see near and far in turn, and nearer
+    readings than that are treated as passing objects.
+    """
+    if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
+        raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
+    metres = ranges_mm * 1e-3
+    hit = (ranges_mm > 0) & (metres < max_range_m)
+    ordered = np.sort(np.where(hit, metres, np.inf), axis=0)
+    count = hit.sum(axis=0)
+    beams = np.arange(ranges_mm.shape[1])
+
+    def quantile(values: FloatArray, share: float) -> FloatArray:
+        row = np.minimum((share * count).astype(np.int64), np.maximum(count - 1, 0))
+        return np.asarray(values[row, beams])
+
+    median = quantile(ordered, 0.5)
+    # Two readings in a hundred scans say nothing about the background.
+    seen = count >= max(1, round(0.02 * len(ranges_mm)))
+    deviation = np.full_like(metres, np.inf)
+    np.subtract(metres, median, out=deviation, where=hit)
+    deviation = np.sort(np.abs(deviation), axis=0)
+    sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
+    near = np.where(seen, quantile(ordered, _PASSING), 0.0)
+    near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
+    return Background(
+        np.where(seen, np.maximum(near, 0.0), np.inf),
+        1e-3 * float(np.gcd.reduce(ranges_mm, axis=None)),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class ScannerTables:
-    """Fixed scanners as arrays, padded to the longest scan.
-
-    Attributes
-    ----------
-    names : tuple of str
-    poses : (scanners, 3) float64
-        In the world.
-    covariance : (3 scanners, 3 scanners) float64
-        Of the poses, jointly.
-    near_mm : (scanners, readings) float64
-        A reading below this is new; 0 for the padding.
-    beams : (scanners, readings, 2) float64
-        The beams' directions in the world.
-    sigmas_m : (scanners,) float64
-        Standard deviations of readings, rounding included.
-    """
+    """Fixed scanners as arrays, padded to the longest scan."""
 
     names: tuple[str, ...]
-    poses: FloatArray
-    covariance: FloatArray
-    near_mm: FloatArray
-    beams: FloatArray
-    sigmas_m: FloatArray
+    poses: FloatArray  # (scanners, 3): in the world
+    covariance: FloatArray  # (3 scanners, 3 scanners): of the poses, jointly
+    near_mm: FloatArray  # (scanners, readings): A reading below this is new; 0 for the padding.
+    beams: FloatArray  # (scanners, readings, 2): the beams' directions in the world
+    sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
 
     @property
     def origins(self) -> FloatArray:
@@ -56,47 +90,20 @@ class ScannerTables:
 
 @dataclass(frozen=True, eq=False)
 class ScanSets:
-    """Scans that belong together.
+    """Scans that belong together."""
 
-    Attributes
-    ----------
-    times_s : (sets,) float64
-        Mean time of the set's scans.
-    rows : (sets, scanners) int64
-        Row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
-    ages_s : (sets, scanners) float64
-        The set's time minus the scan's.
-    ranges_mm : (scans, readings) uint16
-        All scans of all scanners.
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (sets,): mean time of the set's scans
+    # (sets, scanners): row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
     rows: IntArray
-    ages_s: FloatArray
-    ranges_mm: NDArray[np.uint16]
+    ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
+    ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
 
     def __len__(self) -> int:
         return len(self.times_s)
 
 
-def scanner_tables(
-    scanners: Sequence[Scanner],
-    backgrounds: Sequence[Background],
-    joint_covariance: FloatArray | None = None,
-) -> ScannerTables:
-    """Arrange scanners and their backgrounds for the kernels.
-
-    Parameters
-    ----------
-    scanners, backgrounds : sequences of the same length
-    joint_covariance : (3 scanners, 3 scanners) array, optional
-        Of their poses; by default that of each one by itself.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no scanners, or a background is not of its scanner's size.
-    """
+def scanner_tables(scanners: Sequence[Scanner], backgrounds: Sequence[Background]) -> ScannerTables:
+    """Arrange scanners and their backgrounds for the kernels."""
     if not scanners or len(scanners) != len(backgrounds):
         raise GroundTruthError(
             f"{len(scanners)} scanners, {len(backgrounds)} backgrounds: expected as many, some"
@@ -116,12 +123,6 @@ def scanner_tables(
         angle = scanner.pose[2] + scanner.angles_rad
         beams[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = scanner.covariance
-    if joint_covariance is not None:
-        if joint_covariance.shape != covariance.shape:
-            raise GroundTruthError(
-                f"joint covariance of shape {joint_covariance.shape}: expected {covariance.shape}"
-            )
-        covariance = np.array(joint_covariance, dtype=np.float64)
     return ScannerTables(
         tuple(scanner.name for scanner in scanners),
         np.stack([scanner.pose for scanner in scanners]),
@@ -140,17 +141,7 @@ def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> Scan
     time, or where its first scan is more than the window ago. So each scan is in one set, and
     scanners that run slightly faster than others occasionally have a set of their own.
 
-    Parameters
-    ----------
-    scans : sequence of Scans
-        Per scanner.
-    window_s : float, optional
-        By default the median time between a scanner's scans.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no scans at all.
+    `scans`: per scanner. `window_s`: by default the median time between a scanner's scans.
     """
     total = sum(len(one) for one in scans)
     if total == 0:
@@ -188,3 +179,26 @@ def _group(
         begun = t
         rows.append(current)
     return np.array(rows, dtype=np.int64).reshape(-1, scanners)
+
+
+def load_session(
+    folder: Path, calibration: Path
+) -> tuple[tuple[Scanner, ...], Robot, ScannerTables, ScanSets]:
+    """Read fixed scanners, robot, scans, and learn the background.
+
+    Raises
+    ------
+    GroundTruthError
+        If a file is missing or does not fit the others.
+    """
+    scanners = read_scanners(calibration)
+    robot = read_robot(folder / "robot.json")
+    backgrounds = []
+    for scanner in scanners:
+        path = find_scans(folder / "empty", scanner.name)
+        backgrounds.append(
+            learn_background(read_scans(path, scanner.readings).ranges_mm, scanner.max_range_m)
+        )
+    tables = scanner_tables(scanners, backgrounds)
+    scans = [read_scans(find_scans(folder, s.name), s.readings) for s in scanners]
+    return scanners, robot, tables, sets_of_scans(scans)

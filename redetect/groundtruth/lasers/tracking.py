@@ -8,20 +8,25 @@ that the beams agree. Errors of one set affect the next one's pose only through 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.geometry.plane import compose
-from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import LaserSettings
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
-from redetect.groundtruth.lasers.settings import LaserSettings
-from redetect.groundtruth.lasers.tracking_kernels import Seen, fit_outline, new_points
+from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose, Seen, new_points
+from redetect.groundtruth.trajectories.plane import compose
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
@@ -36,72 +41,59 @@ _FRONT_SAMPLE = 60
 
 @dataclass(frozen=True, eq=False)
 class LaserTrack:
-    """Result for every set of scans.
+    """Result for every set of scans."""
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-    status : (N,) int64
-        Index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
-        direction where it is UNDETERMINED.
-    segment : (N,) int64
-        Number of the acquisition that the set belongs to; -1 where the robot is lost.
-    poses : (N, 3) float64
-        x, y (m), theta (rad); NaN without a pose.
-    covariances : (N, 3, 3) float64
-        Of (x, y, theta), from the readings' noise and the scanners' poses.
-    noise : (N, 3, 3) float64
-        The part from the readings' noise, independent from set to set.
-    motion : (N, 3) float64
-        Velocity (m/s) and turn (rad/s) in the world, from the poses before and after.
-    readings : (N,) int64
-        Readings that the pose rests on.
-    rms_m : (N,) float64
-        Their root mean square distance from the outline.
-    chi2 : (N,) float64
-        Their squared normalised residuals per degree of freedom.
-    beams : (N, 6) float64
-        As in `redetect.groundtruth.lasers.tracking_kernels.explain_set`.
-    weak : (N, 3) float64
-        The least determined direction of (x, y, theta times the outline's radius), where it is
-        UNDETERMINED.
-    reasons : dict of int to str
-        Why a set has no pose, where the robot was expected.
-    corrections : (scanners, 3) float64
-        Corrections of the scanners' given poses that their residuals suggest.
-    correction_sigma : (scanners, 3) float64
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (N,)
+    # (N,): index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
+    # direction where it is UNDETERMINED.
     status: IntArray
+    # (N,): number of the acquisition that the set belongs to; -1 where the robot is lost.
     segment: IntArray
-    poses: FloatArray
+    poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
+    # (N, 3, 3): of (x, y, theta), from the readings' noise and the scanners' poses
     covariances: FloatArray
-    noise: FloatArray
+    noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
+    # (N, 3): velocity (m/s) and turn (rad/s) in the world, from the poses before and after
     motion: FloatArray
-    readings: IntArray
-    rms_m: FloatArray
-    chi2: FloatArray
-    beams: FloatArray
+    readings: IntArray  # (N,): readings that the pose rests on
+    rms_m: FloatArray  # (N,): their root mean square distance from the outline
+    chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
+    beams: FloatArray  # (N, 6): as in `BeamCounts`
+    # (N, 3): the least determined direction of (x, y, theta times the outline's radius), where it
+    # is UNDETERMINED
     weak: FloatArray
-    reasons: dict[int, str]
+    reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
+    # (scanners, 3): corrections of the scanners' given poses that their residuals suggest
     corrections: FloatArray
-    correction_sigma: FloatArray
-    fronts: dict[int, str] = field(default_factory=dict)
+    correction_sigma: FloatArray  # (scanners, 3)
+    fronts: dict[int, str]  # How the front was found, by segment
+
+    @classmethod
+    def empty(cls, times_s: FloatArray, scanners: int) -> LaserTrack:
+        """A track without poses, to be filled."""
+        n = len(times_s)
+        return cls(
+            times_s,
+            status=np.full(n, LOST),
+            segment=np.full(n, -1),
+            poses=np.full((n, 3), np.nan),
+            covariances=np.full((n, 3, 3), np.nan),
+            noise=np.full((n, 3, 3), np.nan),
+            motion=np.zeros((n, 3)),
+            readings=np.zeros(n, dtype=np.int64),
+            rms_m=np.full(n, np.nan),
+            chi2=np.full(n, np.nan),
+            beams=np.zeros((n, 6)),
+            weak=np.zeros((n, 3)),
+            reasons={},
+            corrections=np.full((scanners, 3), np.nan),
+            correction_sigma=np.full((scanners, 3), np.nan),
+            fronts={},
+        )
 
 
 class Tracker:
-    """Follows the robot through sets of scans.
-
-    Parameters
-    ----------
-    sets : ScanSets
-    tables : ScannerTables
-    body : Body
-    largest_speed_m_s, largest_turn_rad_s : float
-        The robot moves no faster.
-    settings : LaserSettings, optional
-    """
+    """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
 
     def __init__(
         self,
@@ -109,27 +101,15 @@ class Tracker:
         tables: ScannerTables,
         body: Body,
         largest_speed_m_s: float,
-        largest_turn_rad_s: float,
-        settings: LaserSettings | None = None,
+        settings: LaserSettings,
     ) -> None:
         self.sets, self.tables, self.body = sets, tables, body
-        self.speed, self.turn = largest_speed_m_s, largest_turn_rad_s
-        self.settings = LaserSettings() if settings is None else settings
-        n, many = len(sets), len(tables.names)
+        self.speed, self.settings = largest_speed_m_s, settings
         self.seen_by = tables.as_beams()
-        self.status = np.full(n, LOST, dtype=np.int64)
-        self.segment = np.full(n, -1, dtype=np.int64)
-        self.poses = np.full((n, 3), np.nan)
-        self.covariances = np.full((n, 3, 3), np.nan)
-        self.noise = np.full((n, 3, 3), np.nan)
-        self.motion = np.zeros((n, 3))
-        self.readings = np.zeros(n, dtype=np.int64)
-        self.rms_m, self.chi2 = np.full(n, np.nan), np.full(n, np.nan)
-        self.beams, self.weak = np.zeros((n, 6)), np.zeros((n, 3))
-        self.reasons: dict[int, str] = {}
-        self.prior_m = np.full(n, 0.02)
-        self.information = np.zeros((many, 3, 3))
-        self.gradient = np.zeros((many, 3))
+        self.track = LaserTrack.empty(sets.times_s, len(tables.names))
+        self.prior_m = np.full(len(sets), 0.02)
+        self.information = np.zeros((len(tables.names), 3, 3))
+        self.gradient = np.zeros((len(tables.names), 3))
 
     def run(self) -> LaserTrack:
         """Track, resolve the front, and work the poses out again with their motion known."""
@@ -153,18 +133,20 @@ class Tracker:
                     continue
                 pose, motion, segment, tracked = fitted, np.zeros(3), segment + 1, True
                 last, before, sure, begun = t, t, t, i
-                self.segment[i] = segment
-                self.status[i] = REACQUIRED if self.status[i] == OK else self.status[i]
+                self.track.segment[i] = segment
+                self.track.status[i] = (
+                    REACQUIRED if self.track.status[i] == OK else self.track.status[i]
+                )
                 continue
             step = t - before
             before = t
             predicted = pose + motion * step
-            self.segment[i] = segment
+            self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - sure)
             fitted = self._fit(i, predicted, motion, t - last)
             if fitted is None:
-                self.status[i], pose = COASTING, predicted
+                self.track.status[i], pose = COASTING, predicted
                 continue
             error = fitted - predicted
             error[2] = wrap_angle(error[2])
@@ -174,7 +156,7 @@ class Tracker:
             if step > 0.0:
                 motion = motion + (_MOTION_GAIN + 0.3 * young) / step * error
             last = t
-            sure = t if self.status[i] == OK else sure
+            sure = t if self.track.status[i] == OK else sure
         return self._finished()
 
     def _fit(
@@ -184,31 +166,33 @@ class Tracker:
         s, body = self.settings, self.body
         seen = self._points(i, predicted, motion, alone_s)
         if len(seen.points) < s.least_readings:
-            self.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
+            self.track.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
             return None
-        start, _, count, _ = fit_outline(
+        start, _, count = fit_outline(
             seen.points, body.faces, predicted, s.gate_m, s.kept, s.threshold_m, s.most_steps
         )
         if count < s.least_readings:
-            self.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
+            self.track.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
             return None
-        pose, summary = self._refine(i, seen, start)
-        used, chi2 = summary[0], summary[1]
+        found = self._refine(i, seen, start)
+        pose, used, chi2 = found.pose, found.used, found.chi2
         if used < s.least_readings:
-            self.reasons[i] = f"{used:.0f} readings on the outline"
+            self.track.reasons[i] = f"{used} readings on the outline"
             return None
         if chi2 > _LARGEST_CHI2 * (used - 3.0):
-            self.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used:.0f} readings"
+            self.track.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used} readings"
             return None
         far = math.hypot(pose[0] - predicted[0], pose[1] - predicted[1])
         if far > 0.1 + 2.0 * self.speed * alone_s:
-            self.reasons[i] = f"{far:.2f} m from where the robot should be"
+            self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
             return None
         beams = self._explain(i, pose)
-        if beams[2] > 0.25 * (beams[1] + beams[2]) + 2.0:
-            self.reasons[i] = f"{beams[2]:.0f} beams see through the robot, {beams[1]:.0f} see it"
+        if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
+            self.track.reasons[i] = (
+                f"{beams.through} beams see through the robot, {beams.agree} see it"
+            )
             return None
-        self._store(i, pose, summary, beams)
+        self._store(i, found, beams)
         return pose
 
     def _points(self, i: int, pose: FloatArray, motion: FloatArray, alone_s: float) -> Seen:
@@ -217,69 +201,62 @@ class Tracker:
         centre = np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y])
         reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
         about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
-        return Seen(
-            *new_points(
-                self.sets.ranges_mm, self.sets.rows[i], self.seen_by, centre, reach, about,
-                self.sets.ages_s[i],
-            )
+        return new_points(
+            self.sets.ranges_mm, self.sets.rows[i], self.seen_by, centre, reach, about,
+            self.sets.ages_s[i],
         )  # fmt: skip
 
-    def _refine(self, i: int, seen: Seen, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _refine(self, i: int, seen: Seen, start: FloatArray) -> OutlinePose:
         tables = self.tables
         found = refine(seen, start, tables, self.body, self.settings, float(self.prior_m[i]))
         calibration = found.by_scanner @ tables.covariance @ found.by_scanner.T
-        self.noise[i] = found.covariance
-        self.covariances[i] = found.covariance + calibration
-        self.weak[i] = found.weak
+        self.track.noise[i] = found.covariance
+        self.track.covariances[i] = found.covariance + calibration
+        self.track.weak[i] = found.weak
         self._evidence = found.information, found.gradient
-        return found.pose, found.summary
+        return found
 
-    def _explain(self, i: int, pose: FloatArray) -> FloatArray:
+    def _explain(self, i: int, pose: FloatArray) -> BeamCounts:
         return explain(self.sets, i, self.tables, self.body, pose)
 
-    def _store(self, i: int, pose: FloatArray, summary: FloatArray, beams: FloatArray) -> None:
-        self.poses[i] = pose
-        self.poses[i, 2] = wrap_angle(pose[2])
-        self.readings[i], self.rms_m[i] = int(summary[0]), summary[3]
-        self.chi2[i] = summary[1] / max(summary[0] - 3.0, 1.0)
-        self.beams[i] = beams
-        self.status[i] = UNDETERMINED if summary[2] > 0 else OK
+    def _store(self, i: int, found: OutlinePose, beams: BeamCounts) -> None:
+        self.track.poses[i] = found.pose
+        self.track.poses[i, 2] = wrap_angle(found.pose[2])
+        self.track.readings[i], self.track.rms_m[i] = found.used, found.rms_m
+        self.track.chi2[i] = found.chi2 / max(found.used - 3.0, 1.0)
+        self.track.beams[i] = beams
+        self.track.status[i] = UNDETERMINED if found.open_directions else OK
 
     def _finished(self) -> LaserTrack:
-        good = np.flatnonzero(np.isfinite(self.poses[:, 0]))
-        fronts: dict[int, str] = {}
-        for segment in np.unique(self.segment[good]).tolist():
-            rows = good[self.segment[good] == segment]
-            velocity = _velocities(self.sets.times_s[rows], self.poses[rows])
-            fronts[segment] = self._front(rows, velocity)
-            velocity = _velocities(self.sets.times_s[rows], self.poses[rows])
-            self.motion[rows] = velocity
+        good = np.flatnonzero(np.isfinite(self.track.poses[:, 0]))
+        for segment in np.unique(self.track.segment[good]).tolist():
+            rows = good[self.track.segment[good] == segment]
+            velocity = _velocities(self.sets.times_s[rows], self.track.poses[rows])
+            self.track.fronts[segment] = self._front(rows, velocity)
+            velocity = _velocities(self.sets.times_s[rows], self.track.poses[rows])
+            self.track.motion[rows] = velocity
             for row, motion in zip(rows.tolist(), velocity):
                 self._again(row, motion)
-        good = good[np.isfinite(self.poses[good, 0])]
+        good = good[np.isfinite(self.track.poses[good, 0])]
         scale = self._scales(good)
-        for covariances in (self.covariances, self.noise):
+        for covariances in (self.track.covariances, self.track.noise):
             covariances[good] *= scale[:, None, None]
-        corrections, sigma = self._corrections()
-        return LaserTrack(
-            self.sets.times_s, self.status, self.segment, self.poses, self.covariances,
-            self.noise, self.motion, self.readings, self.rms_m, self.chi2, self.beams, self.weak,
-            self.reasons, corrections, sigma, fronts,
-        )  # fmt: skip
+        self._correct()
+        return self.track
 
     def _again(self, i: int, motion: FloatArray) -> None:
         """The pose once more, from the motion before *and* after it."""
-        status = int(self.status[i])
-        seen = self._points(i, self.poses[i], motion, 0.0)
-        refined, summary = self._refine(i, seen, self.poses[i].copy())
-        if summary[0] < self.settings.least_readings:
-            self.reasons[i] = f"{summary[0]:.0f} readings on the outline"
-            self.status[i], self.poses[i] = COASTING, np.nan
+        status = int(self.track.status[i])
+        seen = self._points(i, self.track.poses[i], motion, 0.0)
+        found = self._refine(i, seen, self.track.poses[i].copy())
+        if found.used < self.settings.least_readings:
+            self.track.reasons[i] = f"{found.used} readings on the outline"
+            self.track.status[i], self.track.poses[i] = COASTING, np.nan
             return
-        self._store(i, refined, summary, self._explain(i, refined))
+        self._store(i, found, self._explain(i, found.pose))
         # Keeps what the whole visit, or its first set, has determined.
-        if status == UNRESOLVED or (status == REACQUIRED and self.status[i] == OK):
-            self.status[i] = status
+        if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
+            self.track.status[i] = status
         self.information += self._evidence[0]
         self.gradient += self._evidence[1]
 
@@ -304,14 +281,14 @@ class Tracker:
             best = int(order[0])
             by = f"driven forward, {ahead[best]:.2f} m"
             if ahead[best] - ahead[int(order[1])] < 2.0 * self.settings.forward_m:
-                self.status[rows] = UNRESOLVED
+                self.track.status[rows] = UNRESOLVED
                 return "unknown: the outline does not show it and the robot hardly drove"
         if best > 0:
-            self.poses[rows] = compose(self.poses[rows], choices[best])
+            self.track.poses[rows] = compose(self.track.poses[rows], choices[best])
             for i in rows.tolist():
-                seen = self._points(i, self.poses[i], np.zeros(3), 0.0)
-                self.poses[i] = fit_outline(
-                    seen.points, self.body.faces, self.poses[i], self.settings.gate_m,
+                seen = self._points(i, self.track.poses[i], np.zeros(3), 0.0)
+                self.track.poses[i] = fit_outline(
+                    seen.points, self.body.faces, self.track.poses[i], self.settings.gate_m,
                     self.settings.kept, self.settings.threshold_m, self.settings.most_steps,
                 )[0]  # fmt: skip
         return by
@@ -319,20 +296,20 @@ class Tracker:
     def _cost(self, i: int, choice: FloatArray) -> float:
         """Squared normalised residuals of set i from a choice of its front, those gated at most."""
         s, body = self.settings, self.body
-        start = compose(self.poses[i], choice)
+        start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
-        start, _, _, _ = fit_outline(
+        start, _, _ = fit_outline(
             seen.points, body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
         )
         found = refine(seen, start, self.tables, body, s, 0.02)
         _, _, through, hidden, _, beside = self._explain(i, found.pose)
-        return float(found.summary[1] + s.gate_sigma**2 * (through + hidden + beside))
+        return float(found.chi2 + s.gate_sigma**2 * (through + hidden + beside))
 
     def _ahead(
         self, rows: IntArray, velocity: FloatArray, choices: list[FloatArray]
     ) -> list[float]:
         """How far the robot drove forward, by every choice of its front (m)."""
-        times, poses = self.sets.times_s[rows], self.poses[rows]
+        times, poses = self.sets.times_s[rows], self.track.poses[rows]
         step = np.diff(times, append=times[-1])
         ahead = []
         for choice in choices:
@@ -350,8 +327,8 @@ class Tracker:
         The residuals of half a second; one set's alone would say too little.
         """
         scale = np.ones(len(good))
-        freedom = np.maximum(self.readings[good] - 3.0, 1.0)
-        chi2 = self.chi2[good] * freedom
+        freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
+        chi2 = self.track.chi2[good] * freedom
         for i in range(len(good)):
             first, last = max(0, i - 18), i + 19
             part = slice(first, last)
@@ -361,18 +338,14 @@ class Tracker:
             scale[i] = ratio if ratio > 1.0 + 4.0 * math.sqrt(2.0 / total) else 1.0
         return scale
 
-    def _corrections(self) -> tuple[FloatArray, FloatArray]:
-        many = len(self.tables.names)
-        corrections = np.full((many, 3), np.nan)
-        sigma = np.full((many, 3), np.nan)
-        for k in range(many):
-            full = self.information[k] + np.tril(self.information[k], -1).T
-            values, vectors = np.linalg.eigh(full)
-            if values[0] > 1e-9 * max(values[2], 1e-9) and values[0] > 0.0:
+    def _correct(self) -> None:
+        """Corrections of the scanners' poses, by all residuals."""
+        for k, information in enumerate(self.information):
+            values, vectors = np.linalg.eigh(information)
+            if values[0] > 1e-9 * max(values[2], 1e-9):
                 covariance = (vectors / values) @ vectors.T
-                corrections[k] = -covariance @ self.gradient[k]
-                sigma[k] = np.sqrt(np.diag(covariance))
-        return corrections, sigma
+                self.track.corrections[k] = -covariance @ self.gradient[k]
+                self.track.correction_sigma[k] = np.sqrt(np.diag(covariance))
 
 
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
@@ -394,3 +367,131 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     enough = (n[:, 0] > 4) & (spread[:, 0] > 1e-6)
     out[enough] = ((stx - st * sx / n) / np.where(spread > 0.0, spread, 1.0))[enough]
     return out
+
+
+_SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
+
+
+def track_robot(
+    sets: ScanSets, tables: ScannerTables, robot: Robot, settings: LaserSettings | None = None
+) -> LaserTrack:
+    """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`)."""
+    settings = LaserSettings() if settings is None else settings
+    body = robot_body(robot.outline, settings.symmetry_m)
+    return Tracker(sets, tables, body, robot.largest_speed_m_s, settings).run()
+
+
+def track_without_suspects(
+    sets: ScanSets,
+    tables: ScannerTables,
+    robot: Robot,
+    scanners: tuple[Scanner, ...],
+    settings: LaserSettings | None = None,
+) -> tuple[LaserTrack, dict[str, FloatArray]]:
+    """Follow the robot, leaving out scanners whose readings do not fit the others'.
+
+    One at a time, the worst first, and only while three scanners or more are left to say so.
+
+    Returns
+    -------
+    left_out : dict of str to (2, 3) float64
+        By scanner, the shift that its readings suggest and its standard deviations.
+    """
+    left_out: dict[str, FloatArray] = {}
+    track = track_robot(sets, tables, robot, settings)
+    while len(scanners) - len(left_out) >= 3:
+        excess = excess_shifts(track, scanners)
+        worst = int(np.argmax(excess))
+        if excess[worst] <= 1.0:
+            break
+        left_out[scanners[worst].name] = np.stack(
+            [track.corrections[worst], track.correction_sigma[worst]]
+        )
+        rows = sets.rows.copy()
+        rows[:, worst] = -1
+        sets = replace(sets, rows=rows)
+        track = track_robot(sets, tables, robot, settings)
+    return track, left_out
+
+
+def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:
+    """(scanners,) how far beyond what is allowed their shifts are; above 1 is suspect."""
+    least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
+    excess = np.zeros(len(scanners))
+    for k, scanner in enumerate(scanners):
+        shift, sigma = track.corrections[k], track.correction_sigma[k]
+        if np.isfinite(shift).all():
+            allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
+            excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
+    return excess
+
+
+#: Sets farther apart than this are not of one block (s).
+LARGEST_GAP_S = 0.05
+
+
+def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
+    """Poses of a track, each from `sets_per_pose` consecutive sets.
+
+    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set
+    is in one pose only, so that the readings' errors in different poses are independent; those of
+    the scanners' poses are common to all and are not averaged away.
+
+    Parameters
+    ----------
+    sets_per_pose : int
+        1: every set by itself. A block is shorter at the end of a visit, and where sets have no
+        determined pose.
+
+    Returns
+    -------
+    PlanarPoses
+        Sets with an undetermined direction come as poses of their own, with the covariance that
+        says so; those whose front is unknown do not come at all.
+
+    Raises
+    ------
+    GroundTruthError
+        If `sets_per_pose` is not positive.
+    """
+    if sets_per_pose < 1:
+        raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
+    determined = np.isin(track.status, (OK, REACQUIRED))
+    rows = np.flatnonzero(determined | (track.status == UNDETERMINED))
+    if not len(rows):
+        return PlanarPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    times = track.times_s[rows]
+    # A new block where the visit changes, after a gap, and round an undetermined set.
+    parted = np.ones(len(rows), dtype=np.bool_)
+    parted[1:] = (
+        (track.segment[rows[1:]] != track.segment[rows[:-1]])
+        | (np.diff(times) > LARGEST_GAP_S)
+        | ~determined[rows[1:]]
+        | ~determined[rows[:-1]]
+    )
+    first = np.flatnonzero(parted)
+    run = np.cumsum(parted) - 1
+    within = (np.arange(len(rows)) - first[run]) // sets_per_pose
+    begins = parted | np.concatenate([[True], np.diff(within) != 0])
+    block = np.cumsum(begins) - 1
+    count = int(block[-1]) + 1
+
+    size = np.bincount(block, minlength=count).astype(np.float64)
+    origin = times[0]
+    middle = np.bincount(block, times - origin, minlength=count) / size
+    lead = track.poses[rows[np.flatnonzero(begins)]]
+    moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
+    apart = moved - lead[block]
+    apart[:, 2] = wrap_angle(apart[:, 2])
+    # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
+    # with equal weights at the mean time an error of the motion drops out.
+    noise, shared = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
+    mean = np.zeros((count, 3))
+    np.add.at(mean, block, apart / size[block][:, None])
+    np.add.at(noise, block, track.noise[rows] / (size**2)[block][:, None, None])
+    np.add.at(shared, block, (track.covariances - track.noise)[rows] / size[block][:, None, None])
+    poses = lead + mean
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    covariances = noise + shared
+    covariances = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+    return PlanarPoses(middle + origin, poses, covariances)

@@ -14,47 +14,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from redetect.groundtruth.lasers.icp_kernels import nearest_on_segments, rigid_fit
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
 class Beams(NamedTuple):
-    """The beams of all scanners.
+    """The beams of all scanners."""
 
-    Attributes
-    ----------
-    near_mm : (scanners, readings) float64
-        Below this a reading is new: nearer than the background.
-    direction : (scanners, readings, 2) float64
-        In the world.
-    origins : (scanners, 2) float64
-        In the world (m).
-    """
-
+    # (scanners, readings): below this a reading is new: nearer than the background
     near_mm: FloatArray
-    direction: FloatArray
-    origins: FloatArray
+    direction: FloatArray  # (scanners, readings, 2): in the world
+    origins: FloatArray  # (scanners, 2): in the world (m)
 
 
 class Seen(NamedTuple):
-    """New readings of a set of scans.
+    """New readings of a set of scans."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        In the world (m).
-    scanner : (n,) int64
-    direction : (n, 2) float64
-        Of the beams.
-    range_m : (n,) float64
-    """
-
-    points: FloatArray
-    scanner: IntArray
-    direction: FloatArray
-    range_m: FloatArray
+    points: FloatArray  # (n, 2): in the world (m)
+    scanner: IntArray  # (n,)
+    direction: FloatArray  # (n, 2): of the beams
+    range_m: FloatArray  # (n,)
 
     def where(self, chosen: NDArray[np.bool_]) -> Seen:
         """Those chosen."""
@@ -63,35 +42,47 @@ class Seen(NamedTuple):
         )
 
 
+class OutlinePose(NamedTuple):
+    """The most likely pose of an outline near a start."""
+
+    pose: FloatArray
+    # (3, 3): from the readings alone, but for open directions, which have the prior's
+    covariance: FloatArray
+    by_scanner: FloatArray  # (3, 3 scanners): derivatives of the pose by the scanners' poses
+    used: int  # Readings that it rests on
+    chi2: float  # Their squared normalised residuals
+    open_directions: int
+    rms_m: float  # Of their distances from the outline
+    # (3,): the least determined direction of (x, y, theta), theta times `scale_m`
+    weak: FloatArray
+    # (scanners, 3, 3), (scanners, 3): correction of each scanner's own pose by the residuals
+    information: FloatArray
+    gradient: FloatArray
+
+
+class BeamCounts(NamedTuple):
+    """How a pose explains the beams of a set."""
+
+    expected: int  # Beams that should see the robot before the background; of these
+    agree: int  # as far as they should,
+    through: int  # farther,
+    hidden: int  # nearer,
+    none: int  # without a reading
+    beside: int  # New readings in the outline's circle where the robot is not
+
+
 class OutlineFit(NamedTuple):
-    """How an outline is fitted.
+    """How an outline is fitted."""
 
-    Attributes
-    ----------
-    floor_m : float
-        Standard deviation of what the outline and the scanner are not.
-    least_slope : float
-        Beams that graze a face count as if they met it at this sine.
-    gate_sigma, gate_m : float
-        Readings farther off do not count; metres in the first step.
-    prior_sigma_m : float
-        With it, open directions hold on to the start.
-    weak_sigma_m : float
-        Directions along which the standard deviation would be larger are open.
-    scale_m : float
-        A radian counts as this.
-    steps : int
-        At most.
-    """
-
-    floor_m: float
-    least_slope: float
+    floor_m: float  # Standard deviation of what the outline and the scanner are not
+    least_slope: float  # Beams that graze a face count as if they met it at this sine
+    # `gate_sigma`, `gate_m`: Readings farther off do not count; metres in the first step.
     gate_sigma: float
     gate_m: float
-    prior_sigma_m: float
-    weak_sigma_m: float
-    scale_m: float
-    steps: int
+    prior_sigma_m: float  # With it, open directions hold on to the start
+    weak_sigma_m: float  # Directions along which the standard deviation would be larger are open
+    scale_m: float  # A radian counts as this
+    steps: int  # At most
 
 
 @njit(cache=True, error_model="numpy")
@@ -103,31 +94,15 @@ def new_points(
     reach_m: float,
     motion: FloatArray,
     ages_s: FloatArray,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+) -> Seen:
     """Points of a set that are nearer than the background and within reach of a place.
 
-    Parameters
-    ----------
-    ranges_mm : (scans, readings) uint16
-    rows : (scanners,) int64
-        Each scanner's scan of the set.
-    beams : Beams
-    centre : (2,)
-        Points farther than `reach_m` from here are left out.
-    motion : (5,)
-        Of the robot: velocity (m/s), turn (rad/s), and the point it turns about at the set's time.
-    ages_s : (scanners,)
-        The set's time minus the scan's: the points are moved on by as much.
-
-    Returns
-    -------
-    points : (n, 2)
-        In the world (m).
-    scanner : (n,) int64
-    direction : (n, 2)
-        Of the beams that saw them.
-    range_m : (n,)
-        Their readings.
+    `ranges_mm` (scans, readings). `rows` (scanners,): each scanner's scan of the set. `centre`
+    (2,): points farther than `reach_m` from here are left out. `motion` (5,): of the robot:
+    velocity (m/s), turn (rad/s), and the point it turns about at the set's time. `ages_s`
+    (scanners,): the set's time minus the scan's: the points are moved on by as much. Returns
+    `points` (n, 2): in the world (m). `scanner` (n,). `direction` (n, 2): of the beams that saw
+    them. `range_m` (n,): their readings.
     """
     most = rows.size * ranges_mm.shape[1]
     points = np.empty((most, 2))
@@ -159,59 +134,7 @@ def new_points(
             scanner[n] = s
             range_m[n] = 1e-3 * r
             n += 1
-    return points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy()
-
-
-@njit(cache=True, error_model="numpy")
-def to_robot(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Points of the world in the robot's frame."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    out = np.empty_like(points)
-    for i in range(points.shape[0]):
-        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
-        out[i, 0], out[i, 1] = c * dx + s * dy, -s * dx + c * dy
-    return out
-
-
-@njit(cache=True, error_model="numpy")
-def fit_outline(
-    points: FloatArray,
-    faces: FloatArray,
-    start: FloatArray,
-    gate_m: float,
-    kept: float,
-    threshold_m: float,
-    most_steps: int,
-) -> tuple[FloatArray, float, int, int]:
-    """Trimmed ICP of the outline to points: pose, root mean square error, pairs used, steps.
-
-    Every step pairs each point with the nearest point of the outline within the gate, keeps the
-    best share and fits by singular values, until the error changes by less than the threshold.
-    """
-    pose = start.copy()
-    before = np.inf
-    rms, count, step = np.inf, 0, 0
-    used = np.zeros(points.shape[0], dtype=np.bool_)
-    while True:
-        nearest, _, squared = nearest_on_segments(to_robot(points, pose), faces)
-        limit = gate_m * gate_m
-        within = squared[squared <= limit]
-        if within.size < 3:
-            return pose, np.inf, within.size, step
-        within.sort()
-        limit = within[math.ceil(kept * within.size) - 1]
-        total, count = 0.0, 0
-        for i in range(points.shape[0]):
-            used[i] = squared[i] <= limit
-            if used[i]:
-                total += squared[i]
-                count += 1
-        rms = math.sqrt(total / count)
-        if abs(before - rms) < threshold_m or step == most_steps:
-            return pose, rms, count, step
-        before = rms
-        pose = rigid_fit(nearest, points, used)
-        step += 1
+    return Seen(points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy())
 
 
 @njit(cache=True, error_model="numpy")
@@ -222,7 +145,7 @@ def refine_outline(
     origins: FloatArray,
     sigmas_m: FloatArray,
     fit: OutlineFit,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> OutlinePose:
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
@@ -230,21 +153,6 @@ def refine_outline(
     the face that its beam meets first, whatever its noise; at first, while the pose may be off, to
     the nearest one turned to the scanner. Readings beyond the gate do not count, and open
     directions hold on to the start (see `OutlineFit`).
-
-    Returns
-    -------
-    pose : (3,)
-    covariance : (3, 3)
-        Of (x, y, theta), from the readings alone, but for open directions, which have the prior's.
-    calibration : (3, 3 scanners)
-        Derivatives of the pose by the scanners' poses.
-    summary : (4,)
-        Readings used, their squared normalised residuals, the pose's open directions, the root mean
-        square distance from the outline (m).
-    weak : (3,)
-        The least determined direction of (x, y, theta), theta times `scale_m`.
-    information, gradient : (scanners, 3, 3), (scanners, 3)
-        Correction of each scanner's own pose by the residuals.
     """
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -258,7 +166,7 @@ def refine_outline(
     calibration = np.zeros((3, 3 * many))
     information = np.zeros((many, 3, 3))
     gradient = np.zeros((many, 3))
-    summary = np.zeros(4)
+    rms, open_count, used, chi2 = 0.0, 0, 0, 0.0
     weak = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
     for step in range(fit.steps):
@@ -313,44 +221,25 @@ def refine_outline(
             squares += e * e
             sx += x
             sy += y
-            j0, j1, j2 = -nx, -ny, nx * y - ny * x
-            h[0, 0] += w * j0 * j0
-            h[1, 0] += w * j1 * j0
-            h[1, 1] += w * j1 * j1
-            h[2, 0] += w * j2 * j0
-            h[2, 1] += w * j2 * j1
-            h[2, 2] += w * j2 * j2
-            g[0] += w * j0 * e
-            g[1] += w * j1 * e
-            g[2] += w * j2 * e
+            by_robot = (-nx, -ny, nx * y - ny * x)
             # By the scanner's pose: the normal in the world, and turning about the scanner.
             q = scanner[i]
             wx, wy = c * nx - s * ny, s * nx + c * ny
-            b2 = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+            lever = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+            by_scanner = (wx, wy, lever)
             for a in range(3):
-                ja = j0 if a == 0 else (j1 if a == 1 else j2)
-                cross[a, 3 * q] += w * ja * wx
-                cross[a, 3 * q + 1] += w * ja * wy
-                cross[a, 3 * q + 2] += w * ja * b2
-            information[q, 0, 0] += w * wx * wx
-            information[q, 1, 0] += w * wy * wx
-            information[q, 1, 1] += w * wy * wy
-            information[q, 2, 0] += w * b2 * wx
-            information[q, 2, 1] += w * b2 * wy
-            information[q, 2, 2] += w * b2 * b2
-            gradient[q, 0] += w * wx * e
-            gradient[q, 1] += w * wy * e
-            gradient[q, 2] += w * b2 * e
-        summary[0], summary[1] = used, chi2
+                g[a] += w * by_robot[a] * e
+                gradient[q, a] += w * by_scanner[a] * e
+                for b in range(3):
+                    h[a, b] += w * by_robot[a] * by_robot[b]
+                    cross[a, 3 * q + b] += w * by_robot[a] * by_scanner[b]
+                    information[q, a, b] += w * by_scanner[a] * by_scanner[b]
         if used < 3:
-            return pose, covariance, calibration, summary, weak, information, gradient
-        summary[3] = math.sqrt(squares / used)
+            break
+        rms = math.sqrt(squares / used)
         # Undetermined directions are evaluated about the middle of the points, theta in metres.
         mx, my = sx / used, sy / used
         scale = fit.scale_m
-        for a in range(3):
-            for b in range(a):
-                h[b, a] = h[a, b]
         # Turning about the middle: xi' = (t + theta x middle, theta * scale).
         back = np.array([[1.0, 0.0, my / scale], [0.0, 1.0, -mx / scale], [0.0, 0.0, 1.0 / scale]])
         values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
@@ -369,7 +258,6 @@ def refine_outline(
                     g[a] -= p * row[a] * ahead
                     for b in range(3):
                         h[a, b] += p * row[a] * row[b]
-        summary[2] = open_count
         v = vectors[:, 0]
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance[:, :] = np.linalg.inv(h)
@@ -381,11 +269,14 @@ def refine_outline(
         pose[0] += c * delta[0] - s * delta[1]
         pose[1] += s * delta[0] + c * delta[1]
         pose[2] += delta[2]
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
-    calibration[:] = -(turn_world @ local_covariance) @ cross
-    return pose, covariance, calibration, summary, weak, information, gradient
+    if used >= 3:
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
+        calibration[:] = -(turn_world @ local_covariance) @ cross
+    return OutlinePose(
+        pose, covariance, calibration, used, chi2, open_count, rms, weak, information, gradient
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -398,17 +289,9 @@ def explain_set(
     radius_m: float,
     pose: FloatArray,
     tolerance_m: float,
-) -> FloatArray:
-    """How a pose explains the beams of a set, by casting each of them at the outline.
-
-    Returns
-    -------
-    (6,) float64
-        Beams that should see the robot before the background; of these: as far as they should,
-        farther (through it), nearer (hidden by something), without a reading; and new readings
-        in the outline's circle where the robot is not: objects beside it.
-    """
-    out = np.zeros(6)
+) -> BeamCounts:
+    """How a pose explains the beams of a set, by casting each of them at the outline."""
+    expected = agree = through = hidden = none = beside = 0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     centre_x = pose[0] + c * middle[0] - s * middle[1]
     centre_y = pose[1] + s * middle[0] + c * middle[1]
@@ -440,15 +323,15 @@ def explain_set(
                     best = r
             reading = 1e-3 * ranges_mm[rows[q], i]
             if best < 1e-3 * beams.near_mm[q, i]:
-                out[0] += 1
+                expected += 1
                 if reading <= 0.0:
-                    out[4] += 1
+                    none += 1
                 elif reading > best + tolerance_m:
-                    out[2] += 1
+                    through += 1
                 elif reading < best - tolerance_m:
-                    out[3] += 1
+                    hidden += 1
                 else:
-                    out[1] += 1
+                    agree += 1
             elif 0.0 < reading < 1e-3 * beams.near_mm[q, i] and abs(reading - ahead) < radius_m:
-                out[5] += 1
-    return out
+                beside += 1
+    return BeamCounts(expected, agree, through, hidden, none, beside)

@@ -1,79 +1,135 @@
 """All poses of a chain at once: bundle adjustment of cameras, bodies and parts.
 
-Levenberg and Marquardt's method on the normal equations, whose structure makes each step cheap and
-exact (`redetect.groundtruth.markers.normal_equations`); covariances come out of the same
-elimination.
+The unknowns are poses, not points: a marker's four corners and a board's are rigid and of known
+size, which gives the result its scale. Bundle adjusters for reconstruction (as pycolmap's) move
+each point independently and cannot keep a square rigid.
+
+No two bodies (times at which something was seen) share a residual, so that the normal equations are
+sparse, and bodies are eliminated by 6x6 blocks from the covariance of cameras and parts (Triggs et
+al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, diags_array
 
+from camera import Camera
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.bundle import (
-    Bundle,
-    Whiteners,
-    whitened_derivatives,
-    whitened_residuals,
+from redetect.groundtruth.markers.chain import (
+    ChainPoints,
+    project_chain,
+    project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.normal_equations import (
+from redetect.groundtruth.markers.least_squares import (
     UNDETERMINED,
-    NormalEquations,
-    normal_equations,
+    Linearised,
+    inverted_information,
+    minimised,
+    solved,
 )
+from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, right_jacobian
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+PoseKind = Literal["camera", "body", "part"]
 
 # Of whitened residuals: where the robust loss of the first pass begins to flatten.
 _ROBUST_SCALE = 3.0
-# How much of the diagonal is added at first, and at least and at most.
-_DAMPING = 1e-4
-_LEAST_DAMPING = 1e-14
-_MOST_DAMPING = 1e12
-_MOST_STEPS = 200
-# Steps (m, rad) that are as good as none, and the share of the cost that rounding may hide. The
-# robust pass only has to come near.
+# Steps (m, rad) that are as good as none; the robust pass only has to come near.
 _STEP_TOLERANCE = 1e-10
 _ROBUST_STEP_TOLERANCE = 1e-6
-_COST_TOLERANCE = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """Prior of a pose: its value, and the covariance of right perturbations."""
+
+    kind: PoseKind
+    index: int
+    pose: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Points in images, the poses that they depend on, and which of those are free."""
+
+    cameras: tuple[Camera, ...]
+    world_from_camera: FloatArray  # (C, 4, 4)
+    world_from_body: FloatArray  # (B, 4, 4)
+    body_from_part: FloatArray  # (P, 4, 4)
+    # `free_camera`, `free_body`, `free_part`: (C | B | P,)
+    free_camera: BoolArray
+    free_body: BoolArray
+    free_part: BoolArray
+    seen: ChainPoints
+    view: IntArray  # (N,): which part in which image each point is of: 0 to V - 1
+    priors: tuple[PosePrior, ...] = ()  # Of free poses
+
+    @property
+    def free(self) -> BoolArray:
+        """(C + P + B,) which poses are free: cameras, then parts, then bodies."""
+        return np.concatenate([self.free_camera, self.free_part, self.free_body])
+
+    @property
+    def unknowns(self) -> int:
+        """Six for each free pose."""
+        return 6 * int(self.free.sum())
+
+    def only(self, chosen: BoolArray) -> Bundle:
+        """The same poses, with the chosen points alone."""
+        return replace(self, seen=self.seen.only(chosen), view=self.view[chosen])
+
+    def moved(self, step: FloatArray) -> Bundle:
+        """With free poses moved by right perturbations, in the order of `free`."""
+        steps = np.zeros((len(self.free), 6))
+        steps[self.free] = step.reshape(-1, 6)
+        cameras, parts = len(self.free_camera), len(self.free_part)
+        return replace(
+            self,
+            world_from_camera=self.world_from_camera @ exp_se3(steps[:cameras]),
+            body_from_part=self.body_from_part @ exp_se3(steps[cameras : cameras + parts]),
+            world_from_body=self.world_from_body @ exp_se3(steps[cameras + parts :]),
+        )
+
+    def pixels(self) -> FloatArray:
+        """(N, 2) pixels at which the points are expected; NaN where they cannot be seen."""
+        return project_chain(
+            self.cameras,
+            self.world_from_camera,
+            self.world_from_body,
+            self.body_from_part,
+            self.seen,
+        )
+
+    def prior_error(self, prior: PosePrior) -> FloatArray:
+        """(6,) right perturbation that leads from the prior's pose to the bundle's."""
+        poses = {
+            "camera": self.world_from_camera,
+            "body": self.world_from_body,
+            "part": self.body_from_part,
+        }
+        return log_se3(inverse(prior.pose) @ poses[prior.kind][prior.index])
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedBundle:
-    """A bundle at its minimum.
+    """A bundle at its minimum."""
 
-    Attributes
-    ----------
-    bundle : Bundle
-        With the adjusted poses.
-    used : (N,) bool
-        Points whose views were not found to be wrong.
-    residuals : (N, 2) float64
-        Pixels seen minus pixels expected, of all points.
-    view_errors : (V,) float64
-        Root mean square of each view's normalised residuals.
-    view_rms_px : (V,) float64
-    cost : float
-        Squared normalised residuals of the used points and of the priors.
-    degrees_of_freedom : int
-    camera_covariance : (6 C, 6 C) float64
-    part_covariance : (6 P, 6 P) float64
-        Of right perturbations, all other poses marginalised; zeros for fixed ones. They are
-        those of the corners' covariances, not scaled by the residuals.
-    """
-
-    bundle: Bundle
-    used: BoolArray
-    residuals: FloatArray
-    view_errors: FloatArray
-    view_rms_px: FloatArray
-    cost: float
+    bundle: Bundle  # With the adjusted poses
+    used: BoolArray  # (N,): points whose views were not found to be wrong
+    residuals: FloatArray  # (N, 2): pixels seen minus pixels expected, of all points
+    cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
-    camera_covariance: FloatArray
+    camera_covariance: FloatArray  # (6 C, 6 C)
+    # (6 P, 6 P): of right perturbations, all other poses marginalised; zeros for fixed ones. They
+    # are those of the corners' covariances, not scaled by the residuals.
     part_covariance: FloatArray
 
     @property
@@ -93,10 +149,6 @@ def adjust_bundle(
         Its poses are the start.
     outlier_sigma, outlier_px : float
         A view is wrong if its normalised error and its residuals (px) are larger than these.
-
-    Returns
-    -------
-    AdjustedBundle
 
     Raises
     ------
@@ -120,45 +172,84 @@ def adjust_bundle(
     return _result(bundle, used)
 
 
+def whitened_residuals(bundle: Bundle) -> FloatArray:
+    """(2 N + 6 priors,) residuals of variance 1; NaN where a point cannot be seen."""
+    difference = bundle.seen.pixels - bundle.pixels()
+    return np.concatenate(
+        [
+            (whitening(bundle.seen.covariances) @ difference[..., None]).ravel(),
+            *(whitening(prior.covariance) @ bundle.prior_error(prior) for prior in bundle.priors),
+        ]
+    )
+
+
+def whitened_jacobian(bundle: Bundle) -> Any:
+    """Sparse (2 N + 6 priors, unknowns) derivatives of the residuals, in the order of `free`."""
+    seen, free = bundle.seen, bundle.free
+    projection = project_chain_with_jacobians(
+        bundle.cameras,
+        bundle.world_from_camera,
+        bundle.world_from_body,
+        bundle.body_from_part,
+        seen,
+    )
+    white = -whitening(seen.covariances)
+    cameras, parts = len(bundle.free_camera), len(bundle.free_part)
+    begin = {"camera": 0, "part": cameras, "body": cameras + parts}
+    first_row = np.arange(0, 2 * len(seen), 2)
+    blocks = [
+        (white @ projection.by_camera, first_row, seen.camera),
+        (white @ projection.by_part, first_row, begin["part"] + seen.part),
+        (white @ projection.by_body, first_row, begin["body"] + seen.body),
+    ]
+    for number, prior in enumerate(bundle.priors):
+        block = np.linalg.inv(right_jacobian(bundle.prior_error(prior)))
+        row = np.array([2 * len(seen) + 6 * number])
+        pose = np.array([begin[prior.kind] + prior.index])
+        blocks.append(((whitening(prior.covariance) @ block)[None], row, pose))
+    number_of = np.cumsum(free) - 1
+    entries = []
+    for values, row, pose in blocks:
+        kept = free[pose]
+        rows = row[kept, None, None] + np.arange(values.shape[1])[:, None]
+        columns = 6 * number_of[pose[kept], None, None] + np.arange(6)
+        entries.append([part.ravel() for part in np.broadcast_arrays(values[kept], rows, columns)])
+    values, rows, columns = (np.concatenate(part) for part in zip(*entries))
+    shape = (2 * len(seen) + 6 * len(bundle.priors), bundle.unknowns)
+    return coo_array((values, (rows.astype(int), columns.astype(int))), shape).tocsr()
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """(..., d, d) inverse Cholesky factors."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
 def _minimised(bundle: Bundle, used: BoolArray, *, robust: bool) -> Bundle:
-    """The bundle at the minimum of the used points' cost (Levenberg-Marquardt)."""
+    """The bundle at the minimum of the used points' cost."""
     if bundle.unknowns == 0:
         return bundle
     part = bundle.only(used)
-    whiten = Whiteners.of(part)
-    residuals = whitened_residuals(part, whiten)
+    residuals = whitened_residuals(part)
     if not np.all(np.isfinite(residuals)):
         raise GeometryError("the start has a point behind its camera or outside its lens")
     if len(residuals) < bundle.unknowns:
         raise GeometryError(
             f"{len(residuals)} residuals for {bundle.unknowns} unknowns: too little was seen"
         )
+
+    def cost_at(bundle: Bundle) -> float:
+        return _cost(whitened_residuals(bundle), robust)
+
+    def linearise(bundle: Bundle) -> Linearised[Bundle]:
+        residuals, jacobian = whitened_residuals(bundle), whitened_jacobian(bundle)
+        # Soft l1 if robust, with its curvature (Triggs, section 4.3).
+        squares = np.square(residuals / _ROBUST_SCALE) if robust else np.zeros_like(residuals)
+        normal = jacobian.T @ (diags_array((1.0 + squares) ** -1.5) @ jacobian)
+        gradient = jacobian.T @ ((1.0 + squares) ** -0.5 * residuals)
+        return Linearised(_cost(residuals, robust), gradient, normal, cost_at)
+
     tolerance = _ROBUST_STEP_TOLERANCE if robust else _STEP_TOLERANCE
-    cost, damping = _cost(residuals, robust), _DAMPING
-    equations = _equations(part, whiten, residuals, robust)
-    for _ in range(_MOST_STEPS):
-        try:
-            shared, bodies, gain = _damped_step(equations, damping)
-        except np.linalg.LinAlgError:
-            damping = 10.0 * damping
-            if damping > _MOST_DAMPING:
-                raise GeometryError(UNDETERMINED) from None
-            continue
-        tried = _moved(part, shared, bodies)
-        residuals = whitened_residuals(tried, whiten)
-        tried_cost = _cost(residuals, robust)
-        small = max(np.abs(shared).max(initial=0.0), np.abs(bodies).max(initial=0.0)) < tolerance
-        # Near the minimum rounding decides which cost is less; such steps are right all the same.
-        if tried_cost <= cost * (1.0 + _COST_TOLERANCE):
-            part, cost = tried, tried_cost
-            if small or gain <= _COST_TOLERANCE * cost:
-                break
-            damping = max(0.1 * damping, _LEAST_DAMPING)
-            equations = _equations(part, whiten, residuals, robust)
-        elif small or gain <= _COST_TOLERANCE * cost or damping > _MOST_DAMPING:
-            break
-        else:
-            damping *= 10.0
+    part = minimised(part, linearise, Bundle.moved, tolerance)
     return replace(part, seen=bundle.seen, view=bundle.view)
 
 
@@ -172,47 +263,10 @@ def _cost(residuals: FloatArray, robust: bool) -> float:
     return _ROBUST_SCALE**2 * float(np.sum(np.sqrt(1.0 + squares) - 1.0))
 
 
-def _equations(
-    bundle: Bundle, whiten: Whiteners, residuals: FloatArray, robust: bool
-) -> NormalEquations:
-    """Normal equations of the loss: soft l1 if robust, with its curvature (Triggs, section 4.3)."""
-    squares = np.square(residuals / _ROBUST_SCALE) if robust else np.zeros_like(residuals)
-    return normal_equations(
-        bundle,
-        whitened_derivatives(bundle, whiten),
-        residuals,
-        (1.0 + squares) ** -0.5,
-        (1.0 + squares) ** -1.5,
-    )
-
-
-def _damped_step(
-    equations: NormalEquations, damping: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """The step for a damping relative to the diagonal, and by how much it should lower the cost."""
-    of_shared, of_bodies = (
-        # Parameters on which no residual depends are kept fixed.
-        damping * np.where(diagonal > 0.0, diagonal, 1.0)
-        for diagonal in equations.diagonals
-    )
-    shared, bodies = equations.step(of_shared, of_bodies)
-    gain = 0.5 * (
-        float(shared @ (of_shared * shared - equations.shared_gradient))
-        + float(np.sum(bodies * (of_bodies * bodies - equations.body_gradient)))
-    )
-    return shared, bodies, gain
-
-
-def _moved(bundle: Bundle, shared: FloatArray, bodies: FloatArray) -> Bundle:
-    steps = shared.reshape(-1, 6)
-    cameras = int(bundle.free_camera.sum())
-    return bundle.moved(steps[:cameras], bodies, steps[cameras:])
-
-
 def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
     """Each view's normalised error, and its root mean square residual in pixels."""
     difference = bundle.seen.pixels - bundle.pixels()
-    white = (Whiteners.of(bundle).points @ difference[..., None])[..., 0]
+    white = (whitening(bundle.seen.covariances) @ difference[..., None])[..., 0]
     count = 2 * np.maximum(np.bincount(bundle.view), 1)
     errors = np.sqrt(np.bincount(bundle.view, np.sum(white**2, axis=1)) / count)
     rms = np.sqrt(np.bincount(bundle.view, np.sum(difference**2, axis=1)) / count)
@@ -221,46 +275,33 @@ def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
 
 def _result(bundle: Bundle, used: BoolArray) -> AdjustedBundle:
     part = bundle.only(used)
-    whiten = Whiteners.of(part)
-    residuals = whitened_residuals(part, whiten)
-    information = _equations(part, whiten, residuals, robust=False).shared_information()
-    covariance = inverted_information(information)
-    errors, rms = _view_figures(bundle)
-    cameras, parts = 6 * len(bundle.free_camera), 6 * len(bundle.free_part)
-    camera_index = np.flatnonzero(np.repeat(bundle.free_camera, 6))
-    part_index = np.flatnonzero(np.repeat(bundle.free_part, 6))
-    camera_covariance, part_covariance = np.zeros((cameras, cameras)), np.zeros((parts, parts))
-    split = len(camera_index)
-    camera_covariance[np.ix_(camera_index, camera_index)] = covariance[:split, :split]
-    part_covariance[np.ix_(part_index, part_index)] = covariance[split:, split:]
+    residuals = whitened_residuals(part)
+    shared = len(bundle.free_camera) + len(bundle.free_part)
+    free = bundle.free[:shared]
+    covariance = np.zeros((6 * shared, 6 * shared))
+    at = np.flatnonzero(np.repeat(free, 6))
+    covariance[np.ix_(at, at)] = inverted_information(_shared_information(part, len(at)))
+    cameras = 6 * len(bundle.free_camera)
     return AdjustedBundle(
         bundle,
         used,
         bundle.seen.pixels - bundle.pixels(),
-        errors,
-        rms,
         float(residuals @ residuals),
         len(residuals) - bundle.unknowns,
-        camera_covariance,
-        part_covariance,
+        covariance[:cameras, :cameras],
+        covariance[cameras:, cameras:],
     )
 
 
-def inverted_information(information: FloatArray) -> FloatArray:
-    """Covariance of an information matrix.
-
-    Raises
-    ------
-    GeometryError
-        If it is singular: something that is free was not seen.
-    """
-    if not len(information):
-        return information
-    scale = np.sqrt(np.clip(np.diagonal(information), 0.0, None))
-    if not np.all(scale > 0.0):
-        raise GeometryError(UNDETERMINED)
-    normalised = information / scale[:, None] / scale[None, :]
-    if np.linalg.eigvalsh(normalised)[0] < 1e-12:
-        raise GeometryError(UNDETERMINED)
-    covariance = np.linalg.inv(normalised) / scale[:, None] / scale[None, :]
-    return np.asarray(0.5 * (covariance + covariance.T))
+def _shared_information(bundle: Bundle, shared: int) -> FloatArray:
+    """Inverse covariance of the first unknowns, those of cameras and parts; bodies marginalised."""
+    jacobian = whitened_jacobian(bundle)
+    normal = (jacobian.T @ jacobian).tocsr()
+    coupling = normal[shared:, :shared].toarray()
+    information = normal[:shared, :shared].toarray()
+    if not len(coupling):
+        return np.asarray(information)
+    try:
+        return np.asarray(information - coupling.T @ solved(normal[shared:, shared:], coupling))
+    except np.linalg.LinAlgError:
+        raise GeometryError(UNDETERMINED) from None

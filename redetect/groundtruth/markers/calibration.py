@@ -17,39 +17,26 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.transforms import quaternion_xyzw, transform_from_quaternion
-from redetect.groundtruth.json_file import read_json, write_json
+from redetect.groundtruth.files import covariance_of, is_number, numbers, read_json, write_json
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
 
-_LARGEST_NUMBER = 1e100
 _QUATERNION_TOLERANCE = 1e-3
-_LARGEST_NEGATIVE_EIGENVALUE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Square markers on a robot.
+    """Square markers on a robot."""
 
-    Attributes
-    ----------
-    dictionary : str
-        Which set of markers the identifiers are from.
-    ids : tuple of int
-        The markers, M of them.
-    widths_m : (M,) float64
-        Widths of the black squares.
-    robot_from_marker : (M, 4, 4) float64
-        Marker frame: origin at the centre, x right, y up, z out of the printed face.
-    covariance : (6 M, 6 M) float64
-        Joint covariance of the poses' right perturbations (m, rad); zeros where exactly known.
-    """
-
-    dictionary: str
-    ids: tuple[int, ...]
-    widths_m: FloatArray
+    dictionary: str  # Which set of markers the identifiers are from
+    ids: tuple[int, ...]  # The markers, M of them
+    widths_m: FloatArray  # (M,): widths of the black squares
+    # (M, 4, 4): marker frame: origin at the centre, x right, y up, z out of the printed face
     robot_from_marker: FloatArray
+    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
+    # known.
     covariance: FloatArray
 
     @property
@@ -60,25 +47,15 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Cameras fixed in the world.
+    """Cameras fixed in the world."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The cameras, C of them.
-    cameras : tuple of Camera
-        Their calibrations. The mounting that a ``.cam`` file holds means nothing here.
-    calibrations : tuple of str
-        Their files, relative to the folder of the network's own.
-    world_from_camera : (C, 4, 4) float64
-    covariance : (6 C, 6 C) float64
-        Joint covariance of the poses' right perturbations (m, rad); zeros where exactly known.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # The cameras, C of them
+    # Their calibrations. The mounting that a ``.cam`` file holds means nothing here.
     cameras: tuple[Camera, ...]
-    calibrations: tuple[str, ...]
-    world_from_camera: FloatArray
+    calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's own
+    world_from_camera: FloatArray  # (C, 4, 4)
+    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
+    # known.
     covariance: FloatArray
 
 
@@ -90,10 +67,6 @@ def marker_corners(width_m: float) -> FloatArray:
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
     """Read a ``rig.json``.
-
-    Parameters
-    ----------
-    path : path
 
     Returns
     -------
@@ -120,7 +93,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     widths = []
     for marker in ids:
         width = by_id[marker].get("width_m")
-        if width is None or not _is_number(width) or not width > 0.0:
+        if not is_number(width) or not width > 0.0:
             raise GroundTruthError(
                 f"{path}: marker {marker}: width_m is {excerpt(width)}: expected metres above 0"
             )
@@ -135,10 +108,6 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 def read_network(path: str | os.PathLike[str]) -> Network:
     """Read a ``network.json`` and the calibrations that it names.
-
-    Parameters
-    ----------
-    path : path
 
     Returns
     -------
@@ -248,21 +217,9 @@ def _entries(
     return entries
 
 
-def _is_number(value: Any) -> bool:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return abs(value) <= _LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
-
-
-def _vector(place: str, value: Any, length: int) -> FloatArray:
-    if not isinstance(value, list) or len(value) != length or not all(map(_is_number, value)):
-        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {length} finite numbers")
-    return np.array(value, dtype=np.float64)
-
-
 def _pose(place: str, entry: dict[str, Any]) -> FloatArray:
-    translation = _vector(f"{place}: translation_m", entry.get("translation_m"), 3)
-    quaternion = _vector(f"{place}: quaternion_xyzw", entry.get("quaternion_xyzw"), 4)
+    translation = numbers(f"{place}: translation_m", entry.get("translation_m"), 3)
+    quaternion = numbers(f"{place}: quaternion_xyzw", entry.get("quaternion_xyzw"), 4)
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) <= _QUATERNION_TOLERANCE:
         raise GroundTruthError(
@@ -272,13 +229,7 @@ def _pose(place: str, entry: dict[str, Any]) -> FloatArray:
 
 
 def parse_pose(place: str, entry: Any) -> FloatArray:
-    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw.
-
-    Raises
-    ------
-    GroundTruthError
-        If it is none; the message names `place`.
-    """
+    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw."""
     if not isinstance(entry, dict):
         raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
     return _pose(place, entry)
@@ -289,22 +240,17 @@ def parse_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
 
     ``covariance`` is a 6x6 matrix of the right perturbation (translation m, rotation rad);
     ``sigmas`` six standard deviations in the same order.
-
-    Raises
-    ------
-    GroundTruthError
-        If it has both, or an invalid one; the message names `place`.
     """
     matrix, sigmas = entry.get("covariance"), entry.get("sigmas")
     if matrix is not None and sigmas is not None:
         raise GroundTruthError(f"{place}: has covariance and sigmas: expected one of them")
     if sigmas is not None:
-        values = _vector(f"{place}: sigmas", sigmas, 6)
+        values = numbers(f"{place}: sigmas", sigmas, 6)
         if np.any(values < 0.0):
             raise GroundTruthError(f"{place}: sigmas: expected 0 or more")
         return np.diag(values**2)
     if matrix is not None:
-        return _covariance(f"{place}: covariance", matrix, 6)
+        return covariance_of(f"{place}: covariance", matrix, 6)
     return np.zeros((6, 6))
 
 
@@ -333,20 +279,6 @@ def _joint_covariance(
         raise GroundTruthError(
             f"{path}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
         )
-    matrix = _covariance(f"{path}: covariance", joint.get("matrix"), size)
+    matrix = covariance_of(f"{path}: covariance", joint.get("matrix"), size)
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])
-
-
-def _covariance(place: str, value: Any, size: int) -> FloatArray:
-    if not isinstance(value, list) or len(value) != size:
-        raise GroundTruthError(f"{place}: expected {size} rows of {size} numbers")
-    matrix = np.stack([_vector(f"{place}: row {i + 1}", row, size) for i, row in enumerate(value)])
-    scale = np.sqrt(np.clip(np.diagonal(matrix), 0.0, None))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    correlation = matrix / safe[:, None] / safe[None, :]
-    if np.abs(correlation - correlation.T).max() > 1e-6:
-        raise GroundTruthError(f"{place}: expected a symmetric matrix")
-    if np.linalg.eigvalsh(correlation)[0] < -_LARGEST_NEGATIVE_EIGENVALUE:
-        raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
-    return np.asarray(0.5 * (matrix + matrix.T))

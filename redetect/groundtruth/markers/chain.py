@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.geometry.transforms import apply, hat, inverse
+from redetect.groundtruth.trajectories.transforms import apply, hat, inverse
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,26 +25,15 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ChainPoints:
-    """Points seen in images.
+    """Points seen in images."""
 
-    Attributes
-    ----------
-    camera, body, part : (N,) int64
-        Which camera, body and part each point belongs to.
-    points : (N, 3) float64
-        In the part's frame (m).
-    pixels : (N, 2) float64
-        Where they were seen, lens distortion included (px).
-    covariances : (N, 2, 2) float64
-        Of the pixels (px^2), positive definite.
-    """
-
+    # `camera`, `body`, `part`: (N,): which camera, body and part each point belongs to
     camera: IntArray
     body: IntArray
     part: IntArray
-    points: FloatArray
-    pixels: FloatArray
-    covariances: FloatArray
+    points: FloatArray  # (N, 3): in the part's frame (m)
+    pixels: FloatArray  # (N, 2): where they were seen, lens distortion included (px)
+    covariances: FloatArray  # (N, 2, 2): of the pixels (px^2), positive definite
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -63,17 +52,11 @@ class ChainPoints:
 
 @dataclass(frozen=True, eq=False)
 class ChainProjection:
-    """Pixels of points and how they move with right perturbations of the three poses.
+    """Pixels of points and how they move with right perturbations of the three poses."""
 
-    Attributes
-    ----------
-    pixels : (N, 2) float64
-        NaN where a point is not in front of its camera or past the distortion's fold.
-    by_camera, by_body, by_part : (N, 2, 6) float64
-        d(u, v) / d(translation m, rotation rad).
-    """
-
+    # (N, 2): naN where a point is not in front of its camera or past the distortion's fold
     pixels: FloatArray
+    # `by_camera`, `by_body`, `by_part`: (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_camera: FloatArray
     by_body: FloatArray
     by_part: FloatArray
@@ -88,13 +71,8 @@ def project_chain(
 ) -> FloatArray:
     """(N, 2) pixels at which the points would be seen (see `ChainProjection.pixels`).
 
-    Parameters
-    ----------
-    cameras : C cameras
-        Their lenses; the mounting that a `Camera` holds is not used.
-    world_from_camera, world_from_body, body_from_part : (C | B | P, 4, 4) arrays
-    seen : ChainPoints
-        Its pixels are not used.
+    `cameras`: their lenses; the mounting that a `Camera` holds is not used. `world_from_camera`,
+    `world_from_body`, `body_from_part` (C | B | P, 4, 4). `seen`: its pixels are not used.
     """
     in_body = apply(body_from_part[seen.part], seen.points)
     in_world = apply(world_from_body[seen.body], in_body)

@@ -14,77 +14,26 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.transforms import inverse, log_se3, transform
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
-from redetect.groundtruth.markers.bundle import Bundle, PosePrior
+from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
 from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.checkerboard import Checkerboard
 from redetect.groundtruth.markers.pnp import solve_camera
 from redetect.groundtruth.markers.settings import NetworkSettings
+from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class BoardView:
-    """A board in an image.
-
-    Attributes
-    ----------
-    camera : str
-    board : str
-    corners : (K, 2) float64
-        Pixels, in the order of `Checkerboard.points`.
-    """
-
-    camera: str
-    board: str
-    corners: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class DoubleBoard:
-    """Two boards held together.
-
-    Attributes
-    ----------
-    first, second : str
-    offset : (4, 4) float64 or None
-        `first_from_second`; None if it is to be estimated.
-    covariance : (6, 6) float64
-        Of its right perturbation; zeros if it is exactly known.
-    """
-
-    first: str
-    second: str
-    offset: FloatArray | None
-    covariance: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class NetworkEstimate:
-    """A network and what it was made from.
+    """A network and what it was made from."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The cameras.
-    world_from_camera : (C, 4, 4) float64
-    covariance : (6 C, 6 C) float64
-        Joint, scaled by the residuals.
-    offset : (4, 4) float64 or None
-        `first_from_second` of the double board, adjusted.
-    adjusted : AdjustedBundle
-    views : tuple of BoardView
-        The bundle's views.
-    """
-
-    names: tuple[str, ...]
-    world_from_camera: FloatArray
-    covariance: FloatArray
-    offset: FloatArray | None
+    names: tuple[str, ...]  # The cameras
+    world_from_camera: FloatArray  # (C, 4, 4)
+    covariance: FloatArray  # (6 C, 6 C): joint, scaled by the residuals
+    offset: FloatArray | None  # (4, 4): `first_from_second` of the double board, adjusted
     adjusted: AdjustedBundle
-    views: tuple[BoardView, ...]
+    views: tuple[BoardView, ...]  # The bundle's views
 
 
 def estimate_network(
@@ -99,19 +48,12 @@ def estimate_network(
 
     Parameters
     ----------
-    cameras : mapping of str to Camera
-    boards : mapping of str to Checkerboard
     world_from_board : mapping of str to (4, 4) array
         Boards that are fixed in the world.
     double : DoubleBoard or None
         None if all cameras see boards of the world.
     shots : sequence of sequences of BoardView
         Markers seen at one time.
-    settings : NetworkSettings
-
-    Returns
-    -------
-    NetworkEstimate
 
     Raises
     ------
@@ -128,7 +70,7 @@ def estimate_network(
         parts[double.first], parts[double.second] = np.eye(4), offset
     poses, bodies = _chained(names, seen, world_from_board, parts)
     bundle, views = _bundle(
-        names, cameras, boards, world_from_board, parts, double, seen, poses, bodies, settings
+        cameras, boards, world_from_board, parts, double, seen, (poses, bodies), settings
     )
     try:
         adjusted = adjust_bundle(
@@ -259,17 +201,16 @@ def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
 
 
 def _bundle(
-    names: tuple[str, ...],
     cameras: Mapping[str, Camera],
     boards: Mapping[str, Checkerboard],
     world_from_board: Mapping[str, FloatArray],
     parts: Mapping[str, FloatArray],
     double: DoubleBoard | None,
     seen: _Seen,
-    poses: Mapping[str, FloatArray],
-    bodies: Mapping[int, FloatArray],
+    placed: tuple[Mapping[str, FloatArray], Mapping[int, FloatArray]],
     settings: NetworkSettings,
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
+    names, (poses, bodies) = sorted(cameras), placed
     order = sorted(parts)
     body_index = {number: 1 + i for i, number in enumerate(sorted(bodies))}
     views: list[BoardView] = []

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.covariance import (
+from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
+    inverse,
     inverse_covariance,
+    log_se3,
     mean_pose,
 )
-from redetect.groundtruth.geometry.transforms import inverse, log_se3
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -33,46 +34,23 @@ _FLOOR_M, _FLOOR_RAD = 0.002, 0.005
 
 @dataclass(frozen=True, eq=False)
 class MarkerPose:
-    """A marker as seen at one time: its one or two solutions.
+    """A marker as seen at one time: its one or two solutions."""
 
-    Attributes
-    ----------
-    poses : (K, 4, 4) float64
-        `reference_from_marker`, the reference a camera or the world.
-    covariances : (K, 6, 6) float64
-        Of the right perturbations.
-    costs : (K,) float64
-        Squared normalised residuals.
-    """
-
-    poses: FloatArray
-    covariances: FloatArray
-    costs: FloatArray
+    poses: FloatArray  # (K, 4, 4): `reference_from_marker`, the reference a camera or the world
+    covariances: FloatArray  # (K, 6, 6): of the right perturbations
+    costs: FloatArray  # (K,): squared normalised residuals
 
 
 @dataclass(frozen=True, eq=False)
 class PairConsensus:
-    """The pose of one marker relative to another.
+    """The pose of one marker relative to another."""
 
-    Attributes
-    ----------
-    pair : (int, int)
-        Indices a, b.
-    a_from_b : (4, 4) float64
-    covariance : (6, 6) float64
-    estimates : (T, 4, 4) float64
-        Each time's estimate that is closest to the consensus.
-    agrees : (T,) bool
-        Which of them agree with it.
-    first : (T,) bool
-        Whether that is the combination of solutions that fit the image best.
-    """
-
-    pair: tuple[int, int]
-    a_from_b: FloatArray
-    covariance: FloatArray
-    estimates: FloatArray
-    agrees: NDArray[np.bool_]
+    pair: tuple[int, int]  # (int, int): indices a, b
+    a_from_b: FloatArray  # (4, 4)
+    covariance: FloatArray  # (6, 6)
+    estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
+    agrees: NDArray[np.bool_]  # (T,): which of them agree with it
+    # (T,): whether that is the combination of solutions that fit the image best
     first: NDArray[np.bool_]
 
     @property
@@ -97,15 +75,7 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
 def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairConsensus:
     """The transform that most times agree with.
 
-    Parameters
-    ----------
-    pair : (int, int)
-    times : one or more estimates
-        From `pair_estimates`, one for each time that shows both markers.
-
-    Returns
-    -------
-    PairConsensus
+    `pair` (int, int). `times`: from `pair_estimates`, one for each time that shows both markers.
     """
     poses, covariances, costs, owner = _stacked(times)
     # The surest estimates are hypotheses: those of a marker seen large and aslant.
@@ -139,18 +109,8 @@ def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairCo
 def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
     """Each marker's parent in the tree over the best supported pairs (Prim).
 
-    Parameters
-    ----------
-    pairs : mapping of (a, b) to int
-        Support of each pair.
-    count : int
-        Number of markers.
-    root : int
-
-    Returns
-    -------
-    list of int
-        Parents; the root's is itself, -1 for unconnected ones.
+    The root's parent is itself; markers that are not connected have -1. `pairs` is each pair's
+    support.
     """
     parents = [-1] * count
     parents[root] = root
@@ -170,13 +130,7 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
 def chained_poses(
     consensus: Mapping[tuple[int, int], PairConsensus], parents: Sequence[int], root: int
 ) -> FloatArray:
-    """(M, 4, 4) poses `root_from_marker` along a tree that reaches all markers.
-
-    Raises
-    ------
-    GroundTruthError
-        If a marker is not connected.
-    """
+    """(M, 4, 4) poses `root_from_marker` along a tree that reaches all markers."""
     poses: dict[int, FloatArray] = {root: np.eye(4)}
     while len(poses) < len(parents):
         before = len(poses)

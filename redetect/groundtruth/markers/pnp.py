@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.transforms import apply, inverse, transform
 from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.settings import Solver
+from redetect.groundtruth.trajectories.transforms import apply, inverse, transform
 
 FloatArray = NDArray[np.float64]
 
@@ -26,18 +26,11 @@ _RANSAC_PX = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PnpSolution:
-    """A pose that explains the corners.
+    """A pose that explains the corners."""
 
-    Attributes
-    ----------
-    pose : (4, 4) float64
-        `camera_from_object`, or `world_from_robot` where there are several cameras.
-    rms_px : float
-        Root mean square of the residuals per coordinate, in the image as it is.
-    """
-
+    # (4, 4): `camera_from_object`, or `world_from_robot` where there are several cameras
     pose: FloatArray
-    rms_px: float
+    rms_px: float  # Root mean square of the residuals per coordinate, in the image as it is
 
 
 def solve_camera(
@@ -47,7 +40,6 @@ def solve_camera(
 
     Parameters
     ----------
-    camera : Camera
     points : (N, 3) array
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
         frame, as `redetect.groundtruth.markers.calibration.marker_corners` gives them.
@@ -92,22 +84,8 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
     `pycolmap` works on all cameras at once; the others on one camera, so there is a solution for
     each camera, and for `ippe` two for each marker in each image.
 
-    Parameters
-    ----------
-    problem : PoseProblem
-    solver : str
-        As in `solve_camera`.
-
-    Returns
-    -------
-    list of PnpSolution
-        `world_from_robot`, with residuals over all cameras; the best first. Solutions in which a
-        corner is behind its camera are left out.
-
-    Raises
-    ------
-    GeometryError
-        If there is no solution.
+    `solver`: as in `solve_camera`. Returns `world_from_robot`, with residuals over all cameras; the
+    best first. Solutions in which a corner is behind its camera are left out.
     """
     used = np.unique(problem.seen.camera)
     if solver == "pycolmap" and len(used) > 1:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.transforms import inverse, log_se3, rotation_angle
 from redetect.groundtruth.markers.pnp import robot_rms_px, solve_robot, view_poses
 from redetect.groundtruth.markers.refinement import (
     PoseProblem,
@@ -24,6 +23,7 @@ from redetect.groundtruth.markers.refinement import (
     refine_pose,
 )
 from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.trajectories.transforms import inverse, log_se3, rotation_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -40,18 +40,10 @@ _FARTHEST_M = 1e4
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """A pose that may be the robot's.
+    """A pose that may be the robot's."""
 
-    Attributes
-    ----------
-    refined : RefinedPose
-        Over the views that it explains.
-    views : (V,) bool
-        Which of all views those are.
-    """
-
-    refined: RefinedPose
-    views: BoolArray
+    refined: RefinedPose  # Over the views that it explains
+    views: BoolArray  # (V,): which of all views those are
 
     @property
     def world_from_robot(self) -> FloatArray:
@@ -66,21 +58,13 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Pose estimate from the corners of one time.
+    """Pose estimate from the corners of one time."""
 
-    Attributes
-    ----------
-    candidates : tuple of PoseCandidate
-        The best first; several if the markers are ambiguous or contradict each other.
-    log_odds : tuple of float
-        Natural logarithm of how much likelier the first is than each candidate: 0 for the first.
-    contradiction : bool
-        Equally many markers support poses that exclude each other.
-    """
-
+    # The best first; several if the markers are ambiguous or contradict each other.
     candidates: tuple[PoseCandidate, ...]
+    # Natural logarithm of how much likelier the first is than each candidate: 0 for the first
     log_odds: tuple[float, ...]
-    contradiction: bool
+    contradiction: bool  # Equally many markers support poses that exclude each other
 
     @property
     def ambiguous(self) -> bool:
@@ -95,11 +79,6 @@ def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
     ----------
     problem : PoseProblem
         With at least one view.
-    settings : PoseSettings
-
-    Returns
-    -------
-    PoseEstimate
 
     Raises
     ------

@@ -14,16 +14,21 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.transforms import exp_se3
-from redetect.groundtruth.markers.chain import ChainPoints, project_chain_with_jacobians
-from redetect.groundtruth.markers.floor import Floor, floor_residuals
+from redetect.groundtruth.markers.chain import (
+    ChainPoints,
+    project_chain,
+    project_chain_with_jacobians,
+)
+from redetect.groundtruth.markers.least_squares import Linearised, inverted_information, minimised
 from redetect.groundtruth.markers.settings import Loss
+from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -32,37 +37,20 @@ IntArray = NDArray[np.int64]
 
 #: Residuals of a view: two of each corner.
 _ROWS = 8
-_STEPS = 50
 _SMALLEST_STEP = 1e-10
-_LARGEST_DAMPING = 1e10
 
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """The data on a robot's pose at one time.
-
-    Attributes
-    ----------
-    cameras : C cameras
-    world_from_camera : (C, 4, 4) float64
-    robot_from_marker : (M, 4, 4) float64
-    camera_covariance : (6 C, 6 C) float64
-        Of the cameras' right perturbations.
-    marker_covariance : (6 M, 6 M) float64
-        Of the markers' right perturbations.
-    seen : ChainPoints
-        Corners: `camera` and `part` point to cameras and markers, `body` is 0.
-    view : (N,) int64
-        Which marker in which image each corner is of: four of 0, four of 1, up to V - 1.
-    floor : Floor or None
-    """
+    """The data on a robot's pose at one time."""
 
     cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray
-    robot_from_marker: FloatArray
-    camera_covariance: FloatArray
-    marker_covariance: FloatArray
-    seen: ChainPoints
+    world_from_camera: FloatArray  # (C, 4, 4)
+    robot_from_marker: FloatArray  # (M, 4, 4)
+    camera_covariance: FloatArray  # (6 C, 6 C): of the cameras' right perturbations
+    marker_covariance: FloatArray  # (6 M, 6 M): of the markers' right perturbations
+    seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
+    # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
     view: IntArray
     floor: Floor | None = None
 
@@ -93,28 +81,16 @@ class PoseProblem:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A local minimum.
+    """A local minimum."""
 
-    Attributes
-    ----------
-    world_from_robot : (4, 4) float64
-    covariance : (6, 6) float64
-        Of the right perturbation: translation (m) and rotation (rad) in the robot's axes.
-    cost : float
-        Squared Mahalanobis length of all residuals, without robust weights.
-    degrees_of_freedom : int
-    view_errors : (V,) float64
-        Root mean square of each view's normalised residuals: about 1 where all is well.
-    view_rms_px : (V,) float64
-        Root mean square of each view's residuals, per coordinate.
-    """
-
-    world_from_robot: FloatArray
+    world_from_robot: FloatArray  # (4, 4)
+    # (6, 6): of the right perturbation: translation (m) and rotation (rad) in the robot's axes
     covariance: FloatArray
-    cost: float
+    cost: float  # Squared Mahalanobis length of all residuals, without robust weights
     degrees_of_freedom: int
+    # (V,): root mean square of each view's normalised residuals: about 1 where all is well
     view_errors: FloatArray
-    view_rms_px: FloatArray
+    view_rms_px: FloatArray  # (V,): root mean square of each view's residuals, per coordinate
 
     @property
     def rms_px(self) -> float:
@@ -122,9 +98,8 @@ class RefinedPose:
         return float(np.sqrt(np.mean(self.view_rms_px**2)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Linearised:
-    """Residuals and what decides their weights, at one pose."""
+class _Corners(NamedTuple):
+    """Residuals of a problem's corners and what decides their weights, at one pose."""
 
     residuals: FloatArray  # (2 N,)
     jacobian: FloatArray  # (2 N, 6)
@@ -132,17 +107,12 @@ class _Linearised:
 
 
 def refine_pose(
-    problem: PoseProblem,
-    start: FloatArray,
-    *,
-    loss: Loss = "linear",
-    loss_scale: float = 2.0,
+    problem: PoseProblem, start: FloatArray, *, loss: Loss = "linear", loss_scale: float = 2.0
 ) -> RefinedPose:
-    """Go down from a start to the nearest minimum (Levenberg-Marquardt).
+    """Go down from a start to the nearest minimum.
 
     Parameters
     ----------
-    problem : PoseProblem
     start : (4, 4) array
         A pose `world_from_robot` in which all corners are in front of their cameras.
     loss : str
@@ -151,68 +121,59 @@ def refine_pose(
     loss_scale : float
         Normalised error of a view at which the weights begin to fall.
 
-    Returns
-    -------
-    RefinedPose
-
     Raises
     ------
     GeometryError
         If the corners do not determine a pose, or `start` has one behind its camera.
     """
-    calibration = _Calibration.of(problem)
-    pose = start
-    here = _linearise(problem, pose, calibration)
-    if here is None:
+    if _corners(problem, start) is None:
         raise GeometryError("the start has a corner behind its camera or outside its lens")
-    weights = _view_weights(problem, here, loss, loss_scale)
-    damping = 1e-6
-    for _ in range(_STEPS):
-        covariance = _covariance(problem, here, weights)
-        cost, gradient, normal = _normal_equations(problem, pose, here, covariance)
-        there, step = None, np.zeros(6)
-        while damping < _LARGEST_DAMPING:
-            step = _solve(normal + damping * np.diag(np.diagonal(normal)), gradient)
-            ahead = pose @ exp_se3(step)
-            there = _linearise(problem, ahead, calibration)
-            if there is not None:
-                # Weights stay those of this step: a cost that also changes them is no measure.
-                new_cost = _cost(problem, ahead, there, covariance)
-                if new_cost <= cost * (1.0 + 1e-12) + 1e-20:
-                    break
-            there = None
-            damping *= 10.0
-        if there is None:
-            break
-        pose, here = ahead, there
-        weights = _view_weights(problem, here, loss, loss_scale)
-        damping = max(damping * 0.1, 1e-12)
-        if np.abs(step).max() < _SMALLEST_STEP:
-            break
-    return _result(problem, pose, here, weights)
+
+    def linearise(pose: FloatArray) -> Linearised[FloatArray]:
+        here = _corners(problem, pose)
+        assert here is not None
+        # Weights stay those of this step: a cost that also changes them is no measure.
+        covariance = _covariance(problem, here, _view_weights(problem, here, loss, loss_scale))
+        stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
+        products = stacked.T @ np.linalg.solve(covariance, stacked)
+        if problem.floor is not None:
+            missing, by_pose = floor_residuals(pose, problem.floor)
+            of_floor = np.concatenate([missing[:, None], -by_pose], axis=1)
+            products += of_floor.T @ of_floor
+        normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
+        return Linearised(
+            0.5 * float(products[0, 0]),
+            products[1:, 0],
+            normal,
+            lambda ahead: 0.5 * _cost(problem, ahead, covariance),
+        )
+
+    pose = minimised(start, linearise, lambda pose, step: pose @ exp_se3(step), _SMALLEST_STEP)
+    here = _corners(problem, pose)
+    assert here is not None
+    squares = np.sum(here.residuals.reshape(-1, 2) ** 2, axis=1)
+    count = np.bincount(problem.view, minlength=problem.views)
+    return RefinedPose(
+        pose,
+        inverted_information(linearise(pose).normal),
+        _cost(problem, pose, _covariance(problem, here, np.ones(problem.views))),
+        len(here.residuals) + (0 if problem.floor is None else 3) - 6,
+        _view_errors(problem, here),
+        np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
+    )
 
 
 def predicted_errors(
     problem: PoseProblem, pose: FloatArray, pose_covariance: FloatArray
 ) -> FloatArray:
-    """Normalised errors of all views at a pose that was estimated without them.
+    """(V,) normalised errors of all views at a pose that was estimated without them.
 
-    Parameters
-    ----------
-    problem : PoseProblem
-    pose : (4, 4) array
-    pose_covariance : (6, 6) array
-        Of its right perturbation.
-
-    Returns
-    -------
-    (V,) array
-        As `RefinedPose.view_errors`; infinite where a view cannot be seen from there.
+    Infinite where a view cannot be seen from there.
     """
     errors = np.full(problem.views, np.inf)
     for view in range(problem.views):
         alone = problem.only(np.arange(problem.views) == view)
-        here = _linearise(alone, pose, _Calibration.of(alone))
+        here = _corners(alone, pose)
         if here is not None:
             covariance = _covariance(alone, here, np.ones(1))
             covariance += here.jacobian @ pose_covariance @ here.jacobian.T
@@ -220,64 +181,23 @@ def predicted_errors(
     return errors
 
 
-@dataclass(frozen=True, eq=False)
-class _Calibration:
-    """Cameras and markers in use, and the covariances of their poses."""
-
-    cameras: IntArray
-    markers: IntArray
-    camera_covariance: FloatArray
-    marker_covariance: FloatArray
-
-    @classmethod
-    def of(cls, problem: PoseProblem) -> _Calibration:
-        cameras, markers = np.unique(problem.seen.camera), np.unique(problem.seen.part)
-        return cls(
-            cameras,
-            markers,
-            _block(problem.camera_covariance, cameras),
-            _block(problem.marker_covariance, markers),
-        )
-
-
-def _block(covariance: FloatArray, used: IntArray) -> FloatArray:
-    """The covariance of those in use; (0, 0) if they are exactly known."""
-    index = (6 * used[:, None] + np.arange(6)).ravel()
-    block = covariance[np.ix_(index, index)]
-    return block if np.any(block) else np.zeros((0, 0))
-
-
-def _linearise(
-    problem: PoseProblem, pose: FloatArray, calibration: _Calibration
-) -> _Linearised | None:
+def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
+    """None if one cannot be seen."""
+    seen = problem.seen
     projection = project_chain_with_jacobians(
-        problem.cameras,
-        problem.world_from_camera,
-        pose[None],
-        problem.robot_from_marker,
-        problem.seen,
+        problem.cameras, problem.world_from_camera, pose[None], problem.robot_from_marker, seen
     )
-    residuals = (problem.seen.pixels - projection.pixels).ravel()
+    residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
         return None
     common = np.zeros((len(residuals), len(residuals)))
-    for used, index, covariance, jacobian in (
-        (
-            calibration.cameras,
-            problem.seen.camera,
-            calibration.camera_covariance,
-            projection.by_camera,
-        ),
-        (
-            calibration.markers,
-            problem.seen.part,
-            calibration.marker_covariance,
-            projection.by_part,
-        ),
+    for jacobian, index, covariance in (
+        (projection.by_camera, seen.camera, problem.camera_covariance),
+        (projection.by_part, seen.part, problem.marker_covariance),
     ):
-        if len(covariance):
-            common += _common(jacobian, np.searchsorted(used, index), covariance)
-    return _Linearised(residuals, projection.by_body.reshape(-1, 6), common)
+        if np.any(covariance):
+            common += _common(jacobian, index, covariance)
+    return _Corners(residuals, projection.by_body.reshape(-1, 6), common)
 
 
 def _common(jacobian: FloatArray, index: IntArray, covariance: FloatArray) -> FloatArray:
@@ -293,7 +213,7 @@ def _common(jacobian: FloatArray, index: IntArray, covariance: FloatArray) -> Fl
     return blocks.transpose(1, 0, 2).reshape(2 * count, 2 * count)
 
 
-def _covariance(problem: PoseProblem, here: _Linearised, weights: FloatArray) -> FloatArray:
+def _covariance(problem: PoseProblem, here: _Corners, weights: FloatArray) -> FloatArray:
     """S (2 N, 2 N), with more noise in views of little weight."""
     count = len(problem.seen)
     noise = np.zeros((count, 2, count, 2))
@@ -302,23 +222,19 @@ def _covariance(problem: PoseProblem, here: _Linearised, weights: FloatArray) ->
     return np.asarray(noise.reshape(2 * count, 2 * count) + here.common)
 
 
-def _normal_equations(
-    problem: PoseProblem, pose: FloatArray, here: _Linearised, covariance: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Cost, gradient (6,) and normal matrix (6, 6)."""
-    stacked = np.concatenate([here.residuals[:, None], here.jacobian], axis=1)
-    products = stacked.T @ np.linalg.solve(covariance, stacked)
-    if problem.floor is not None:
-        missing, by_pose = floor_residuals(pose, problem.floor)
-        of_floor = np.concatenate([missing[:, None], by_pose], axis=1)
-        products += of_floor.T @ of_floor
-    return float(products[0, 0]), products[1:, 0], 0.5 * (products[1:, 1:] + products[1:, 1:].T)
-
-
-def _cost(
-    problem: PoseProblem, pose: FloatArray, here: _Linearised, covariance: FloatArray
-) -> float:
-    cost = float(here.residuals @ np.linalg.solve(covariance, here.residuals))
+def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> float:
+    """Squared Mahalanobis length of all residuals; infinite where a corner cannot be seen."""
+    pixels = project_chain(
+        problem.cameras,
+        problem.world_from_camera,
+        pose[None],
+        problem.robot_from_marker,
+        problem.seen,
+    )
+    residuals = (problem.seen.pixels - pixels).ravel()
+    if not np.all(np.isfinite(residuals)):
+        return np.inf
+    cost = float(residuals @ np.linalg.solve(covariance, residuals))
     if problem.floor is not None:
         cost += float(np.sum(floor_residuals(pose, problem.floor)[0] ** 2))
     return cost
@@ -328,7 +244,7 @@ def _normalised_rms(residuals: FloatArray, covariance: FloatArray) -> float:
     return float(np.sqrt(residuals @ np.linalg.solve(covariance, residuals) / len(residuals)))
 
 
-def _view_errors(problem: PoseProblem, here: _Linearised) -> FloatArray:
+def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
     covariance = _covariance(problem, here, np.ones(problem.views))
     views = np.arange(problem.views)
     own = covariance.reshape(len(views), _ROWS, len(views), _ROWS)[views, :, views, :]
@@ -338,7 +254,7 @@ def _view_errors(problem: PoseProblem, here: _Linearised) -> FloatArray:
 
 
 def _view_weights(
-    problem: PoseProblem, here: _Linearised, loss: Loss, loss_scale: float
+    problem: PoseProblem, here: _Corners, loss: Loss, loss_scale: float
 ) -> FloatArray:
     if loss == "linear":
         return np.ones(problem.views)
@@ -348,29 +264,28 @@ def _view_weights(
     return np.asarray(1.0 / (1.0 + relative**2))
 
 
-def _solve(normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    try:
-        return np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        raise GeometryError("the corners do not determine a pose") from None
+@dataclass(frozen=True)
+class Floor:
+    """z, roll and pitch of a robot on the floor, with standard deviations."""
+
+    z_m: float
+    sigma_z_m: float
+    sigma_tilt_rad: float
 
 
-def _result(
-    problem: PoseProblem, pose: FloatArray, here: _Linearised, weights: FloatArray
-) -> RefinedPose:
-    _, _, normal = _normal_equations(problem, pose, here, _covariance(problem, here, weights))
-    unweighted = _covariance(problem, here, np.ones(problem.views))
-    try:
-        covariance = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        raise GeometryError("the corners do not determine a pose") from None
-    squares = np.sum(here.residuals.reshape(-1, 2) ** 2, axis=1)
-    count = np.bincount(problem.view, minlength=problem.views)
-    return RefinedPose(
-        pose,
-        np.asarray(0.5 * (covariance + covariance.T)),
-        _cost(problem, pose, here, unweighted),
-        len(here.residuals) + (0 if problem.floor is None else 3) - 6,
-        _view_errors(problem, here),
-        np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
-    )
+def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatArray]:
+    """Deviation of a pose from the floor's z, roll, pitch: (3,) normalised, and (3, 6) Jacobian.
+
+    The Jacobian is that of the normalised z, roll and pitch by the pose's right perturbation.
+    """
+    sigmas = np.array([floor.sigma_z_m, floor.sigma_tilt_rad, floor.sigma_tilt_rad])
+    roll, pitch = roll_pitch(pose)
+    missing = np.array([floor.z_m - pose[2, 3], -roll, -pitch])
+    up = pose[2, :3]  # the world's vertical in the robot's axes; it turns by up x w
+    jacobian = np.zeros((3, 6))
+    jacobian[0, :3] = up
+    by_rotation = np.array([[0, -up[2], up[1]], [up[2], 0, -up[0]], [-up[1], up[0], 0]])
+    across = up[1] ** 2 + up[2] ** 2
+    jacobian[1, 3:] = (up[2] * by_rotation[1] - up[1] * by_rotation[2]) / across
+    jacobian[2, 3:] = -by_rotation[0] / np.sqrt(across)
+    return missing / sigmas, jacobian / sigmas[:, None]

@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.transforms import inverse
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, adjust_bundle
-from redetect.groundtruth.markers.bundle import Bundle, PosePrior
+from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
 from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.pairs import (
@@ -32,8 +30,11 @@ from redetect.groundtruth.markers.pnp import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
 from redetect.groundtruth.markers.settings import RigSettings
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
 
 FloatArray = NDArray[np.float64]
+
 
 # Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
 _WRONG_PX = 20.0
@@ -41,36 +42,18 @@ _WRONG_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """A rig in the frame of one of its markers, and what it was made from.
+    """A rig in the frame of one of its markers, and what it was made from."""
 
-    Attributes
-    ----------
-    rig : Rig
-        `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the
-        residuals where those are larger than the corners' covariances say.
-    reference : int
-        The marker whose frame it is.
-    pairs : dict of (int, int) to PairConsensus
-        By indices of the rig.
-    parents : tuple of int
-        The tree: each marker's index of the marker that it was chained to.
-    adjusted : AdjustedBundle
-    views : tuple of View
-        The bundle's views.
-    times : int
-        How many times (images, without a network) were used.
-    left_out : dict of int to str
-        Markers that were found but are not in the rig, with the reason.
-    """
-
+    # `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the residuals
+    # where those are larger than the corners' covariances say.
     rig: Rig
-    reference: int
-    pairs: dict[tuple[int, int], PairConsensus]
-    parents: tuple[int, ...]
+    reference: int  # The marker whose frame it is
+    pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
+    parents: tuple[int, ...]  # The tree: each marker's index of the marker that it was chained to
     adjusted: AdjustedBundle
-    views: tuple[View, ...]
-    times: int
-    left_out: dict[int, str]
+    views: tuple[View, ...]  # The bundle's views
+    times: int  # How many times (images, without a network) were used
+    left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
 
 
 def estimate_rig(
@@ -90,21 +73,14 @@ def estimate_rig(
     ----------
     groups : sequence of sequences of MarkerFrame
         Images taken at one time; single ones where the cameras are not calibrated to each other.
-    cameras : C cameras
     world_from_camera : (C, 4, 4) array
         Identities where the cameras are not calibrated to each other.
     widths_m : mapping of int to float
         Widths of the markers that may be in the rig, by ID.
-    dictionary : str
-    settings : RigSettings
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
     camera_covariance : (6 C, 6 C) array, optional
         Covariance of the cameras' relative poses, a prior of their adjustment.
-
-    Returns
-    -------
-    RigEstimate
 
     Raises
     ------
@@ -352,3 +328,123 @@ def _best_start(
             if total < least:
                 best, least = pose, total
     return best
+
+
+# Exactly known poses are held to a micrometre and a microradian.
+_EXACT = 1e-12
+# Assumed deviations of a reference pose without covariance (m, rad), and of any one's level.
+_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
+
+
+def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSettings) -> RigEstimate:
+    """Put a rig into the frame in which some of its markers are known.
+
+    Parameters
+    ----------
+    known : Rig
+        One or more of its markers in the robot's frame; their covariances, apart from each other,
+        are their priors'.
+
+    Raises
+    ------
+    GroundTruthError
+        If the rig has none of them.
+    """
+    ids = estimate.rig.ids
+    common = [marker for marker in ids if marker in known.ids]
+    if not common:
+        raise GroundTruthError(f"the rig has markers {list(ids)}, none of {list(known.ids)}")
+    priors, starts = [], []
+    for marker in common:
+        i, j = ids.index(marker), known.ids.index(marker)
+        covariance = known.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] + _EXACT * np.eye(6)
+        priors.append(PosePrior("part", i, known.robot_from_marker[j], covariance))
+        starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
+    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    return _readjusted(estimate, start, tuple(priors), settings)
+
+
+def rig_by_reference_poses(
+    estimate: RigEstimate, reference: PlanarPoses, settings: RigSettings
+) -> tuple[RigEstimate, int]:
+    """Put a rig into the frame of a robot whose poses are known at some times.
+
+    Parameters
+    ----------
+    estimate : RigEstimate
+        Made with a network, whose world is that of the poses.
+    reference : PlanarPoses
+        The robot standing level.
+    settings : RigSettings
+        With the tolerance between a pose's time and an image's.
+
+    Returns
+    -------
+    int
+        How many times have a known pose.
+
+    Raises
+    ------
+    GroundTruthError
+        If none has one.
+    """
+    bundle = estimate.adjusted.bundle
+    body_of_view = bundle.seen.body[np.searchsorted(bundle.view, np.arange(len(estimate.views)))]
+    priors, starts = [], []
+    for body in range(len(bundle.world_from_body)):
+        times = [view.frame.time_s for view, b in zip(estimate.views, body_of_view) if b == body]
+        k = int(np.argmin(np.abs(reference.times_s - np.mean(times))))
+        if abs(reference.times_s[k] - float(np.mean(times))) > settings.time_tolerance_s:
+            continue
+        x, y, theta = reference.poses[k]
+        pose = planar_transform(float(x), float(y), float(theta))
+        covariance = _reference_covariance(reference, k, pose)
+        priors.append(PosePrior("body", body, pose, covariance))
+        starts.append(inverse(pose) @ bundle.world_from_body[body])
+    if not priors:
+        raise GroundTruthError(
+            "no images show two markers of the rig at the time of any reference pose"
+        )
+    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    return _readjusted(estimate, start, tuple(priors), settings), len(priors)
+
+
+def _reference_covariance(reference: PlanarPoses, k: int, pose: FloatArray) -> FloatArray:
+    """(6, 6) covariance of a known pose's right perturbation."""
+    covariance = np.diag(np.square([_REFERENCE_SIGMA_M] * 3 + [_REFERENCE_SIGMA_RAD] * 3))
+    if reference.covariances is not None:
+        turn = np.eye(3)
+        turn[:2, :2] = pose[:2, :2].T
+        planar = turn @ reference.covariances[k] @ turn.T
+        covariance[np.ix_([0, 1, 5], [0, 1, 5])] = planar + _EXACT * np.eye(3)
+    return covariance
+
+
+def _readjusted(
+    estimate: RigEstimate,
+    robot_from_rig: FloatArray,
+    priors: tuple[PosePrior, ...],
+    settings: RigSettings,
+) -> RigEstimate:
+    bundle = estimate.adjusted.bundle
+    seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body)
+    moved = replace(
+        bundle,
+        world_from_body=bundle.world_from_body @ inverse(robot_from_rig),
+        body_from_part=robot_from_rig @ bundle.body_from_part,
+        free_body=seen,
+        free_part=np.ones(len(bundle.free_part), dtype=np.bool_),
+        priors=(*(p for p in bundle.priors if p.kind == "camera"), *priors),
+    )
+    try:
+        adjusted = adjust_bundle(
+            moved, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
+        )
+    except GeometryError as error:
+        raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
+    rig = replace(
+        estimate.rig,
+        robot_from_marker=adjusted.bundle.body_from_part,
+        covariance=adjusted.part_covariance * max(1.0, adjusted.reduced_cost),
+    )
+    return replace(estimate, rig=rig, adjusted=adjusted)

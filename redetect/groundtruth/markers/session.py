@@ -11,8 +11,7 @@ import numpy as np
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
 from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.floor import Floor
-from redetect.groundtruth.markers.refinement import PoseProblem
+from redetect.groundtruth.markers.refinement import Floor, PoseProblem
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import MarkerLandmark, read_frames
@@ -27,20 +26,10 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".b
 
 @dataclass(frozen=True)
 class MarkerFrame:
-    """The markers found in one image.
+    """The markers found in one image."""
 
-    Attributes
-    ----------
-    camera : int
-        Index of the camera.
-    prefix : str
-        The image's name.
-    time_s : float
-    markers : tuple of MarkerLandmark
-    """
-
-    camera: int
-    prefix: str
+    camera: int  # Index of the camera
+    prefix: str  # The image's name
     time_s: float
     markers: tuple[MarkerLandmark, ...]
 
@@ -57,24 +46,9 @@ class View:
 def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Path], Path]:
     """The run folders and the network file that a command line means.
 
-    Parameters
-    ----------
-    paths : one or more paths
-        A session (a folder with one run folder per camera), or the run folders themselves.
-    network_path : path, optional
-        By default ``network.json`` in the session, or beside the run folders.
-
-    Returns
-    -------
-    list of path
-        Run folders; for a session all that have found markers.
-    path
-        The network file.
-
-    Raises
-    ------
-    GroundTruthError
-        If a folder does not exist, or a session has no run with found markers.
+    `paths`: a session (a folder with one run folder per camera), or the run folders themselves.
+    `network_path`: by default ``network.json`` in the session, or beside the run folders. Returns
+    run folders; for a session all that have found markers. the network file.
     """
     for path in paths:
         if not path.is_dir():
@@ -94,28 +68,10 @@ def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Pa
 def read_marker_frames(
     run: Path, camera: int, *, detected: Path | None = None, timed: bool = True
 ) -> list[MarkerFrame]:
-    """Read the markers found in a run's images, and the images' times.
+    """The markers found in a run's images, in the file's order, and the images' times.
 
-    Parameters
-    ----------
-    run : path
-        Folder with ``detected.markers`` and ``<name>.times``.
-    camera : int
-        Index that the frames will carry.
-    detected : path, optional
-        The file of markers, if it is another one.
-    timed : bool
-        Whether times are needed; without, frames are numbered.
-
-    Returns
-    -------
-    list of MarkerFrame
-        In the file's order.
-
-    Raises
-    ------
-    GroundTruthError, redetect.landmarks.LandmarkFileError
-        If a file cannot be read, or an image has no time.
+    The run folder has ``detected.markers`` (or `detected`) and ``<name>.times``. Frames are
+    numbered instead if they need not be `timed`.
     """
     path = detected if detected is not None else run / DETECTED_NAME
     times: dict[str, float] = {}
@@ -138,18 +94,9 @@ def read_marker_frames(
 def group_by_time(
     frames: Sequence[MarkerFrame], tolerance_s: float
 ) -> list[tuple[MarkerFrame, ...]]:
-    """Put images of different cameras together whose times agree.
+    """Groups of images of different cameras, in order of time.
 
-    Parameters
-    ----------
-    frames : sequence of MarkerFrame
-    tolerance_s : float
-        A group's images lie within this of its first; each camera is in it once.
-
-    Returns
-    -------
-    list of groups
-        In the order of their times.
+    A group's images lie within the tolerance of its first; each camera is in it once.
     """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
@@ -179,13 +126,7 @@ def rig_views(group: Sequence[MarkerFrame], rig: Rig) -> list[View]:
 def chain_points(
     views: Sequence[View], widths_m: Sequence[float], corner_floor_px: float
 ) -> ChainPoints:
-    """Corners of views as points of a chain, with body 0 and the rig's markers as parts.
-
-    Raises
-    ------
-    GroundTruthError
-        If a corner's covariance, with the floor added, is none.
-    """
+    """Corners of views as points of a chain, with body 0 and the rig's markers as parts."""
     cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
     parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
     points = np.zeros((0, 3))
@@ -233,13 +174,7 @@ def pose_problem(
 
 
 def _times_by_name(path: Path) -> dict[str, float]:
-    """Times of images by their names without folder and ending, of which none may be there twice.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or two of its images are called alike.
-    """
+    """Times of images by their names without folder and ending, all of them different."""
     times: dict[str, float] = {}
     prefixes: dict[str, str] = {}
     for prefix, time_s in read_times(path).items():

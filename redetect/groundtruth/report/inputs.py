@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.json_file import read_json_value
+from redetect.groundtruth.files import read_json_value
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.trajectories.alignment import align_poses
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.storage.bounded import read_bounded
 
@@ -46,67 +45,32 @@ class Interval:
 
 @dataclass
 class Inputs:
-    """All that the page shows.
+    """All that the page shows."""
 
-    Attributes
-    ----------
-    name : str
-        Of the session.
-    building : (S, 4) float64 or None
-    streams : dict of str to PlanarPoses
-        By the names in `STREAMS`, as far as they are there.
-    odometry : PlanarPoses or None
-        On the ground truth's clock, moved rigidly onto the truth in each visit.
-    truth : PlanarPoses or None
-    clock : ClockModel or None
-    documents : dict of str to dict
-        Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`.
-    sets : dict of str to int
-        Numbers of sets of scans by status.
-    intervals : list of Interval
-        Where the laser's track was not determined within visits.
-    picture : bytes or None
-        Plots of the validation (PNG).
-    visits : list of (float, float)
-        Times between which the robot was in the covered area.
-    missing : list of str
-        Missing files.
-    problems : list of str
-        Files that cannot be read.
-    """
-
-    name: str
-    building: FloatArray | None = None
+    name: str  # Of the session
+    building: FloatArray | None = None  # (S, 4)
+    # By the names in `STREAMS`, as far as they are there
     streams: dict[str, PlanarPoses] = field(default_factory=dict)
+    # On the ground truth's clock, moved rigidly onto the truth in each visit
     odometry: PlanarPoses | None = None
     truth: PlanarPoses | None = None
     clock: ClockModel | None = None
+    # Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`
     documents: dict[str, dict[str, Any]] = field(default_factory=dict)
-    sets: dict[str, int] = field(default_factory=dict)
+    sets: dict[str, int] = field(default_factory=dict)  # Numbers of sets of scans by status
+    # Where the laser's track was not determined within visits
     intervals: list[Interval] = field(default_factory=list)
-    picture: bytes | None = None
+    picture: bytes | None = None  # Plots of the validation (PNG)
+    # Times between which the robot was in the covered area
     visits: list[tuple[float, float]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # Missing files
+    problems: list[str] = field(default_factory=list)  # Files that cannot be read
 
 
 def gather(session: Path, truth: Path | None = None) -> Inputs:
     """Read the files of a session.
 
-    Parameters
-    ----------
-    session : Path
-    truth : Path, optional
-        True poses; by default ``truth.csv`` in the session, if there.
-
-    Returns
-    -------
-    Inputs
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no such folder, or the requested truth cannot be read.
+    `truth`: true poses; by default ``truth.csv`` in the session, if there.
     """
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
@@ -148,11 +112,7 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
     inside = np.zeros(len(poses), dtype=np.bool_)
     for first, last in visits:
         inside |= (poses.times_s >= first) & (poses.times_s <= last)
-    return PlanarPoses(
-        poses.times_s[inside],
-        poses.poses[inside],
-        None if poses.covariances is None else poses.covariances[inside],
-    )
+    return poses.only(inside)
 
 
 def _read(
@@ -177,8 +137,7 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
     except GroundTruthError:
         inputs.missing.append("building.csv or building.dxf")
         return None
-    building = _read(inputs, path, read_building)
-    return None if building is None else building.segments
+    return _read(inputs, path, read_building)
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -2,43 +2,45 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from redetect.groundtruth.report.figures import (
+    Series,
+    Track,
+    ellipse_figure,
+    map_figure,
+    series_figure,
+)
 from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
-from redetect.groundtruth.report.parts import Part, Section, figure, page, paragraph, picture, table
-from redetect.groundtruth.report.svg import Series, Track, draw_map, draw_series, legend
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.matching import matched_streams, pose_differences
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 from redetect.groundtruth.validation.validate import PUBLISHED
-from redetect.landmarks import wrap_angle
+from redetect.reporting.page import Part, Section, image_part, page_of
 
 # Differences remain without colour: dashes.
-_LOOKS = {
-    "laser": ("#1f5f99", ""),
-    "camera": ("#b8560f", "6 3"),
-    "fused": ("#2b7a3a", "10 3 2 3"),
-    "odometry": ("#7a4fa0", "2 3"),
-    "truth": ("#222222", "1 3"),
+_LOOKS: dict[str, tuple[str, tuple[float, ...]]] = {
+    "laser": ("#1f5f99", ()),
+    "camera": ("#b8560f", (6, 3)),
+    "fused": ("#2b7a3a", (10, 3, 2, 3)),
+    "odometry": ("#7a4fa0", (2, 3)),
+    "truth": ("#222222", (1, 3)),
 }
 _MOST_ROWS = 40
 _ELLIPSES = 60
+# Width and height of the validation's plots on the page.
+_VALIDATION_PX = (864, 410)
 
 
 def report_page(inputs: Inputs, version: str) -> bytes:
     """The whole page, UTF-8; the same inputs give the same bytes.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    version : str
-        Of the program, for the page's foot.
+    `version`: of the program, for the page's foot.
     """
     sections = [
         Section("state", "What there is", _state(inputs)),
@@ -49,7 +51,14 @@ def report_page(inputs: Inputs, version: str) -> bytes:
         Section("rejected", "Rejected and lost", _rejected(inputs)),
         Section("settings", "Settings and versions", _settings(inputs, version)),
     ]
-    return page(f"Ground truth: {inputs.name}", sections)
+    return page_of(f"Ground truth: {inputs.name}", sections)
+
+
+def table(
+    caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text: Sequence[int] = ()
+) -> Part:
+    """A table whose first column names the row; the columns in `text` are words, not numbers."""
+    return Part("table", caption, tuple(head), tuple(map(tuple, rows)), left=(0, *text))
 
 
 def _state(inputs: Inputs) -> list[Part]:
@@ -66,13 +75,11 @@ def _state(inputs: Inputs) -> list[Part]:
         content.append(table("Streams of poses", head, rows, text=(4,)))
     if inputs.visits:
         spans = ", ".join(f"{b - a:.0f} s" for a, b in inputs.visits[:_MOST_ROWS])
-        content.append(paragraph(f"{len(inputs.visits)} visits to the covered area: {spans}."))
+        content.append(Part("text", f"{len(inputs.visits)} visits to the covered area: {spans}."))
     for problem in inputs.problems:
-        content.append(paragraph(f"Cannot be read: {problem}", kind="problem"))
+        content.append(Part("problem", f"Cannot be read: {problem}"))
     if inputs.missing:
-        content.append(
-            paragraph("Not in the session: " + ", ".join(inputs.missing) + ".", kind="note")
-        )
+        content.append(Part("note", "Not in the session: " + ", ".join(inputs.missing) + "."))
     return content
 
 
@@ -97,33 +104,24 @@ def _maps(inputs: Inputs) -> list[Part]:
     if inputs.truth is not None:
         everything.append(_track("truth", inputs.truth, inputs))
     if not everything and inputs.building is None:
-        return [
-            paragraph("Neither a building nor a stream of poses: nothing to draw.", kind="note")
-        ]
-    drawing, _ = draw_map("The building and all paths", everything, inputs.building)
+        return [Part("note", "Neither a building nor a stream of poses: nothing to draw.")]
     words = "The building" if inputs.building is not None else "No building map in the session"
     words += f" and the paths during the visits ({', '.join(t.label for t in everything)})."
     if inputs.odometry is not None:
         words += " Odometry is moved onto the truth in each visit."
-    key = legend([(t.label, t.colour, t.dashes) for t in everything])
-    content = [figure(words, key, drawing)]
+    content = [map_figure(words, everything, inputs.building)]
     for track in tracks:
         if track.poses.covariances is None or not len(track.poses):
-            content.append(paragraph(f"{track.label}: no covariances, no ellipses.", kind="note"))
-            continue
-        drawing, factor = draw_map(
-            f"3 sigma ellipses: {track.label}", [track], inputs.building, width=560.0,
-            ellipses=_ELLIPSES,
-        )  # fmt: skip
-        size = f"drawn {factor:g} times as large" if factor > 1.0 else "true to scale"
-        content.append(figure(f"{track.label}: path and 3\u03c3 ellipses, {size}.", drawing))
+            content.append(Part("note", f"{track.label}: no covariances, no ellipses."))
+        else:
+            content.append(ellipse_figure(track, inputs.building, _ELLIPSES))
     return content
 
 
 def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
         words = "No truth in the session: give one by --truth to see errors over time."
-        return [paragraph(words, kind="note")]
+        return [Part("note", words)]
     rows: list[tuple[str, ...]] = []
     place, turn, faults = [], [], []
     named = {name: (STREAMS[name], poses) for name, poses in inputs.streams.items()}
@@ -135,13 +133,13 @@ def _errors(inputs: Inputs) -> list[Part]:
             mine, theirs, _ = matched_streams(inside, inputs.truth)
         except ValueError as fault:
             rows.append((label, "0", *("-",) * 9))
-            faults.append(paragraph(f"{label}: {fault}", kind="problem"))
+            faults.append(Part("problem", f"{label}: {fault}"))
             continue
         rows.append((label, *_score_words(score_poses(mine, theirs))))
-        error = mine.poses - theirs.poses
+        error = pose_differences(mine.poses, theirs.poses)
         colour, dashes = _LOOKS[name]
         far = 1e3 * np.hypot(error[:, 0], error[:, 1])
-        bent = np.degrees(np.abs(wrap_angle(error[:, 2])))
+        bent = np.degrees(np.abs(error[:, 2]))
         short = STREAMS.get(name, name)
         place.append(Series(short, colour, dashes, mine.times_s, far))
         turn.append(Series(short, colour, dashes, mine.times_s, bent))
@@ -151,7 +149,7 @@ def _errors(inputs: Inputs) -> list[Part]:
             mine, theirs, _ = matched_streams(fused, inputs.truth)
             rows.append(("fused, pauses included", *_score_words(score_poses(mine, theirs))))
         except ValueError as fault:
-            faults.append(paragraph(f"fused, pauses included: {fault}", kind="problem"))
+            faults.append(Part("problem", f"fused, pauses included: {fault}"))
     head = (
         "stream", "poses", "mean / mm", "sigma", "rmse", "worst", "mean / deg", "sigma", "worst",
         "NEES / 3", "poses with it",
@@ -161,29 +159,18 @@ def _errors(inputs: Inputs) -> list[Part]:
         caption += "; odometry is moved onto the truth in each visit"
     content = [table(caption, head, rows), *faults]
     content.append(
-        paragraph(
+        Part(
+            "note",
             "NEES / 3 is 1 where covariances are right. Errors of neighbouring poses go together, "
             "so that it scatters more than the number of poses suggests.",
-            kind="note",
         )
     )
-    key = [(s.label, s.colour, s.dashes) for s in place]
     words = "Each point is the largest error in its stretch of time; pauses are cut out."
-    content.append(
-        figure(
-            f"Position error over time. {words}",
-            legend(key),
-            draw_series("Position error over time", "mm", place, inputs.visits),
-        )
-    )
-    content.append(
-        figure(
-            "Heading error over time, without sign.",
-            legend(key),
-            draw_series("Heading error over time", "deg", turn, inputs.visits),
-        )
-    )
-    return content
+    return [
+        *content,
+        series_figure(f"Position error over time. {words}", "mm", place, inputs.visits),
+        series_figure("Heading error over time, without sign.", "deg", turn, inputs.visits),
+    ]
 
 
 def _score_words(score: PoseScore) -> tuple[str, ...]:
@@ -210,7 +197,7 @@ def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
         words = "No validation in the session: groundtruth validate writes it."
-        return [paragraph(words, kind="note")]
+        return [Part("note", words)]
     figures = _entry(document, "figures", dict)
     rows = [
         (
@@ -230,18 +217,17 @@ def _validation(inputs: Inputs) -> list[Part]:
     head = ("ground truth", "mean / mm", "sigma", "worst", "mean / deg", "sigma", "worst")
     content = [table("Linear and angular errors at reference poses", head, rows)]
     content.append(
-        paragraph(
+        Part(
+            "problem" if _is_outside(figures) else "text",
             f"{_number(figures.get('poses'), 1.0, 0)} reference poses. NEES / 3 with both "
             f"covariances: {_number(figures.get('nees'), 1.0, 3)}; 95 % of right ones lie between "
             f"{_number(figures.get('nees_low'), 1.0, 3)} and "
             f"{_number(figures.get('nees_high'), 1.0, 3)}.",
-            kind="problem" if _is_outside(figures) else "paragraph",
         )
     )
     if inputs.picture is not None:
-        source = "data:image/png;base64," + base64.b64encode(inputs.picture).decode("ascii")
-        alt = "Plots of the linear and angular errors at each reference pose"
-        content.append(picture("Errors pose by pose.", source, alt))
+        words = "Linear and angular errors at each reference pose."
+        content.append(image_part(words, inputs.picture, "png", *_VALIDATION_PX))
     refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
     if refused:
         content.append(
@@ -262,7 +248,7 @@ def _validation(inputs: Inputs) -> list[Part]:
 def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
         words = "No clock.json: all times are taken to be of one clock."
-        return [paragraph(words, kind="note")]
+        return [Part("note", words)]
     rows = []
     for s in inputs.clock.segments[:_MOST_ROWS]:
         rows.append(
@@ -285,14 +271,14 @@ def _clock(inputs: Inputs) -> list[Part]:
     caption = "The robot's clock minus the ground truth's, by segment"
     content = [table(caption, head, rows, text=(8,))]
     for note in dict.fromkeys(s.note for s in inputs.clock.segments[:_MOST_ROWS] if s.note):
-        content.append(paragraph(f"Note: {note}.", kind="note"))
+        content.append(Part("note", f"Note: {note}."))
     left_out = len(inputs.clock.segments) - len(rows)
     if left_out > 0:
-        content.append(paragraph(f"{left_out} more segments are in clock.json.", kind="note"))
+        content.append(Part("note", f"{left_out} more segments are in clock.json."))
     ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
     if isinstance(ptpd, dict):
         content.append(
-            paragraph("ptpd: " + ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items()) + ".")
+            Part("text", "ptpd: " + ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items()) + ".")
         )
     return content
 
@@ -302,7 +288,7 @@ def _rejected(inputs: Inputs) -> list[Part]:
     if inputs.sets:
         counts = ", ".join(f"{number} {status}" for status, number in sorted(inputs.sets.items()))
         content.append(
-            paragraph(f"Sets of scans: {counts}. Lost includes the pauses between visits.")
+            Part("text", f"Sets of scans: {counts}. Lost includes the pauses between visits.")
         )
     if inputs.intervals:
         longest = sorted(inputs.intervals, key=lambda i: (i.from_s - i.to_s, i.from_s))
@@ -323,16 +309,16 @@ def _rejected(inputs: Inputs) -> list[Part]:
     ]
     if suspects:
         words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
-        content.append(paragraph(words, kind="problem"))
+        content.append(Part("problem", words))
     fused = inputs.documents.get("fused.json")
     if fused is None:
-        content.append(paragraph("No account of a fusion (fused.json).", kind="note"))
+        content.append(Part("note", "No account of a fusion (fused.json)."))
         return content
     rejected = [r for r in _entry(fused, "rejected", list) if isinstance(r, dict)]
     used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
     restarts = _entry(fused, "restarts_s", list)
     words = f"Fusion used {used or 'nothing'}; rejected {len(rejected)}; {len(restarts)} restarts."
-    content.append(paragraph(words))
+    content.append(Part("text", words))
     if rejected:
         worst = sorted(rejected, key=lambda r: -_float(r.get("squared_innovation")))[:_MOST_ROWS]
         entries = [
@@ -359,7 +345,7 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
     if rows:
         caption = "Effective settings of what the page shows"
         content.append(table(caption, ("file", "setting", "value"), rows, text=(1, 2)))
-    content.append(paragraph(f"Page written by groundtruth report, version {version}."))
+    content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
 
 

@@ -1,1 +1,1 @@
-"""Poses over time: files, other times, rigid alignment of whole paths."""
+"""Rigid motions in space and in the plane; poses over time: files, other times, alignment."""

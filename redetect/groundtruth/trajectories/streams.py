@@ -10,13 +10,14 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.geometry.transforms import quaternion_xyzw
-from redetect.groundtruth.text_file import read_text
+from redetect.groundtruth.files import read_text
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
 
@@ -35,23 +36,16 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 class PlanarPoses:
     """Poses of a robot on the floor over time.
 
-    Attributes
-    ----------
-    times_s : (N,) float64
-        Seconds, not descending.
-    poses : (N, 3) float64
-        x, y (m) and theta (rad). Headings may lie past +-pi, as in the real streams.
-    covariances : (N, 3, 3) float64 or None
-        Covariances of (x, y, theta); may be singular where a file's rounding made them so.
-
     Raises
     ------
     GroundTruthError
         If shapes disagree, a number is not finite or times descend.
     """
 
-    times_s: FloatArray
+    times_s: FloatArray  # (N,): seconds, not descending
+    # (N, 3): x, y (m) and theta (rad). Headings may lie past +-pi, as in the real streams.
     poses: FloatArray
+    # (N, 3, 3): covariances of (x, y, theta); may be singular where a file's rounding made them so.
     covariances: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -83,6 +77,11 @@ class PlanarPoses:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    def only(self, chosen: NDArray[Any] | slice) -> PlanarPoses:
+        """The chosen poses, by a mask, indices or a slice."""
+        covariances = None if self.covariances is None else self.covariances[chosen]
+        return PlanarPoses(self.times_s[chosen], self.poses[chosen], covariances)
+
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     """Keep only the last of all poses with the same time.
@@ -91,27 +90,14 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     poses have the same time. The robot moved between them, but at no computable speed.
     """
     last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
-    if np.all(last):
-        return poses
-    return PlanarPoses(
-        poses.times_s[last],
-        poses.poses[last],
-        None if poses.covariances is None else poses.covariances[last],
-    )
+    return poses if np.all(last) else poses.only(last)
 
 
 def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> NDArray[np.bool_]:
     """Which of (..., d, d) covariances can be inverted in earnest.
 
-    Parameters
-    ----------
-    covariances : (..., d, d) array
-    rounding : float
-        By how much each entry may be off; an eigenvalue must be larger than that.
-
-    Returns
-    -------
-    (...) bool array
+    `covariances` (..., d, d). `rounding`: by how much each entry may be off; an eigenvalue must be
+    larger than that.
     """
     symmetric = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
     scale = np.sqrt(np.clip(np.diagonal(symmetric, axis1=-2, axis2=-1), 0.0, None))
@@ -131,10 +117,6 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     path : path
         Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#`
         comments, which the real files do not have, are skipped.
-
-    Returns
-    -------
-    PlanarPoses
 
     Raises
     ------
@@ -168,16 +150,8 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
 def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> str:
     """Format poses as a RAWSEEDS stream.
 
-    Parameters
-    ----------
-    poses : PlanarPoses
-    covariance_decimals : int
-        The real files have 6, with which variances below (0.7 mm)^2 vanish and matrices become
-        singular; so there are more here unless asked for.
-
-    Returns
-    -------
-    str
+    `covariance_decimals`: the real files have 6, with which variances below (0.7 mm)^2 vanish and
+    matrices become singular; so there are more here unless asked for.
     """
     lines = []
     for i in range(len(poses)):
@@ -212,10 +186,6 @@ def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     """Read a ``.times`` file: rows ``prefix seconds``, with `#` comments.
 
-    Parameters
-    ----------
-    path : path
-
     Returns
     -------
     dict of str to float
@@ -237,16 +207,19 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     return times
 
 
-def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: str) -> FloatArray:
+def read_rows_of_numbers(
+    path: str | os.PathLike[str], columns: int, expected: str, *, head: str = ""
+) -> FloatArray:
     """Read rows of numbers between commas or blanks; blank lines and `#` comments are skipped.
 
     Parameters
     ----------
-    path : path
     columns : int
         Numbers in every row.
     expected : str
         What they are, for messages.
+    head : str
+        Names between commas that may be on the first line.
 
     Returns
     -------
@@ -259,6 +232,8 @@ def read_rows_of_numbers(path: str | os.PathLike[str], columns: int, expected: s
     """
     rows: list[list[float]] = []
     for line, words in _rows(path):
+        if not rows and words == head.split(","):
+            continue
         if len(words) != columns:
             raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
         rows.append(_numbers(path, line, words))

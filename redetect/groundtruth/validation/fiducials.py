@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.json_file import read_json, write_json
-from redetect.groundtruth.text_file import read_text
-from redetect.storage import write_whole
+from redetect.groundtruth.files import is_number, read_json, read_text
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
 
-_HEAD = "pose,t,point,fiducial,distance_m"
+DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
 _NAME = re.compile(r"[^\s,#\"]{1,64}")
 _LARGEST_FILE_BYTES = 1 << 26
 _FARTHEST_M = 1e6
@@ -31,40 +28,20 @@ _FARTHEST_M = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Points between which distances are measured.
+    """Points between which distances are measured."""
 
-    Attributes
-    ----------
-    fiducials : dict of str to (2,) float64
-        Surveyed points in the world (m).
-    robot_points : dict of str to (2,) float64
-        Points on the robot, in its frame (m).
-    sigma_m : float
-        Standard deviation of a distance (m).
-    """
-
-    fiducials: dict[str, FloatArray]
-    robot_points: dict[str, FloatArray]
-    sigma_m: float
+    fiducials: dict[str, FloatArray]  # Surveyed points in the world (m)
+    robot_points: dict[str, FloatArray]  # Points on the robot, in its frame (m)
+    sigma_m: float  # Standard deviation of a distance (m)
 
 
 @dataclass(frozen=True)
 class Distance:
-    """A distance from a point on the robot to a fiducial.
+    """A distance from a point on the robot to a fiducial."""
 
-    Attributes
-    ----------
-    pose : int
-        Number of the reference pose.
-    time_s : float
-        When, on the ground truth's clock.
-    point, fiducial : str
-        The two ends.
-    distance_m : float
-    """
-
-    pose: int
-    time_s: float
+    pose: int  # Number of the reference pose
+    time_s: float  # When, on the ground truth's clock
+    # `point`, `fiducial`: The two ends
     point: str
     fiducial: str
     distance_m: float
@@ -82,28 +59,10 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     if content.get("version") != 1:
         raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
     sigma = content.get("sigma_m")
-    if sigma is None or not _is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
+    if not is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
         raise GroundTruthError(f"{path}: sigma_m is {excerpt(sigma)}: expected metres above 0")
     points = [_points(path, content, key) for key in ("fiducials", "robot_points")]
     return Survey(points[0], points[1], float(sigma))
-
-
-def write_survey(
-    path: str | os.PathLike[str],
-    survey: Survey,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Write a ``fiducials.json``, and other entries, whole or not at all."""
-    content = {
-        "version": 1,
-        "fiducials": {name: point.tolist() for name, point in survey.fiducials.items()},
-        "robot_points": {name: point.tolist() for name, point in survey.robot_points.items()},
-        "sigma_m": survey.sigma_m,
-        **(extra or {}),
-    }
-    write_json(path, content, overwrite=overwrite)
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
@@ -111,7 +70,6 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
 
     Parameters
     ----------
-    path : path
     survey : Survey
         The file may contain only its points.
 
@@ -129,19 +87,10 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     rows: list[Distance] = []
     for number, line in enumerate(text.split("\n"), 1):
         content = line.partition("#")[0].strip()
-        if not content or (not rows and content == _HEAD):
+        if not content or (not rows and content == DISTANCES_HEAD):
             continue
         rows.append(_distance(path, number, [word.strip() for word in content.split(",")], survey))
     return rows
-
-
-def write_distances(
-    path: str | os.PathLike[str], distances: list[Distance], *, overwrite: bool = False
-) -> None:
-    """Write a ``distances.csv``, whole or not at all; in tenths of a millimetre."""
-    rows = [f"{d.pose},{d.time_s:.6f},{d.point},{d.fiducial},{d.distance_m:.4f}" for d in distances]
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(("\n".join([_HEAD, *rows]) + "\n").encode())
 
 
 def _points(
@@ -152,7 +101,7 @@ def _points(
         raise GroundTruthError(f"{path}: {key}: expected two or more points by name")
     points = {}
     for name, value in entries.items():
-        good = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+        good = isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
         if not good or not all(abs(x) < _FARTHEST_M for x in value):
             raise GroundTruthError(
                 f"{path}: {key}: {excerpt(name)} is {excerpt(value)}: expected [x, y]"
@@ -169,18 +118,14 @@ def _distance(
     path: str | os.PathLike[str], number: int, words: list[str], survey: Survey
 ) -> Distance:
     if len(words) != 5:
-        raise StreamError(path, number, f"{len(words)} words: expected {_HEAD}")
+        raise StreamError(path, number, f"{len(words)} words: expected {DISTANCES_HEAD}")
     try:
         pose, time, distance = int(words[0]), float(words[1]), float(words[4])
     except ValueError:
-        raise StreamError(path, number, f"expected numbers in {_HEAD}") from None
+        raise StreamError(path, number, f"expected numbers in {DISTANCES_HEAD}") from None
     if pose < 0 or not np.isfinite(time) or not 0.0 <= distance < _FARTHEST_M:
         raise StreamError(path, number, "expected a pose and a distance of 0 or more, finite")
     for name, known in ((words[2], survey.robot_points), (words[3], survey.fiducials)):
         if name not in known:
             raise StreamError(path, number, f"{excerpt(name)}: expected one of {', '.join(known)}")
     return Distance(pose, time, words[2], words[3], distance)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.plane import apply
 from redetect.groundtruth.lasers.icp import IcpResult, IcpSettings, icp_to_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.trajectories.plane import apply
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
-from redetect.storage.bounds import ABOVE_0, PROBABILITY, SHARE_ABOVE_0, demand
 
 FloatArray = NDArray[np.float64]
 ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
@@ -33,88 +32,36 @@ _FEWEST_READINGS = 0.5
 # Along a corridor only the beams to its ends change; a passer-by hides fewer than these.
 _MOVED_SHARE = 0.25
 _QUANTUM_M = 0.01
+# The robot is at rest for this long before and after the distances' time; it has moved if a quarter
+# of the beams change by more than this within that time.
+_STILL_S = 0.5
+_MOVED_M = 0.03
+# Gates of successive ICPs, the share of the best matches that counts, and how well the walls must
+# determine each direction.
+_GATES_M = (0.2, 0.1, 0.05)
+_KEPT = 0.95
+_WEAK_SIGMA_M = 0.05
+# Distances and walls disagree if right ones would by as much in less than this share.
+_DISAGREEMENT_PROBABILITY = 1e-4
+# The walls decide among several poses if at least this share of the points is on a wall, and the
+# share at the next pose is smaller by at least this fraction.
+_LEAST_SHARE = 0.5
 _MOUNT_STEP = 1e-3
-
-
-@dataclass(frozen=True)
-class RefineSettings:
-    """How scans refine a pose.
-
-    Parameters
-    ----------
-    still_s : float
-        The robot is at rest for this long before and after the distances' time (s).
-    moved_m : float
-        It has moved if a quarter of the beams change by more than this within that time (m).
-    gates_m : tuple of float
-        Gates of successive ICPs (m).
-    kept : float
-        Share of the best matches that counts.
-    weak_sigma_m : float
-        A direction known less well than this from the walls is undetermined (m).
-    disagreement_probability : float
-        Distances and walls disagree if right ones would by as much in less than this share.
-    least_share : float
-        The walls decide among several poses if at least this share of the points is on a wall, and
-        the share at the next pose is smaller by at least this fraction.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is out of range.
-    """
-
-    still_s: float = 0.5
-    moved_m: float = 0.03
-    gates_m: tuple[float, ...] = (0.2, 0.1, 0.05)
-    kept: float = 0.95
-    weak_sigma_m: float = 0.05
-    disagreement_probability: float = 1e-4
-    least_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        demand(
-            self,
-            GroundTruthError,
-            still_s=ABOVE_0,
-            moved_m=ABOVE_0,
-            gates_m=ABOVE_0,
-            kept=SHARE_ABOVE_0,
-            weak_sigma_m=ABOVE_0,
-            disagreement_probability=PROBABILITY,
-            least_share=PROBABILITY,
-        )
-        if not self.gates_m:
-            raise GroundTruthError("gates_m is empty: expected one or more")
 
 
 @dataclass(frozen=True, eq=False)
 class Onboard:
-    """A scanner on board and its scans, on the robot's clock.
+    """A scanner on board and its scans, on the robot's clock."""
 
-    Attributes
-    ----------
-    scanner : Scanner
-        Its pose is in the robot's frame.
-    scans : Scans
-    """
-
-    scanner: Scanner
+    scanner: Scanner  # Its pose is in the robot's frame
     scans: Scans
 
 
 @dataclass(frozen=True, eq=False)
 class StillPoints:
-    """Readings of the on-board scanners while the robot was at rest.
+    """Readings of the on-board scanners while the robot was at rest."""
 
-    Attributes
-    ----------
-    scanner_points : tuple of (n, 2) float64
-        Averaged points in each scanner's frame (m).
-    scanners : tuple of Scanner
-    """
-
-    scanner_points: tuple[FloatArray, ...]
+    scanner_points: tuple[FloatArray, ...]  # Averaged points in each scanner's frame (m)
     scanners: tuple[Scanner, ...]
 
     def robot_points(self, mounts: Sequence[FloatArray] | None = None) -> FloatArray:
@@ -125,56 +72,26 @@ class StillPoints:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A reference pose after refinement by scans.
+    """A reference pose after refinement by scans."""
 
-    Attributes
-    ----------
-    pose : (3,) float64
-    covariance : (3, 3) float64
-    scans : str
-        `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
-        `moved`: the robot was not at rest; `no scans`: too few readings are on walls;
-        `not asked`.
-    reason : str
-    points : int
-        Points on walls that count.
-    rms_m : float
-        Of their distances from the walls; NaN without.
-    """
-
-    pose: FloatArray
-    covariance: FloatArray
+    pose: FloatArray  # (3,)
+    covariance: FloatArray  # (3, 3)
+    # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
+    # `moved`: the robot was not at rest; `no scans`: too few readings are on walls; `not asked`.
     scans: ScanStatus
     reason: str
-    points: int
-    rms_m: float
+    points: int  # Points on walls that count
+    rms_m: float  # Of their distances from the walls; NaN without.
 
 
-def still_points(
-    onboard: Sequence[Onboard], time_s: float, settings: RefineSettings | None = None
-) -> StillPoints:
+def still_points(onboard: Sequence[Onboard], time_s: float) -> StillPoints:
     """Average the readings of the on-board scanners about a time.
 
-    Parameters
-    ----------
-    onboard : sequence of Onboard
-    time_s : float
-        On the robot's clock.
-    settings : RefineSettings, optional
-
-    Returns
-    -------
-    StillPoints
-
-    Raises
-    ------
-    GeometryError
-        If the readings show that the robot moved; its message begins with ``moved``.
+    `time_s`: on the robot's clock.
     """
-    s = RefineSettings() if settings is None else settings
     clouds, changes = [], [np.zeros(0)]
     for board in onboard:
-        ranges = board.scans.ranges_mm[np.abs(board.scans.times_s - time_s) <= s.still_s]
+        ranges = board.scans.ranges_mm[np.abs(board.scans.times_s - time_s) <= _STILL_S]
         if not len(ranges):
             clouds.append(np.zeros((0, 2)))
             continue
@@ -191,19 +108,16 @@ def still_points(
         clouds.append(np.column_stack([mean * np.cos(angles), mean * np.sin(angles)]))
     change = np.concatenate(changes)
     change = change[np.isfinite(change)]
-    if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > s.moved_m:
+    if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > _MOVED_M:
         raise GeometryError(
             f"moved: a quarter of the beams change by more than {typical:.3f} m: expected a robot "
-            f"at rest for {2.0 * s.still_s:g} s"
+            f"at rest for {2.0 * _STILL_S:g} s"
         )
     return StillPoints(tuple(clouds), tuple(board.scanner for board in onboard))
 
 
 def refine_pose(
-    distances: DistancePose,
-    points: StillPoints,
-    segments: FloatArray,
-    settings: RefineSettings | None = None,
+    distances: DistancePose, points: StillPoints, segments: FloatArray
 ) -> RefinedPose | None:
     """Combine what distances and walls say of a pose.
 
@@ -211,21 +125,18 @@ def refine_pose(
     ----------
     distances : DistancePose
         Of status `ok`, or `ambiguous`: then the walls decide, or nothing does.
-    points : StillPoints
     segments : (S, 4) array
         The building's walls (m).
-    settings : RefineSettings, optional
 
     Returns
     -------
     RefinedPose or None
         None if several poses fit and the walls do not decide.
     """
-    s = RefineSettings() if settings is None else settings
     cloud = points.robot_points()
     chosen = 0
     if distances.status == "ambiguous":
-        decided = _decided(distances, cloud, segments, s)
+        decided = _decided(distances, cloud, segments)
         if decided is None:
             return None
         chosen = decided
@@ -235,16 +146,16 @@ def refine_pose(
         return RefinedPose(prior, covariance, status, reason, 0, math.nan)
 
     try:
-        found = _aligned(cloud, segments, prior, s)
+        found = _aligned(cloud, segments, prior)
     except (GeometryError, GroundTruthError) as error:
         return unrefined("no scans", str(error))
     if len(found.undetermined) or not np.isfinite(found.covariance).all():
         return unrefined("undetermined", "the walls leave a direction open")
-    own = found.covariance + _mount_covariance(points, segments, found, s)
+    own = found.covariance + _mount_covariance(points, segments, found)
     apart = found.pose - prior
     apart[2] = wrap_angle(apart[2])
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
-    if chdtrc(3, misfit) < s.disagreement_probability:
+    if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
         return unrefined(
             "disagrees",
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
@@ -259,23 +170,19 @@ def refine_pose(
     return RefinedPose(pose, combined, "used", "", int(found.used.sum()), found.rms_m)
 
 
-def _aligned(
-    cloud: FloatArray, segments: FloatArray, start: FloatArray, s: RefineSettings
-) -> IcpResult:
+def _aligned(cloud: FloatArray, segments: FloatArray, start: FloatArray) -> IcpResult:
     if not len(cloud):
         raise GeometryError("no readings of a scanner on board about this time")
     found: IcpResult | None = None
-    for gate in s.gates_m:
-        settings = IcpSettings(gate, s.kept, weak_sigma_m=s.weak_sigma_m)
+    for gate in _GATES_M:
+        settings = IcpSettings(gate, _KEPT, weak_sigma_m=_WEAK_SIGMA_M)
         found = icp_to_segments(cloud, segments, start, settings)
         start = found.pose
     assert found is not None
     return found
 
 
-def _mount_covariance(
-    points: StillPoints, segments: FloatArray, found: IcpResult, s: RefineSettings
-) -> FloatArray:
+def _mount_covariance(points: StillPoints, segments: FloatArray, found: IcpResult) -> FloatArray:
     """(3, 3) what the scanners' mounts, known only so well, do to the pose."""
     total = np.zeros((3, 3))
     mounts = [scanner.pose for scanner in points.scanners]
@@ -289,7 +196,7 @@ def _mount_covariance(
                 other = [mount.copy() for mount in mounts]
                 other[k][axis] += sign * _MOUNT_STEP
                 cloud = points.robot_points(other)
-                ends.append(_aligned(cloud, segments, found.pose, s).pose)
+                ends.append(_aligned(cloud, segments, found.pose).pose)
             change = ends[0] - ends[1]
             change[2] = wrap_angle(change[2])
             effect[:, axis] = change / (2.0 * _MOUNT_STEP)
@@ -297,19 +204,17 @@ def _mount_covariance(
     return total
 
 
-def _decided(
-    distances: DistancePose, cloud: FloatArray, segments: FloatArray, s: RefineSettings
-) -> int | None:
+def _decided(distances: DistancePose, cloud: FloatArray, segments: FloatArray) -> int | None:
     """Which candidate's points are on walls, if those of one only are."""
     shares = []
     for pose in distances.candidates:
         try:
-            shares.append(float(_aligned(cloud, segments, pose, s).used.mean()))
+            shares.append(float(_aligned(cloud, segments, pose).used.mean()))
         except (GeometryError, GroundTruthError):
             shares.append(0.0)
     order = np.argsort(shares)[::-1]
     best, next_best = shares[order[0]], shares[order[1]]
-    if best < s.least_share or next_best > (1.0 - s.least_share) * best:
+    if best < _LEAST_SHARE or next_best > (1.0 - _LEAST_SHARE) * best:
         return None
     return int(order[0])
 

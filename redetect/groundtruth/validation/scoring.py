@@ -1,17 +1,25 @@
-"""Compares poses with the truth: errors, and whether their covariances are right."""
+"""Compares poses with the truth: absolute and relative errors, and their covariances."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.alignment import align_poses
-from redetect.groundtruth.trajectories.interpolation import matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
-from redetect.landmarks import wrap_angle
+from redetect.groundtruth.trajectories.matching import (
+    interpolate_poses,
+    pose_differences,
+    squared_lengths,
+)
+from redetect.groundtruth.trajectories.plane import between
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    is_positive_definite,
+    read_rows_of_numbers,
+)
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -19,40 +27,26 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class PoseScore:
-    """How far poses are from the truth.
+    """How far poses are from the truth."""
 
-    Attributes
-    ----------
-    poses : int
-        Poses compared with the truth.
-    unmatched : int
-        Poses without truth at their time.
-    position_mean_m, position_sigma_m, position_rmse_m, position_max_m : float
-        Of the distances from the truth; sigma with N - 1.
-    angle_mean_rad, angle_sigma_rad, angle_max_rad : float
-        Of the signed differences of heading; the largest without sign.
-    angle_abs_mean_rad : float
-        Mean of the differences without sign.
-    position_median_m : float
-    normalised : int
-        Poses whose covariance could be inverted.
-    normalised_error : float
-        Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances
-        are right. NaN without covariances.
-    """
-
-    poses: int
-    unmatched: int
+    poses: int  # Poses compared with the truth
+    unmatched: int  # Poses without truth at their time
+    # `position_mean_m`, `position_sigma_m`, `position_rmse_m`, `position_max_m`: Of the distances
+    # from the truth; sigma with N - 1.
     position_mean_m: float
     position_sigma_m: float
     position_rmse_m: float
     position_max_m: float
+    # `angle_mean_rad`, `angle_sigma_rad`, `angle_max_rad`: Of the signed differences of heading;
+    # the largest without sign.
     angle_mean_rad: float
     angle_sigma_rad: float
     angle_max_rad: float
-    angle_abs_mean_rad: float
+    angle_abs_mean_rad: float  # Mean of the differences without sign
     position_median_m: float
-    normalised: int
+    normalised: int  # Poses whose covariance could be inverted
+    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
+    # right. NaN without covariances.
     normalised_error: float
 
 
@@ -66,10 +60,6 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
     unmatched : int
         Handed through.
 
-    Returns
-    -------
-    PoseScore
-
     Raises
     ------
     GroundTruthError
@@ -79,8 +69,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         raise GroundTruthError(
             f"{len(poses)} poses and {len(truth)} of the truth: expected as many, and at least one"
         )
-    error = poses.poses - truth.poses
-    error[:, 2] = wrap_angle(error[:, 2])
+    error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
     normalised, count = float("nan"), 0
     if poses.covariances is not None:
@@ -90,8 +79,8 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         usable = is_positive_definite(covariances)
         count = int(usable.sum())
         if count:
-            weighted = np.linalg.solve(covariances[usable], error[usable][..., None])[..., 0]
-            normalised = float(np.mean(np.sum(error[usable] * weighted, axis=1)) / 3.0)
+            squared = squared_lengths(error[usable], covariances[usable])
+            normalised = float(np.mean(squared) / 3.0)
     return PoseScore(
         len(poses),
         unmatched,
@@ -109,42 +98,138 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
     )
 
 
-def compare_streams(
-    poses: PlanarPoses,
-    truth: PlanarPoses,
-    *,
-    largest_gap_s: float = 0.5,
-    interpolate: str = "truth",
-    align: bool = False,
-) -> PoseScore:
-    """Score two streams whose times differ.
+def _sigma(values: FloatArray) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+
+
+_COLUMNS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """Poses of the robot at one time relative to another."""
+
+    # `from_s`, `to_s`: (N,): the two times (s); either may be the earlier one.
+    from_s: FloatArray
+    to_s: FloatArray
+    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
+    from_to: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.from_s)
+
+
+@dataclass(frozen=True)
+class RelativeScore:
+    """Relative errors."""
+
+    pairs: int  # Pairs of times compared with the truth
+    unmatched: int  # Pairs that one side has no pose for, or that are too far apart
+    # `position_mean_m`, `position_sigma_m`, `position_median_m`, `position_rmse_m`,
+    # `position_max_m`: Of the lengths of the relative errors' translations; sigma with N - 1.
+    position_mean_m: float
+    position_sigma_m: float
+    position_median_m: float
+    position_rmse_m: float
+    position_max_m: float
+    # `angle_rmse_rad`, `angle_abs_mean_rad`, `angle_max_rad`: Of the relative errors' rotations
+    angle_rmse_rad: float
+    angle_abs_mean_rad: float
+    angle_max_rad: float
+
+
+def read_relations(path: str | os.PathLike[str]) -> Relations:
+    """Read a file of relations: rows t_i, t_j, x, y, z, roll, pitch, yaw between blanks or commas.
+
+    Of these x, y and yaw count: poses are on a floor.
+
+    Raises
+    ------
+    StreamError
+        If the file cannot be read or a row is malformed; the message names file and line.
+    """
+    table = read_rows_of_numbers(path, _COLUMNS, "t_i, t_j, x, y, z, roll, pitch, yaw")
+    return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
+
+
+def score_relations(
+    poses: PlanarPoses, relations: Relations, largest_gap_s: float = np.inf
+) -> RelativeScore:
+    """Hold poses against known relations; the poses are interpolated at the relations' times.
 
     Parameters
     ----------
-    poses, truth : PlanarPoses
     largest_gap_s : float
         Nothing is interpolated across longer gaps.
-    interpolate : str
-        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
-    align : bool
-        Move the poses rigidly onto the truth first, for solutions with a world of their own.
-
-    Returns
-    -------
-    PoseScore
 
     Raises
     ------
     GroundTruthError
-        If no pose has a truth at its time.
+        If no relation has poses at both its times.
     """
-    mine, theirs, unmatched = matched_streams(
-        poses, truth, largest_gap_s=largest_gap_s, interpolate=interpolate
+    before, known_before = _at(poses, relations.from_s, largest_gap_s)
+    after, known_after = _at(poses, relations.to_s, largest_gap_s)
+    known = known_before & known_after
+    return relative_score(
+        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
     )
-    if align:
-        mine = align_poses(mine, theirs)
-    return score_poses(mine, theirs, unmatched)
 
 
-def _sigma(values: FloatArray) -> float:
-    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+def score_steps(
+    poses: PlanarPoses, truth: PlanarPoses, step: int, longest_s: float = np.inf
+) -> RelativeScore:
+    """Relative errors over steps of a truth, from every pose.
+
+    Parameters
+    ----------
+    poses, truth : PlanarPoses
+        With the same times.
+    step : int
+        From each pose to the one `step` poses later.
+    longest_s : float
+        Steps that take longer, as across a gap, do not count (s).
+
+    Raises
+    ------
+    GroundTruthError
+        If the numbers of poses differ or no step remains.
+    """
+    if len(poses) != len(truth):
+        raise GroundTruthError(f"{len(poses)} poses and {len(truth)} of the truth: expected equal")
+    if step < 1:
+        raise GroundTruthError(f"step is {step}: expected 1 or more")
+    known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
+    mine, right = (between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
+    return relative_score(right, mine, int((~known).sum()))
+
+
+def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0) -> RelativeScore:
+    """Figures of the errors truth^-1 * estimate of (N, 3) relative poses."""
+    if not len(truth):
+        raise GroundTruthError("no two times with poses to compare relative to each other")
+    error = between(truth, estimates)
+    length = np.hypot(error[:, 0], error[:, 1])
+    return RelativeScore(
+        len(error),
+        unmatched,
+        float(length.mean()),
+        float(length.std(ddof=1)) if len(length) > 1 else 0.0,
+        float(np.median(length)),
+        float(np.sqrt(np.mean(length**2))),
+        float(length.max()),
+        float(np.sqrt(np.mean(error[:, 2] ** 2))),
+        float(np.abs(error[:, 2]).mean()),
+        float(np.abs(error[:, 2]).max()),
+    )
+
+
+def _at(
+    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
+) -> tuple[FloatArray, BoolArray]:
+    """(N, 3) poses at times in any order, and which of them there are; zeros elsewhere."""
+    order = np.argsort(times_s, kind="stable")
+    interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
+    result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
+    result[order[found]] = interpolated.poses
+    known[order[found]] = True
+    return result, known

@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.trajectories.matching import pose_differences, squared_lengths
 from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
 from redetect.groundtruth.validation.reference_poses import DistancePose
-from redetect.landmarks import wrap_angle
-
-if TYPE_CHECKING:
-    from redetect.groundtruth.clocks.clock import ClockModel
-    from redetect.groundtruth.validation.reference_poses_scans import Onboard, RefineSettings
+from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 
 FloatArray = NDArray[np.float64]
 
@@ -27,14 +25,7 @@ _BAND = 0.95
 
 @dataclass(frozen=True)
 class Published:
-    """Figures that RAWSEEDS printed for a ground truth (deliverable D2.1, part 2).
-
-    Attributes
-    ----------
-    name : str
-    position_mean_m, position_sigma_m : float
-    angle_mean_deg, angle_sigma_deg : float
-    """
+    """Figures that RAWSEEDS printed for a ground truth (deliverable D2.1, part 2)."""
 
     name: str
     position_mean_m: float
@@ -52,38 +43,19 @@ PUBLISHED = (
 
 @dataclass(frozen=True, eq=False)
 class ReferencePose:
-    """A reference pose, and how it came about.
+    """A reference pose, and how it came about."""
 
-    Attributes
-    ----------
-    index : int
-        Its number in the file of distances.
-    time_s : float
-        On the ground truth's clock.
-    pose : (3,) float64
-        x, y (m), theta (rad).
-    covariance : (3, 3) float64
-    distances : DistancePose
-    scans : str
-        Use of the on-board scans
-        (`redetect.groundtruth.validation.reference_poses_scans.RefinedPose`).
-    note : str
-        Remarks.
-    points : int
-        Points of the scans on walls.
-    rms_m : float
-        Of their distances from the walls; NaN without.
-    """
-
-    index: int
-    time_s: float
-    pose: FloatArray
-    covariance: FloatArray
+    index: int  # Its number in the file of distances
+    time_s: float  # On the ground truth's clock
+    pose: FloatArray  # (3,): x, y (m), theta (rad)
+    covariance: FloatArray  # (3, 3)
     distances: DistancePose
+    # Use of the on-board scans
+    # (`redetect.groundtruth.validation.reference_poses_scans.RefinedPose`)
     scans: str
-    note: str
-    points: int
-    rms_m: float
+    note: str  # Remarks
+    points: int  # Points of the scans on walls
+    rms_m: float  # Of their distances from the walls; NaN without.
 
 
 @dataclass(frozen=True)
@@ -98,65 +70,43 @@ class Refused:
 
 @dataclass(frozen=True)
 class PoseError:
-    """How far a ground truth is from a reference pose.
-
-    Attributes
-    ----------
-    index : int
-    time_s : float
-    x_m, y_m : float
-        Ground truth minus reference.
-    linear_m : float
-        Their length.
-    angular_rad : float
-        Signed, the short way round.
-    nees : float
-        error^T (C + C_reference)^-1 error, with three degrees of freedom; NaN without covariances
-        that can be inverted.
-    sigma_linear_m, sigma_angular_rad : float
-        Expected standard deviations by both covariances: root of the trace, and of the heading;
-        NaN if the ground truth has none.
-    """
+    """How far a ground truth is from a reference pose."""
 
     index: int
     time_s: float
+    # `x_m`, `y_m`: Ground truth minus reference
     x_m: float
     y_m: float
-    linear_m: float
-    angular_rad: float
+    linear_m: float  # Their length
+    angular_rad: float  # Signed, the short way round
+    # error^T (C + C_reference)^-1 error, with three degrees of freedom; NaN without covariances
+    # that can be inverted.
     nees: float
+    # `sigma_linear_m`, `sigma_angular_rad`: Expected standard deviations by both covariances: root
+    # of the trace, and of the heading; NaN if the ground truth has none.
     sigma_linear_m: float
     sigma_angular_rad: float
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of the errors at the reference poses.
-
-    Attributes
-    ----------
-    poses : int
-    linear_mean_m, linear_sigma_m, linear_worst_m : float
-        Sigma with N - 1.
-    angular_mean_rad, angular_sigma_rad, angular_worst_rad : float
-        Of the signed errors; the worst without sign.
-    normalised : int
-        Poses with a NEES.
-    nees : float
-        Its mean over 3, the degrees of freedom: 1 if the covariances are right. NaN without.
-    nees_low, nees_high : float
-        95 % of means over as many independent poses are between these. NaN without.
-    """
+    """Figures of the errors at the reference poses."""
 
     poses: int
+    # `linear_mean_m`, `linear_sigma_m`, `linear_worst_m`: Sigma with N - 1
     linear_mean_m: float
     linear_sigma_m: float
     linear_worst_m: float
+    # `angular_mean_rad`, `angular_sigma_rad`, `angular_worst_rad`: Of the signed errors; the worst
+    # without sign.
     angular_mean_rad: float
     angular_sigma_rad: float
     angular_worst_rad: float
-    normalised: int
+    normalised: int  # Poses with a NEES
+    # Its mean over 3, the degrees of freedom: 1 if the covariances are right. NaN without.
     nees: float
+    # `nees_low`, `nees_high`: 95 % of means over as many independent poses are between these. NaN
+    # without.
     nees_low: float
     nees_high: float
 
@@ -166,7 +116,6 @@ def reference_poses(
     onboard: Sequence[Onboard] = (),
     segments: FloatArray | None = None,
     clock: ClockModel | None = None,
-    settings: RefineSettings | None = None,
 ) -> tuple[list[ReferencePose], list[Refused]]:
     """Poses from distances, refined by scans where these help.
 
@@ -180,11 +129,9 @@ def reference_poses(
         The building's walls, needed with scanners.
     clock : ClockModel, optional
         Without it the robot's clock is assumed to be the ground truth's.
-    settings : RefineSettings, optional
 
     Returns
     -------
-    references : list of ReferencePose
     refused : list of Refused
         Those that distances leave ambiguous, undetermined or inconsistent.
     """
@@ -199,7 +146,7 @@ def reference_poses(
             references.append(_unrefined(d, "not asked", d.reason))
             continue
         assert segments is not None
-        reference = _refined(d, onboard, segments, clock, settings)
+        reference = _refined(d, onboard, segments, clock)
         if reference is None:
             reason = f"{d.reason}; the walls do not decide"
             refused.append(Refused(d.index, d.time_s, d.status, reason))
@@ -213,16 +160,13 @@ def _refined(
     onboard: Sequence[Onboard],
     segments: FloatArray,
     clock: ClockModel | None,
-    settings: RefineSettings | None,
 ) -> ReferencePose | None:
-    from redetect.groundtruth.validation.reference_poses_scans import refine_pose, still_points
-
     time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
     try:
-        points = still_points(onboard, time, settings)
+        points = still_points(onboard, time)
     except GeometryError as error:
         return None if d.status == "ambiguous" else _unrefined(d, "moved", str(error))
-    refined = refine_pose(d, points, segments, settings)
+    refined = refine_pose(d, points, segments)
     if refined is None:
         return None
     note = "; ".join(part for part in (d.reason, refined.reason) if part)
@@ -264,7 +208,6 @@ def pose_errors(
 
     Returns
     -------
-    errors : list of PoseError
     without : list of Refused
         References at whose time there is no ground truth.
     """
@@ -276,15 +219,13 @@ def pose_errors(
         if not there
     ]
     assert stream.covariances is not None
-    error = at_times.poses - stream.poses[known]
-    error[:, 2] = wrap_angle(error[:, 2])
+    error = pose_differences(at_times.poses, stream.poses[known])
     nees = np.full(len(error), np.nan)
     sigma = np.full((len(error), 2), np.nan)
     if at_times.covariances is not None and len(error):
         both = at_times.covariances + stream.covariances[known]
         usable = is_positive_definite(at_times.covariances) & is_positive_definite(both)
-        weighted = np.linalg.solve(both[usable], error[usable][..., None])[..., 0]
-        nees[usable] = np.sum(error[usable] * weighted, axis=1)
+        nees[usable] = squared_lengths(error[usable], both[usable])
         sigma[usable, 0] = np.sqrt(both[usable, 0, 0] + both[usable, 1, 1])
         sigma[usable, 1] = np.sqrt(both[usable, 2, 2])
     there = [r for r, found in zip(references, known) if found]
@@ -307,19 +248,11 @@ def _nearest(
     earlier = np.abs(times_s - poses.times_s[before]) <= np.abs(poses.times_s[after] - times_s)
     index = np.where(earlier, before, after)
     known = np.abs(poses.times_s[index] - times_s) <= farthest_s
-    chosen = index[known]
-    covariances = None if poses.covariances is None else poses.covariances[chosen]
-    return PlanarPoses(poses.times_s[chosen], poses.poses[chosen], covariances), known
+    return poses.only(index[known]), known
 
 
 def figures_of(errors: Sequence[PoseError]) -> Figures:
-    """Mean, sigma, worst and NEES of errors.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is none.
-    """
+    """Mean, sigma, worst and NEES of errors."""
     if not errors:
         raise GroundTruthError("no reference pose with ground truth at its time")
     linear = np.array([e.linear_m for e in errors])

@@ -15,14 +15,14 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
 from redetect.groundtruth.fusion.learning import noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.geometry.plane import log_motion
-from redetect.groundtruth.geometry.transforms import exp_se3
-from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.matching import interpolate_poses
+from redetect.groundtruth.trajectories.plane import log_motion
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import (
     LASER_COVARIANCE,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
-from redetect.groundtruth.geometry.plane import between
-from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.matching import interpolate_poses
+from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import (

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.clocks.sync import synchronise
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
-from redetect.groundtruth.fusion.leave_out import leave_out
-from redetect.groundtruth.trajectories.alignment import moved_poses
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, leave_out
+from redetect.groundtruth.trajectories.matching import moved_poses
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import drive, measure

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from redetect.groundtruth.commands.lasers import perform
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.plane import between
 from redetect.groundtruth.lasers.alignment import (
     STEPS,
     AlignmentSettings,
     align_scanners,
     still_scan,
 )
-from redetect.groundtruth.lasers.building import Building, write_building
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
-from redetect.groundtruth.lasers.scans import Scans, write_scans
+from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.trajectories.plane import between
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import (
     FRONTED,
@@ -35,6 +34,7 @@ from tests.groundtruth.lasers.scene import (
     scanner,
     write_session,
 )
+from tools.simulator.laser.writers import write_building, write_scans
 
 FloatArray = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def test_a_scanner_measured_far_off_is_found_and_named(
     )  # fmt: skip
     for one, empty in zip(scanners, empty_scans(scanners, 8)):
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
-    write_building(tmp_path / "building.csv", Building(ROOM))
+    write_building(tmp_path / "building.csv", ROOM)
     assert perform(Lasers(tmp_path)) == 0
     content = json.loads((tmp_path / "aligned.json").read_text())
     assert content["far_off_measured"] == ["fixed2"]
@@ -175,7 +175,7 @@ def test_the_command(tmp_path: Path) -> None:
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
     with pytest.raises(GroundTruthError, match="building"):
         perform(Lasers(tmp_path))
-    write_building(tmp_path / "building.csv", Building(ROOM))
+    write_building(tmp_path / "building.csv", ROOM)
     assert perform(Lasers(tmp_path)) == 0
     first = (tmp_path / "aligned.json").read_bytes(), (tmp_path / "aligned.png").read_bytes()
     found = read_scanners(tmp_path / "aligned.json")

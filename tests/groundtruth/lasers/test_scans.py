@@ -22,11 +22,11 @@ from redetect.groundtruth.lasers.scanners import (
     Scanner,
     read_robot,
     read_scanners,
-    write_robot,
     write_scanners,
 )
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans, write_scans
+from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.storage import OutputExistsError
+from tools.simulator.laser.writers import write_robot, write_scans
 
 
 def sick(name: str = "fixed0", **changes: Any) -> Scanner:

@@ -7,10 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.background import learn_background
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.lasers.sets import ScannerTables, scanner_tables, sets_of_scans
+from redetect.groundtruth.lasers.sets import (
+    ScannerTables,
+    learn_background,
+    scanner_tables,
+    sets_of_scans,
+)
 from tests.groundtruth.lasers.scene import (
     empty_scans,
     four_scanners,
@@ -42,10 +46,7 @@ def test_background_is_learned() -> None:
     ranges[rng.random(500) < 0.3, 2] = 0  # drops out
     ranges[:5, 3] = 1000  # somebody passed
     found = learn_background(ranges, 20.0)
-    assert found.range_m[[0, 2, 3]] == pytest.approx(3.0, abs=0.011)
-    assert np.isnan(found.range_m[1])
     assert np.isinf(found.near_m[1])
-    assert found.drop_out[2] == pytest.approx(0.3, abs=0.06)
     assert found.quantum_m == pytest.approx(0.01)
     assert np.all((found.near_m[[0, 2, 3]] > 2.85) & (found.near_m[[0, 2, 3]] < 2.97))
 

@@ -6,18 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.markers.chain import ChainPoints, project_chain
+from redetect.groundtruth.markers.refinement import Floor, PoseProblem
+from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
     inverse,
     planar_transform,
     transform,
 )
-from redetect.groundtruth.markers.calibration import Rig
-from redetect.groundtruth.markers.chain import ChainPoints, project_chain
-from redetect.groundtruth.markers.floor import Floor
-from redetect.groundtruth.markers.refinement import PoseProblem
-from redetect.groundtruth.markers.session import MarkerFrame
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]

@@ -127,7 +127,7 @@ GOOD: dict[str, Any] = {
         (["markers", "31", "quaternion_xyzw"], [0, 0, 0, 2], "has length 2: expected a unit"),
         (["markers", "31", "quaternion_xyzw"], None, "expected 4 finite numbers"),
         (["markers", "31", "sigmas"], [1, 1, 1, 1, 1, -1], "sigmas: expected 0 or more"),
-        (["markers", "31", "covariance"], [[1]], "expected 6 rows of 6 numbers"),
+        (["markers", "31", "covariance"], [[1]], "expected 6 x 6 finite numbers"),
         (["covariance"], {"markers": ["1"], "matrix": []}, "markers are \\['1'\\]: expected"),
         (["covariance"], 5, "expected an object with markers and matrix"),
     ],

@@ -9,18 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.markers.chain import ChainPoints
+from redetect.groundtruth.markers.pnp import SOLVERS
+from redetect.groundtruth.markers.poses import estimate_pose
+from redetect.groundtruth.markers.refinement import Floor, PoseProblem
+from redetect.groundtruth.markers.settings import PoseSettings, Solver
+from redetect.groundtruth.trajectories.transforms import (
     inverse,
     log_se3,
     planar_transform,
     rotation_angle,
 )
-from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.floor import Floor
-from redetect.groundtruth.markers.pnp import SOLVERS
-from redetect.groundtruth.markers.poses import estimate_pose
-from redetect.groundtruth.markers.refinement import PoseProblem
-from redetect.groundtruth.markers.settings import PoseSettings, Solver
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, pose_problem, robot_pose
 
 FloatArray = NDArray[np.float64]

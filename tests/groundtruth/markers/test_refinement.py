@@ -8,22 +8,30 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.geometry.covariance import (
-    composed_covariance,
-    inverse_covariance,
-    planar_covariance,
-    planar_jacobian,
-)
-from redetect.groundtruth.geometry.transforms import exp_se3, heading, inverse, log_se3, roll_pitch
 from redetect.groundtruth.markers.chain import (
     ChainPoints,
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.floor import Floor, floor_residuals
 from redetect.groundtruth.markers.pnp import SOLVERS, solve_camera, solve_robot
-from redetect.groundtruth.markers.refinement import predicted_errors, refine_pose
+from redetect.groundtruth.markers.refinement import (
+    Floor,
+    floor_residuals,
+    predicted_errors,
+    refine_pose,
+)
 from redetect.groundtruth.markers.settings import Solver
+from redetect.groundtruth.trajectories.transforms import (
+    composed_covariance,
+    exp_se3,
+    heading,
+    inverse,
+    inverse_covariance,
+    log_se3,
+    planar_covariance,
+    planar_jacobian,
+    roll_pitch,
+)
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, lens, pose_problem, robot_pose
 
 FloatArray = NDArray[np.float64]

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.covariance import mean_pose
-from redetect.groundtruth.geometry.transforms import exp_se3, inverse, log_se3, planar_transform
 from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
@@ -20,12 +18,23 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
     spanning_tree,
 )
-from redetect.groundtruth.markers.rig_estimation import RigEstimate, estimate_rig
-from redetect.groundtruth.markers.rig_frame import rig_by_known_markers, rig_by_reference_poses
-from redetect.groundtruth.markers.rig_picture import draw_rig
+from redetect.groundtruth.markers.rig_estimation import (
+    RigEstimate,
+    estimate_rig,
+    rig_by_known_markers,
+    rig_by_reference_poses,
+)
 from redetect.groundtruth.markers.session import MarkerFrame
 from redetect.groundtruth.markers.settings import RigSettings
+from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.transforms import (
+    exp_se3,
+    inverse,
+    log_se3,
+    mean_pose,
+    planar_transform,
+)
 from tests.groundtruth.markers.scene import (
     box_rig,
     frames_of,

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.geometry.transforms import inverse, planar_transform, rotation_angle
 from redetect.groundtruth.markers.calibration import Network
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
@@ -23,6 +22,7 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.markers.track import report_entry, track_robot
+from redetect.groundtruth.trajectories.transforms import inverse, planar_transform, rotation_angle
 from redetect.landmarks import MarkerCorner
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 

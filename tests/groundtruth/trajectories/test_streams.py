@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.geometry.transforms import exp_se3, transform_from_quaternion
 from redetect.groundtruth.trajectories.streams import (
     RAWSEEDS_ROUNDING,
     PlanarPoses,
@@ -21,6 +20,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_times,
     write_planar_poses,
 )
+from redetect.groundtruth.trajectories.transforms import exp_se3, transform_from_quaternion
 from redetect.storage import OutputExistsError
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")

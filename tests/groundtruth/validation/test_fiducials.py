@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.validation.fiducials import (
-    Distance,
-    Survey,
-    read_distances,
-    read_survey,
-    write_distances,
-    write_survey,
-)
+from redetect.groundtruth.validation.fiducials import Distance, Survey, read_distances, read_survey
+from tools.simulator.laser.writers import write_distances, write_survey
 
 SURVEY = Survey(
     {"SW": np.array([0.0, 0.5]), "column": np.array([6.25, -3.0])},

@@ -11,17 +11,16 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.trajectories.alignment import planar_alignment
-from redetect.groundtruth.trajectories.interpolation import matched_streams
+from redetect.groundtruth.trajectories.matching import matched_streams, planar_alignment
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from redetect.groundtruth.validation.relative_errors import (
+from redetect.groundtruth.validation.scoring import (
     Relations,
     read_relations,
     relative_score,
+    score_poses,
     score_relations,
     score_steps,
 )
-from redetect.groundtruth.validation.scoring import score_poses
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
 

@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.alignment import align_poses
-from redetect.groundtruth.trajectories.interpolation import interpolate_poses
+from redetect.groundtruth.trajectories.matching import align_poses, interpolate_poses
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from redetect.groundtruth.validation.scoring import compare_streams, score_poses
+from redetect.groundtruth.validation.scoring import score_poses
+from tests.groundtruth.comparison import compare_streams
 
 
 def poses_of(times: list[float], rows: list[list[float]]) -> PlanarPoses:

@@ -13,22 +13,23 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.building import Building, write_building
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, write_robot
-from redetect.groundtruth.lasers.scans import Scans, write_scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
+from redetect.groundtruth.lasers.scans import Scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import (
-    Distance,
-    Survey,
-    write_distances,
-    write_survey,
-)
+from redetect.groundtruth.validation.fiducials import Distance, Survey
 from redetect.groundtruth.validation.reference_poses import poses_from_distances
 from redetect.groundtruth.validation.validate import figures_of, pose_errors, reference_poses
+from tools.simulator.laser.writers import (
+    write_building,
+    write_distances,
+    write_robot,
+    write_scans,
+    write_survey,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -68,7 +69,7 @@ def session(tmp_path: Path) -> Path:
     write_survey(folder / "fiducials.json", SURVEY)
     write_distances(folder / "distances.csv", distances_at(STANDS, np.random.default_rng(1)))
     walls = np.array([[0, 0, 8, 0], [8, 0, 8, 6], [8, 6, 0, 6], [0, 6, 0, 0]], dtype=float)
-    write_building(folder / "building.csv", Building(walls))
+    write_building(folder / "building.csv", walls)
     step = math.radians(1.0)
     scanner = Scanner("top", np.zeros(3), np.zeros((3, 3)), -math.pi, step, 360, 30.0, 0.01)
     outline = np.array([[0.3, 0.3], [-0.4, 0.3], [-0.4, -0.3], [0.3, -0.3]])
@@ -171,7 +172,7 @@ def test_the_command_writes_the_folder(session: Path, capsys: pytest.CaptureFixt
     assert "mean 20 mm, sigma 11; mean +0.15 deg, sigma 1.56 (published)" in printed
     content = json.loads((output / "validation.json").read_text())
     assert content["version"]
-    assert content["settings"]["scans"]["kept"] == 0.95
+    assert content["settings"] == {"refine": "scans"}
     assert set(content["files"]) >= {"distances.csv", "top.scans.npz", "clock.json", "poses.csv"}
     expected = np.hypot(*(noisy - STANDS)[:, :2].T)
     figures = content["figures"]

@@ -222,8 +222,8 @@ def test_points_on_the_robot_are_on_its_outline(session: tuple[Path, SessionPlan
 def test_the_drawing_is_the_map(session: tuple[Path, SessionPlan]) -> None:
     folder, plan = session
     rows, drawing = (read_building(folder / f"building.{end}") for end in ("csv", "dxf"))
-    np.testing.assert_allclose(rows.segments, drawing.segments, atol=1e-9)
-    np.testing.assert_allclose(rows.segments, plan.site.walls, atol=1e-6)
+    np.testing.assert_allclose(rows, drawing, atol=1e-9)
+    np.testing.assert_allclose(rows, plan.site.walls, atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(

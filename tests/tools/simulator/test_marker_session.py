@@ -12,17 +12,17 @@ import pytest
 from scipy.stats import chi2
 
 from camera import parse_camera, read_camera
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.markers.boards import Checkerboard, find_checkerboard
+from redetect.groundtruth.markers.calibration import read_network, read_rig
+from redetect.groundtruth.markers.chain import ChainPoints, project_chain
+from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
+from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     log_se3,
     planar_transform,
     transform_from_quaternion,
 )
-from redetect.groundtruth.markers.calibration import read_network, read_rig
-from redetect.groundtruth.markers.chain import ChainPoints, project_chain
-from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
-from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
 from tools.simulator.__main__ import main
 from tools.simulator.markers.calibration_set import (
     DOUBLE,

@@ -10,33 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.json_file import read_json, write_json
-from redetect.groundtruth.lasers.building import (
-    Building,
-    read_building,
-    write_building,
-    write_drawing,
-)
-from redetect.groundtruth.lasers.scanners import (
-    Scanner,
-    read_robot,
-    read_scanners,
-    write_robot,
-    write_scanners,
-)
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans, write_scans
+from redetect.groundtruth.files import read_json, write_json
+from redetect.groundtruth.lasers.building import read_building
+from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners, write_scanners
+from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import (
-    Distance,
-    Survey,
-    read_survey,
-    write_distances,
-    write_survey,
-)
+from redetect.groundtruth.validation.fiducials import Distance, Survey, read_survey
 from redetect.landmarks import wrap_angle
 from redetect.storage import write_whole
 from tools.arrays import BoolArray, FloatArray
@@ -45,6 +28,14 @@ from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
 from tools.simulator.laser.settings import LaserSettings
 from tools.simulator.laser.site import FIDUCIALS, ROOM_M, Passer, legs_of
+from tools.simulator.laser.writers import (
+    write_building,
+    write_distances,
+    write_drawing,
+    write_robot,
+    write_scans,
+    write_survey,
+)
 
 #: How long before and after each visit scans are logged, and the odometry if its log pauses.
 SCAN_MARGIN_S = 2.0
@@ -198,7 +189,7 @@ def write_session(
 
 
 def _write_site(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
-    building = Building(plan.site.walls)
+    building = plan.site.walls
     write_building(folder / "building.csv", building, overwrite=overwrite)
     write_drawing(folder / "building.dxf", building, overwrite=overwrite)
     write_robot(folder / "robot.json", plan.robot, {"note": NOTE}, overwrite=overwrite)
@@ -337,7 +328,7 @@ def draw_session(
     figure = Figure(figsize=(12.0, 10.0), layout="tight")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal")
-    walls = read_building(folder / "building.csv").segments.reshape(-1, 2, 2)
+    walls = read_building(folder / "building.csv").reshape(-1, 2, 2)
     axes.add_collection(LineCollection(list(walls), colors="black", linewidths=1.2))
     axes.plot(*truth.poses[:, :2].T, color="0.6", linewidth=0.8, label="way")
     axes.plot(*camera.poses[:, :2].T, ".", color="tab:red", markersize=2, label="marker poses")

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     planar_transform,
     quaternion_xyzw,
 )
-from redetect.groundtruth.json_file import write_json
 from tools.arrays import ByteArray, FloatArray
 from tools.simulator.markers.rendering import Imaging, grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit

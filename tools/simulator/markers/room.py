@@ -12,8 +12,8 @@ import numpy as np
 
 from camera import Camera
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
-from redetect.groundtruth.geometry.transforms import planar_transform, transform
 from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.trajectories.transforms import planar_transform, transform
 from tools.arrays import FloatArray
 from tools.simulator.markers.surface import (
     Surface,

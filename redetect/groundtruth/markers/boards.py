@@ -1,4 +1,4 @@
-"""``boards.json``: which checkerboard is in which image of which camera, and the boards' data.
+"""Checkerboards, and ``boards.json``: which is in which image of which camera.
 
 ::
 
@@ -12,6 +12,10 @@
 estimated, and may have ``sigmas`` or a ``covariance``. Images of one placement were taken without
 moving the board. Instead of ``image`` there may be ``corners``, found by other means. A camera's
 calibration is ``<camera>/<camera>.cam`` beside the file.
+
+A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
+right, y up, z out of the print, held so that the square in its top left corner is black. With one
+even and one odd number of corners only one way to hold it is like that.
 """
 
 from __future__ import annotations
@@ -24,22 +28,103 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from camera.boards.board import Board
+from camera.boards.points import find_board
 from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.json_file import read_json
+from redetect.groundtruth.files import numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
-from redetect.groundtruth.markers.checkerboard import Checkerboard, find_checkerboard
-from redetect.groundtruth.markers.network_estimation import BoardView, DoubleBoard
 from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
 from redetect.storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]
 
+
+#: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
+#: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
+_WINDOW = 0.4
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """A board's inner corners.
+
+    Raises
+    ------
+    GroundTruthError
+        If the board is symmetric under rotation by 180 degrees, or is too small.
+    """
+
+    # `columns`, `rows`: Numbers of inner corners; one even, one odd.
+    columns: int
+    rows: int
+    square_m: float  # Side of a square
+
+    def __post_init__(self) -> None:
+        try:
+            board = self.board
+        except CalibrationError as error:
+            raise GroundTruthError(str(error)) from None
+        if board.looks_turned:
+            raise GroundTruthError(
+                f"board of {self.columns} x {self.rows} inner corners looks the same turned by 180 "
+                "degrees: expected one even and one odd number"
+            )
+
+    @property
+    def board(self) -> Board:
+        """The board as used in the package `camera`."""
+        return Board("checkerboard", self.columns, self.rows, self.square_m)
+
+    @property
+    def points(self) -> FloatArray:
+        """(rows * columns, 3) inner corners in the board's frame, row by row from top left (m)."""
+        return self.board.points
+
+
+def find_checkerboard(image: NDArray[np.uint8], board: Checkerboard) -> FloatArray:
+    """A board's inner corners (rows * columns, 2) in an image (H, W) (OpenCV).
+
+    Pixels (the top left pixel's centre is 0, 0) in the order of `Checkerboard.points`.
+
+    Raises
+    ------
+    GeometryError
+        If there is no such board in the image.
+    """
+    try:
+        _, pixels = find_board(image, board.board, window=_WINDOW)
+    except CalibrationError:
+        raise GeometryError(
+            f"no checkerboard of {board.columns} x {board.rows} inner corners in the image"
+        ) from None
+    return pixels
+
+
 BOARDS_NAME = "boards.json"
 _LARGEST_IMAGE_BYTES = 1 << 28
 FIRST, SECOND, WORLD = "first", "second", "world"
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A board in an image."""
+
+    camera: str
+    board: str
+    corners: FloatArray  # (K, 2): pixels, in the order of `Checkerboard.points`
+
+
+@dataclass(frozen=True, eq=False)
+class DoubleBoard:
+    """Two boards held together."""
+
+    first: str
+    second: str
+    offset: FloatArray | None  # (4, 4): `first_from_second`; None if it is to be estimated.
+    covariance: FloatArray  # (6, 6): of its right perturbation; zeros if it is exactly known.
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,24 +140,13 @@ class BoardImage:
 
 @dataclass(frozen=True, eq=False)
 class BoardsFile:
-    """Content of a ``boards.json``.
-
-    Attributes
-    ----------
-    boards : dict of str to Checkerboard
-    world_from_board : (4, 4) float64
-    double : DoubleBoard or None
-    cameras : dict of str to Camera
-    calibrations : dict of str to str
-        Their files, relative to the folder.
-    images : tuple of BoardImage
-    """
+    """Content of a ``boards.json``."""
 
     boards: dict[str, Checkerboard]
-    world_from_board: FloatArray
+    world_from_board: FloatArray  # (4, 4)
     double: DoubleBoard | None
     cameras: dict[str, Camera]
-    calibrations: dict[str, str]
+    calibrations: dict[str, str]  # Their files, relative to the folder
     images: tuple[BoardImage, ...]
 
 
@@ -83,10 +157,6 @@ def read_boards(path: Path) -> BoardsFile:
     ----------
     path : path
         The file, or its folder.
-
-    Returns
-    -------
-    BoardsFile
 
     Raises
     ------
@@ -222,11 +292,6 @@ def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) 
             raise GroundTruthError(f"{place}: image is {excerpt(image)}: expected a file's name")
         path = _inside(place, folder, image)
         return BoardImage(camera, board, placement, path, None)
-    try:
-        array = np.asarray(corners, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    expected = (boards[board].rows * boards[board].columns, 2)
-    if array.shape != expected or not np.all(np.isfinite(array)):
-        raise GroundTruthError(f"{place}: corners: expected {expected[0]} pairs of finite numbers")
+    count = boards[board].rows * boards[board].columns
+    array = numbers(f"{place}: corners", corners, count, 2)
     return BoardImage(camera, board, placement, None, array)

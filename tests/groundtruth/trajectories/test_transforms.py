@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from redetect.groundtruth.geometry.transforms import (
+from redetect.groundtruth.trajectories.transforms import (
     adjoint,
     apply,
     exp_se3,
@@ -108,11 +108,9 @@ def test_heading_roll_and_pitch_are_those_of_yaw_pitch_roll(
 def test_a_stack_is_worked_on_like_its_members() -> None:
     generator = np.random.default_rng(1)
     stack = generator.normal(size=(3, 2, 6))
-    for function in (exp_se3, right_jacobian):
-        whole = function(stack)
-        for i in np.ndindex(3, 2):
-            np.testing.assert_array_equal(whole[i], function(stack[i]))
     poses = exp_se3(stack)
+    for i in np.ndindex(3, 2):
+        np.testing.assert_array_equal(poses[i], exp_se3(stack[i]))
     for of_pose in (log_se3, adjoint, inverse, rotation_angle, quaternion_xyzw):
         whole = of_pose(poses)
         for i in np.ndindex(3, 2):

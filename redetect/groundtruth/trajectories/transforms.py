@@ -11,11 +11,15 @@ T. D. Barfoot, *State Estimation for Robotics*, 2nd ed., 2024, chapter 8.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
+
 
 #: Below this angle (rad) closed forms lose more digits than their series.
 _SMALL_ANGLE_RAD = 1e-2
@@ -100,14 +104,15 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
     return matrix
 
 
-def right_jacobian(tangents: ArrayLike) -> FloatArray:
-    """(..., 6, 6) matrices J with exp(xi + d) = exp(xi) exp(J d) for small d, of (..., 6) xi."""
-    xi = -np.asarray(tangents, dtype=np.float64)  # the left Jacobian of the opposite tangent
-    rotation_part = _left_jacobian_so3(xi[..., 3:])
-    matrix = np.zeros((*xi.shape[:-1], 6, 6))
-    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation_part
-    matrix[..., :3, 3:] = _left_jacobian_coupling(xi)
-    return matrix
+def right_jacobian(tangent: ArrayLike) -> FloatArray:
+    """(6, 6) matrix J with exp(xi + d) = exp(xi) exp(J d) for small d, of a (6,) tangent xi."""
+    v, w = hat(np.reshape(tangent, (2, 3)))
+    # The integral of exp(-s ad) over s from 0 to 1, with ad = [[w, v], [0, w]].
+    block = np.zeros((12, 12))
+    block[:3, :3] = block[3:6, 3:6] = -w
+    block[:3, 3:6] = -v
+    block[:6, 6:] = np.eye(6)
+    return np.asarray(expm(block)[:6, 6:])
 
 
 def rotation_angle(transforms: ArrayLike) -> FloatArray:
@@ -150,29 +155,63 @@ def _coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     return a, b
 
 
-def _left_jacobian_coupling(xi: FloatArray) -> FloatArray:
-    """Barfoot's Q(xi), the off-diagonal block of SE(3)'s left Jacobian."""
-    rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
-    angle = np.linalg.norm(xi[..., 3:], axis=-1)[..., None, None]
-    _, b = _coefficients(angle)
-    square = angle * angle
-    # The closed forms of the higher coefficients cancel more than those above.
-    small = angle < 0.1
-    t = np.where(small, 1.0, angle)
-    c = np.where(
-        small,
-        1.0 / 24.0 - square / 720.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)),
-        (t**2 + 2.0 * np.cos(t) - 2.0) / (2.0 * t**4),
-    )
-    d = np.where(
-        small,
-        1.0 / 120.0 - square / 2520.0 * (1.0 - square / 48.0 * (1.0 - square / 82.5)),
-        (2.0 * t - 3.0 * np.sin(t) + t * np.cos(t)) / (2.0 * t**5),
-    )
-    pr, rp, prp = phi @ rho, rho @ phi, phi @ rho @ phi
+def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
+    """(..., 3, 6) derivative of (x, y, theta) by the right perturbation of (..., 4, 4) poses."""
+    rotation = np.asarray(world_from_robot, dtype=np.float64)[..., :3, :3]
+    jacobian = np.zeros((*rotation.shape[:-2], 3, 6))
+    jacobian[..., :2, :3] = rotation[..., :2, :]
+    # The x axis turns by R (w x e_x) = R (0, w_z, -w_y).
+    axis, to_y, to_z = rotation[..., 0], rotation[..., 1], rotation[..., 2]
+    across = axis[..., 0] ** 2 + axis[..., 1] ** 2
+    jacobian[..., 2, 5] = (axis[..., 0] * to_y[..., 1] - axis[..., 1] * to_y[..., 0]) / across
+    jacobian[..., 2, 4] = -(axis[..., 0] * to_z[..., 1] - axis[..., 1] * to_z[..., 0]) / across
+    return jacobian
+
+
+def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(..., 3, 3) covariance of (x, y, theta) (m, m, rad).
+
+    `world_from_robot` (..., 4, 4). `covariance` (..., 6, 6): of the right perturbation (translation
+    m, rotation rad).
+    """
+    jacobian = planar_jacobian(world_from_robot)
+    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
+
+
+def composed_covariance(
+    a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
+) -> FloatArray:
+    """(6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
+    moved = adjoint(inverse(b_from_c))
     return np.asarray(
-        0.5 * rho
-        + b * (pr + rp + prp)
-        + c * (phi @ pr + rp @ phi - 3.0 * prp)
-        + d * (prp @ phi + phi @ prp)
+        moved @ a_covariance @ np.swapaxes(moved, -1, -2) + b_covariance, dtype=np.float64
     )
+
+
+def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(6, 6) covariance of b_from_a, from that of a_from_b."""
+    moved = adjoint(a_from_b)
+    return np.asarray(moved @ covariance @ np.swapaxes(moved, -1, -2), dtype=np.float64)
+
+
+def mean_pose(
+    poses: Sequence[FloatArray] | FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Weighted mean of poses on SE(3) that are close to each other.
+
+    Of (N, 4, 4) poses and (N, 6, 6) covariances of their right perturbations. Returns the mean (4,
+    4), its covariance (6, 6) if the poses' errors are independent, and the squared normalised
+    deviations over degrees of freedom; 1 for a single pose.
+    """
+    stack = np.asarray(poses, dtype=np.float64)
+    mean, information = stack[0], np.linalg.inv(covariances)
+    covariance = np.linalg.inv(information.sum(axis=0))
+    for _ in range(20):
+        apart = log_se3(inverse(mean) @ stack)
+        step = covariance @ np.einsum("nij,nj->i", information, apart)
+        mean = mean @ exp_se3(step)
+        if np.abs(step).max() < 1e-13:
+            break
+    apart = log_se3(inverse(mean) @ stack)
+    squares = float(np.einsum("ni,nij,nj->", apart, information, apart))
+    return mean, covariance, squares / (6 * (len(stack) - 1)) if len(stack) > 1 else 1.0

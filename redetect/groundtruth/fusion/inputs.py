@@ -1,0 +1,287 @@
+"""The inputs of a fusion: settings, odometry as movements between nodes, measured poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories.plane import between, log_motion
+from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+
+FloatArray = NDArray[np.float64]
+
+
+_DEVIATIONS = (
+    "distance_sigma",
+    "lateral_sigma",
+    "turn_sigma",
+    "turn_per_metre_sigma",
+    "turn_scale_sigma",
+    "turn_bias_per_metre_sigma",
+    "distance_scale_sigma",
+)
+
+
+@dataclass(frozen=True)
+class FuseSettings:
+    """How odometry errs, and how far a measurement may be off.
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is not finite, negative, or no probability.
+    """
+
+    # Standard deviation of odometry's distance after a metre (m); it grows with the root.
+    distance_sigma: float = 0.02
+    # How far the robot slips sideways within a metre (m), its standard deviation; it grows with the
+    # root. The lateral error by a wrong heading is not part of it.
+    lateral_sigma: float = 0.01
+    turn_sigma: float = 0.02  # Standard deviation of its heading after turning a radian (rad)
+    turn_per_metre_sigma: float = 0.01  # The same after a metre driven (rad)
+    # Scale these deviations (distance's, the sideways one, and both of the heading together) by
+    # what makes the measurements likeliest; they only begin the search then.
+    learn_noise: bool = True
+    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Standard deviations,
+    # before anything was measured, of what odometry is off by: the share of each turn, the turn per
+    # metre (rad), the share of each way. Terms that make no better predictions are left out.
+    turn_scale_sigma: float = 0.03
+    turn_bias_per_metre_sigma: float = 0.01
+    distance_scale_sigma: float = 0.03
+    gate_probability: float = 0.9999  # Share of right poses that pass the gate
+    # Factors on the measurements' covariances, by the stream's name; others count as 1.
+    covariance_scale: Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name in _DEVIATIONS:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise GroundTruthError(f"{name} is {value}: expected 0 or more")
+        if not 0.0 < self.gate_probability < 1.0:
+            raise GroundTruthError(
+                f"gate_probability is {self.gate_probability}: expected between 0 and 1"
+            )
+        for name, value in (self.covariance_scale or {}).items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise GroundTruthError(f"covariance scale of {name} is {value}: expected above 0")
+
+    def systematic_sigmas(self) -> FloatArray:
+        """(3,) of the turns' share, the turn per metre (rad) and the ways' share."""
+        return np.array(
+            [self.turn_scale_sigma, self.turn_bias_per_metre_sigma, self.distance_scale_sigma]
+        )
+
+    def with_terms(self, kept: NDArray[np.bool_]) -> FuseSettings:
+        """With some of these three alone; the others are taken to be 0."""
+        turn, bend, way = np.where(kept, self.systematic_sigmas(), 0.0).tolist()
+        return replace(
+            self,
+            turn_scale_sigma=turn,
+            turn_bias_per_metre_sigma=bend,
+            distance_scale_sigma=way,
+        )
+
+
+# A robot at rest may still move a little; without this noise, rest would give singular covariances.
+_CREEP_M2_PER_S = (1e-4) ** 2
+_CREEP_RAD2_PER_S = (1e-4) ** 2
+# A turn is distinct if, from a second before to a second after, odometry turned by more than so
+# many of its standard deviations.
+_DISTINCT_OVER_S = 1.0
+_DISTINCT_SIGMAS = 4.0
+# Odometry pauses where samples are farther apart than both, in seconds and in usual intervals.
+_PAUSE_S = 1.0
+_PAUSE_INTERVALS = 10.0
+# Motion that is possible in a pause: at this quantile of the rates over a second.
+_USUAL_RATES_OVER_S = 1.0
+_USUAL_RATES_QUANTILE = 0.9
+
+
+def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
+    """Pauses of odometry, as the times of the samples before and after each.
+
+    Only the resulting movement is known of them, not the path. No two samples may have one time.
+    """
+    times = odometry.times_s
+    return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
+
+
+def _paused(times_s: FloatArray) -> NDArray[np.bool_]:
+    interval = np.diff(times_s)
+    if len(interval) == 0:
+        return np.zeros(0, dtype=np.bool_)
+    return np.asarray(interval > max(_PAUSE_S, _PAUSE_INTERVALS * float(np.median(interval))))
+
+
+def movements(
+    odometry: PlanarPoses, node_times_s: FloatArray, settings: FuseSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Movements between nodes, each a share of an arc between two samples of odometry.
+
+    `odometry` has two samples or more, no two of one time; (N,) node times ascend within its time.
+    Returns the controls (N, 4) of a `MovementProblem`, and the additional distance (m) and turn
+    (rad) (N, 2) that the robot may have made where odometry pauses, at its usual rates.
+    """
+    arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
+    way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
+    distinct = np.where(_distinct(odometry.times_s, way, turn, settings), turn, 0.0)
+    arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, way, turn)])
+    last = len(odometry) - 2
+    at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
+    share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
+    shares = np.concatenate([np.zeros((1, 6)), share[:, None] * arcs[at]])
+    return shares[:, :4].copy(), shares[:, 4:].copy()
+
+
+def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[FloatArray, ...]:
+    """Sums of steps from a margin before each to a margin after it, and over how long."""
+    from_s = np.maximum(times_s[:-1] - margin_s, times_s[0])
+    to_s = np.minimum(times_s[1:] + margin_s, times_s[-1])
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    ends = (np.interp(at, times_s, total) for at in (to_s, from_s))
+    return np.asarray(np.subtract(*ends)), to_s - from_s
+
+
+def _distinct(
+    times_s: FloatArray, way: FloatArray, turn: FloatArray, settings: FuseSettings
+) -> NDArray[np.bool_]:
+    """Between which samples the robot turned by more than odometry's random errors explain.
+
+    Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
+    errors, which measured headings contradict, so that the estimate would be biased towards -1
+    (regression dilution).
+    """
+    turned, passed = _within(times_s, turn, _DISTINCT_OVER_S)
+    driven, _ = _within(times_s, way, _DISTINCT_OVER_S)
+    variance = (
+        settings.turn_sigma**2 * np.abs(turned)
+        + settings.turn_per_metre_sigma**2 * driven
+        + _CREEP_RAD2_PER_S * passed
+    )
+    return np.asarray(turned**2 > _DISTINCT_SIGMAS**2 * variance)
+
+
+def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:
+    """(N - 1, 2) way and turn that pauses may hide, beyond the arcs over them."""
+    paused = _paused(times_s)
+    hidden = np.zeros((len(way), 2))
+    if not np.any(paused) or np.all(paused):
+        return hidden
+    usual = []
+    for steps in (way, turn):
+        total, passed = _within(times_s, steps, 0.5 * _USUAL_RATES_OVER_S)
+        usual.append(float(np.quantile((np.abs(total) / passed)[~paused], _USUAL_RATES_QUANTILE)))
+    passed = np.diff(times_s)[paused]
+    for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
+        hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
+    # Some odometry is written on change only: with all digits equal, the robot was at rest.
+    hidden[(way == 0.0) & (turn == 0.0)] = 0.0
+    return hidden
+
+
+def variances_of(
+    times_s: FloatArray,
+    controls: FloatArray,
+    unseen: FloatArray,
+    noise: Sequence[float] | FloatArray,
+    settings: FuseSettings,
+) -> FloatArray:
+    """(N, 3) noise of movements to nodes: along the way, across it (m^2), of the turn (rad^2).
+
+    All of it is proportional to way, turn and time, so that it adds up over parts of a movement;
+    but for what pauses hide: there odometry's systematic bend has a way to act on that is not
+    known, and what a wrong heading leads aside is taken to be that of a way out and back.
+
+    `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
+    `redetect.groundtruth.fusion.learning.noise_of`.
+    """
+    along, across, by_turn, by_way = np.square(noise)
+    way = np.hypot(controls[:, 0], controls[:, 1])
+    passed = np.concatenate([[0.0], np.diff(times_s)])
+    hidden_way, hidden_turn = unseen.T
+    hidden = (
+        by_turn * hidden_turn
+        + by_way * hidden_way
+        + np.square(settings.turn_bias_per_metre_sigma * hidden_way)
+    )
+    aside = hidden * hidden_way**2 / 12.0
+    return np.column_stack(
+        [
+            along * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
+            across * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
+            by_turn * np.abs(controls[:, 2]) + by_way * way + hidden + _CREEP_RAD2_PER_S * passed,
+        ]
+    )
+
+
+def gather(
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
+) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
+    """All measurements within the odometry's time, in order, with covariances that can be used.
+
+    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
+    stream how many covariances had to be raised and how many rows repeat the row before to the last
+    digit: these are left out, since one measurement must not count twice.
+    """
+    names: list[str] = []
+    times, poses, covariances = [], [], []
+    repaired, repeated = {}, {}
+    for name, stream in streams.items():
+        if stream.covariances is None:
+            raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
+        inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
+        again = inside & _repeats(stream, stream.covariances)
+        repeated[name] = int(np.count_nonzero(again))
+        inside &= ~again
+        usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
+        scale = (settings.covariance_scale or {}).get(name, 1.0)
+        names += [name] * int(np.count_nonzero(inside))
+        times.append(stream.times_s[inside])
+        poses.append(stream.poses[inside])
+        covariances.append(usable * scale)
+    if not names:
+        raise GroundTruthError(
+            "no measured pose within the odometry's time "
+            f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
+        )
+    all_times = np.concatenate(times)
+    order = np.argsort(all_times, kind="stable")
+    return (
+        [names[i] for i in order],
+        all_times[order],
+        np.concatenate(poses)[order],
+        np.concatenate(covariances)[order],
+        repaired,
+        repeated,
+    )
+
+
+def _repeats(stream: PlanarPoses, covariances: FloatArray) -> NDArray[np.bool_]:
+    """(N,) which rows are those before them."""
+    rows = np.column_stack([stream.times_s, stream.poses, covariances.reshape(len(stream), 9)])
+    same = np.all(rows[1:] == rows[:-1], axis=1)
+    return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
+
+
+def _usable(name: str, covariances: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, int]:
+    """Covariances of rows made symmetric, and raised where rounding made them singular."""
+    symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
+    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
+    worst = float(smallest.min(initial=0.0))
+    # Three entries of a row may each be off by the rounding.
+    if worst < -3.0 * RAWSEEDS_ROUNDING:
+        at = int(np.argmin(smallest))
+        raise GroundTruthError(
+            f"{name}: pose {rows[at] + 1} has a covariance with eigenvalue {worst:.3g}: expected "
+            "none below what rounding to six decimals makes of 0"
+        )
+    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
+    symmetric[weak] += np.eye(3) * (
+        RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])[:, None, None]
+    )
+    return symmetric, int(np.count_nonzero(weak))

@@ -1,0 +1,377 @@
+"""One movement by odometry, compiled: where it leads, derivatives, what its errors sum up to.
+
+Between two nodes the robot is taken to go forward, sideways and round at constant rates, which is
+an arc. All along it, white noise is added to the three rates: along the way, across it, and to the
+turn. Its effect at the arc's end is integrated in closed form: a heading that errs early
+leads aside for the rest of the way. So an arc that is cut in two, and its halves one after the
+other, come to the same. In complex numbers, with the arc's length s, its turn w and the directions
+of its chord and across it as axes, a wrong heading at the share t - 1/2 of the way moves the end by
+
+    s (cos h - cos wt + i (sin h - sin wt)) / w,        h = w / 2,
+
+of which `arc_integrals` gives means and variances over t from -1/2 to 1/2. (The covariance of both
+parts is zero, one being odd and the other even.)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+#: Length of the state, and of the pose at its beginning.
+STATE = 6
+POSE = 3
+#: Restart of the filter at a node: none, after many rejections, where it was lost.
+NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
+# Below this half turn (rad) differences cancel, and series are right to ten digits.
+_SERIES_BELOW = 0.1
+
+
+@njit(cache=True, error_model="numpy")
+def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
+    """Effect of errors along an arc of length 1.
+
+    `half_turn`: half the angle between its tangents at both ends (rad). Returns `chord`: length of
+    the chord, sin(h) / h. `mean_along`: mean of (cos h - cos 2ht) / 2h over t from -1/2 to 1/2. The
+    mean of (sin h - sin 2ht) / 2h is half the chord. `variance_along`, `variance_across`: variances
+    of the two over t. `mean_cosine`: mean of cos(4ht), sin(2h) / 2h: how much of the difference
+    between errors along the way and across it is left in the directions of the chord.
+    """
+    h = half_turn
+    q = h * h
+    if abs(h) < _SERIES_BELOW:
+        chord = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0)))
+        mean_along = h * (-1.0 / 6.0 + q * (1.0 / 60.0 + q * (-1.0 / 1680.0 + q / 90720.0)))
+        variance_along = q * (1.0 / 180.0 + q * (-1.0 / 1260.0 + q / 18900.0))
+        variance_across = 1.0 / 12.0 + q * (-1.0 / 60.0 + q * (1.0 / 630.0 - q / 11340.0))
+        p = 4.0 * q
+        mean_cosine = 1.0 - p / 6.0 * (1.0 - p / 20.0 * (1.0 - p / 42.0 * (1.0 - p / 72.0)))
+        return chord, mean_along, variance_along, variance_across, mean_cosine
+    chord = math.sin(h) / h
+    mean_cosine = math.sin(2.0 * h) / (2.0 * h)
+    mean_along = (math.cos(h) - chord) / (2.0 * h)
+    variance_along = (0.5 + 0.5 * mean_cosine - chord * chord) / (4.0 * q)
+    variance_across = (0.5 - 0.5 * mean_cosine) / (4.0 * q)
+    return chord, mean_along, variance_along, variance_across, mean_cosine
+
+
+@njit(cache=True, error_model="numpy")
+def move(
+    x: FloatArray,
+    p: FloatArray,
+    f: FloatArray,
+    control: FloatArray,
+    variances: FloatArray,
+    point: FloatArray,
+) -> None:
+    """Move a state and its covariance on by a movement of odometry, in place.
+
+    `x`, `p` (6,), (6, 6): state (see `redetect.groundtruth.fusion.kernels`) and covariance;
+    replaced. `f` (6, 6): identity on the first call; becomes the derivative of the new state by the
+    old one. `control` (4,): way forward, way to the left (m) and turn (rad), summed up over the
+    movement in the robot's own, turning frame; and the part of the turn that a share of turns is a
+    share of. `variances` (3,): what noise along the way, across it (m^2) and of the turn (rad^2)
+    sum up to. `point` (6,): the state at which the movement is linearised.
+    """
+    way = math.sqrt(control[0] * control[0] + control[1] * control[1])
+    turn, distinct = control[2], control[3]
+    length = (1.0 + point[5]) * way
+    half = 0.5 * (turn + point[3] * distinct + point[4] * way)
+    chord, along, variance_along, variance_across, mean_cosine = arc_integrals(half)
+    # The chord's direction in the world.
+    cos, sin = math.cos(point[2] + half), math.sin(point[2] + half)
+    east, north = cos, sin
+    if way > 0.0:
+        east = (cos * control[0] - sin * control[1]) / way
+        north = (sin * control[0] + cos * control[1]) / way
+    # By the turn of the whole arc.
+    by_turn_x = length * (along * east - 0.5 * chord * north)
+    by_turn_y = length * (along * north + 0.5 * chord * east)
+    f[0, 2] = -length * chord * north
+    f[1, 2] = length * chord * east
+    f[0, 3], f[0, 4], f[0, 5] = distinct * by_turn_x, way * by_turn_x, way * chord * east
+    f[1, 3], f[1, 4], f[1, 5] = distinct * by_turn_y, way * by_turn_y, way * chord * north
+    f[2, 3], f[2, 4] = distinct, way
+    x[0] += length * chord * east
+    x[1] += length * chord * north
+    for n in range(2, STATE):
+        off = x[n] - point[n]
+        x[0] += f[0, n] * off
+        x[1] += f[1, n] * off
+    x[2] += turn + x[3] * distinct + x[4] * way
+    # f is the identity but for rows 0 to 2: p becomes f p f' row by row, then column by column.
+    for j in range(STATE):
+        p[0, j] += f[0, 2] * p[2, j] + f[0, 3] * p[3, j] + f[0, 4] * p[4, j] + f[0, 5] * p[5, j]
+        p[1, j] += f[1, 2] * p[2, j] + f[1, 3] * p[3, j] + f[1, 4] * p[4, j] + f[1, 5] * p[5, j]
+        p[2, j] += f[2, 3] * p[3, j] + f[2, 4] * p[4, j]
+    for i in range(STATE):
+        p[i, 0] += p[i, 2] * f[0, 2] + p[i, 3] * f[0, 3] + p[i, 4] * f[0, 4] + p[i, 5] * f[0, 5]
+        p[i, 1] += p[i, 2] * f[1, 2] + p[i, 3] * f[1, 3] + p[i, 4] * f[1, 4] + p[i, 5] * f[1, 5]
+        p[i, 2] += p[i, 3] * f[2, 3] + p[i, 4] * f[2, 4]
+    of_turn = variances[2]
+    middle = 0.5 * (variances[0] + variances[1])
+    apart = 0.5 * (variances[0] - variances[1]) * mean_cosine
+    lever = length * length * of_turn
+    qa = middle + apart + lever * variance_along
+    qc = middle - apart + lever * variance_across
+    cross = east * north * (qa - qc) + of_turn * by_turn_x * by_turn_y
+    p[0, 0] += east * east * qa + north * north * qc + of_turn * by_turn_x * by_turn_x
+    p[1, 1] += north * north * qa + east * east * qc + of_turn * by_turn_y * by_turn_y
+    p[2, 2] += of_turn
+    for i, j, value in ((0, 1, cross), (0, 2, of_turn * by_turn_x), (1, 2, of_turn * by_turn_y)):
+        p[i, j] += value
+        p[j, i] += value
+
+
+@njit(cache=True, error_model="numpy")
+def _wrap(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@njit(cache=True, error_model="numpy")
+def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
+    """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
+    a, b, c = m[0, 0], m[0, 1], m[0, 2]
+    d, e, f = m[1, 1], m[1, 2], m[2, 2]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    scale = 1.0 / determinant
+    inverse[0, 0] = c00 * scale
+    inverse[0, 1] = inverse[1, 0] = c01 * scale
+    inverse[0, 2] = inverse[2, 0] = c02 * scale
+    inverse[1, 1] = (a * f - c * c) * scale
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
+    inverse[2, 2] = (a * d - b * b) * scale
+    return float(determinant)
+
+
+@njit(cache=True, error_model="numpy")
+def _squared_innovation(
+    p: FloatArray,
+    measured_covariance: FloatArray,
+    innovation: FloatArray,
+    s: FloatArray,
+    s_inverse: FloatArray,
+) -> tuple[float, float]:
+    """Normalised square of an innovation, and its covariance's determinant; fills the last two."""
+    for i in range(POSE):
+        for j in range(POSE):
+            s[i, j] = p[i, j] + measured_covariance[i, j]
+    determinant = _invert_3x3(s, s_inverse)
+    squared = 0.0
+    for i in range(POSE):
+        for j in range(POSE):
+            squared += innovation[i] * s_inverse[i, j] * innovation[j]
+    return squared, determinant
+
+
+@njit(cache=True, error_model="numpy")
+def _update(
+    x: FloatArray,
+    p: FloatArray,
+    innovation: FloatArray,
+    s_inverse: FloatArray,
+    gain: FloatArray,
+    temporary: FloatArray,
+) -> None:
+    """Take a measured pose in; gain and temporary are work space."""
+    for i in range(STATE):
+        for j in range(POSE):
+            total = 0.0
+            for n in range(POSE):
+                total += p[i, n] * s_inverse[n, j]
+            gain[i, j] = total
+    for i in range(STATE):
+        for j in range(POSE):
+            x[i] += gain[i, j] * innovation[j]
+        for j in range(STATE):
+            total = 0.0
+            for n in range(POSE):
+                total += gain[i, n] * p[n, j]
+            temporary[i, j] = total
+    for i in range(STATE):
+        for j in range(i, STATE):
+            p[i, j] -= 0.5 * (temporary[i, j] + temporary[j, i])
+            p[j, i] = p[i, j]
+
+
+class Odometry(NamedTuple):
+    """Movements to N nodes, each from the node before; the first is not used."""
+
+    controls: FloatArray  # (N, 4): as `move` takes them
+    variances: FloatArray  # (N, 3): accumulated noise along the way, across it and of the turn
+
+
+class MeasuredPoses(NamedTuple):
+    """M poses measured at some of the nodes, in ascending order."""
+
+    nodes: IntArray  # (M,)
+    # `poses`, `covariances`: (M, 3), (M, 3, 3)
+    poses: FloatArray
+    covariances: FloatArray
+
+
+class Gating(NamedTuple):
+    """When a measurement is rejected, and when the filter restarts from one."""
+
+    largest_squared: float  # Largest squared normalised innovation
+    # After this number of rejections in a row the pose becomes the measured one, with
+    # `restart_variances`, however far off the filter was
+    restart_after: int
+    restart_variances: FloatArray  # (3,)
+    lost_variance: float  # The same at once where the heading's variance (rad^2) is greater
+    cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
+
+
+class FilterHistory(NamedTuple):
+    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother."""
+
+    predicted: FloatArray
+    predicted_covariance: FloatArray
+    filtered: FloatArray
+    filtered_covariance: FloatArray
+    # (N, 6, 6): derivatives of each node's prediction with respect to the node before
+    transitions: FloatArray
+
+
+def empty_history(nodes: int) -> FilterHistory:
+    """A history to be filled; of no nodes where none is wanted."""
+    states, spreads = (nodes, STATE), (nodes, STATE, STATE)
+    return FilterHistory(
+        np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def filter_forward(
+    odometry: Odometry,
+    start: FloatArray,
+    start_covariance: FloatArray,
+    measured: MeasuredPoses,
+    gating: Gating,
+    points: FloatArray,
+    history: FilterHistory,
+) -> tuple[FloatArray, BoolArray, NDArray[np.int8], float]:
+    """Filter N nodes forward.
+
+    `start`, `start_covariance` (6,), (6, 6): before the measurements at the first node. `points`
+    (N, 6): states at which each movement away from a node is linearised, with headings that go on
+    without jumps; measured headings are assumed to be within half a turn of them. Of length 1: at
+    the filter's own. `history`: filled, unless it is of no nodes. Returns `squared_innovations`
+    (M,): normalised. `accepted` (M,). `restarted` (N,): whether the filter began anew at a node,
+    and why. `surprise`: minus twice the logarithm of the likelihood of the accepted innovations.
+    """
+    controls, nodes = odometry.controls, measured.nodes
+    keep = len(history.predicted) > 0
+    predicted, predicted_covariance = history.predicted, history.predicted_covariance
+    filtered, filtered_covariance = history.filtered, history.filtered_covariance
+    transitions = history.transitions
+    squared_innovations = np.zeros(len(nodes))
+    accepted = np.zeros(len(nodes), np.bool_)
+    restarted = np.empty(len(controls), np.int8)
+    x = start.copy()
+    p = start_covariance.copy()
+    f = np.eye(STATE)
+    s = np.empty((POSE, POSE))
+    s_inverse = np.empty((POSE, POSE))
+    innovation = np.empty(POSE)
+    gain = np.empty((STATE, POSE))
+    temporary = np.empty((STATE, STATE))
+    m = 0
+    rejections = 0
+    surprise = 0.0
+    for k in range(controls.shape[0]):
+        restarted[k] = NOT_ANEW
+        cut = gating.cuts[k]
+        if k > 0:
+            if points.shape[0] > 1:
+                move(x, p, f, controls[k], odometry.variances[k], points[k - 1])
+            else:
+                move(x, p, f, controls[k], odometry.variances[k], x.copy())
+            if keep:
+                transitions[k] = f
+        if keep:
+            predicted[k] = x
+            predicted_covariance[k] = p
+        while m < nodes.shape[0] and nodes[m] == k:
+            for i in range(POSE):
+                innovation[i] = measured.poses[m, i] - x[i]
+            if points.shape[0] > 1:
+                ahead = points[k, 2] - x[2]
+                innovation[2] = ahead + _wrap(innovation[2] - ahead)
+            else:
+                innovation[2] = _wrap(innovation[2])
+            lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
+            if lost or rejections >= gating.restart_after:
+                for i in range(POSE):
+                    for j in range(STATE):
+                        p[i, j] = 0.0
+                        p[j, i] = 0.0
+                for i in range(POSE):
+                    p[i, i] = gating.restart_variances[i]
+                    x[i] += innovation[i]
+                    innovation[i] = 0.0
+                rejections = 0
+                cut = False
+                restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
+                if keep:
+                    predicted[k] = x
+                    predicted_covariance[k] = p
+                    transitions[k, :POSE] = 0.0
+            squared, determinant = _squared_innovation(
+                p, measured.covariances[m], innovation, s, s_inverse
+            )
+            squared_innovations[m] = squared
+            accepted[m] = squared <= gating.largest_squared
+            if accepted[m]:
+                rejections = 0
+                surprise += squared + math.log(determinant)
+                _update(x, p, innovation, s_inverse, gain, temporary)
+            else:
+                rejections += 1
+                surprise += gating.largest_squared + math.log(determinant)
+            m += 1
+        if keep:
+            filtered[k] = x
+            filtered_covariance[k] = p
+    return squared_innovations, accepted, restarted, surprise
+
+
+@njit(cache=True, error_model="numpy")
+def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
+    """Smooth what `filter_forward` left, from the last node to the first.
+
+    Where the filter began anew, poses before learn from what came after only what it says of
+    odometry's systematic errors.
+
+    Returns `states`, `covariances` (N, 6), (N, 6, 6).
+    """
+    predicted, predicted_covariance = history.predicted, history.predicted_covariance
+    filtered, filtered_covariance = history.filtered, history.filtered_covariance
+    transitions = history.transitions
+    smoothed, smoothed_covariance = np.empty_like(filtered), np.empty_like(filtered_covariance)
+    last = predicted.shape[0] - 1
+    smoothed[last] = filtered[last]
+    smoothed_covariance[last] = filtered_covariance[last]
+    for k in range(last - 1, -1, -1):
+        p = filtered_covariance[k]
+        expected = predicted_covariance[k + 1].copy()
+        for i in range(STATE):
+            # States without any variance stay as they are.
+            if expected[i, i] == 0.0:
+                expected[i, i] = 1.0
+        gain = np.ascontiguousarray(np.linalg.solve(expected, transitions[k + 1] @ p).T)
+        smoothed[k] = filtered[k] + gain @ (smoothed[k + 1] - predicted[k + 1])
+        change = smoothed_covariance[k + 1] - predicted_covariance[k + 1]
+        spread = p + gain @ change @ gain.T
+        smoothed_covariance[k] = 0.5 * (spread + spread.T)
+    return smoothed, smoothed_covariance

@@ -1,1 +1,0 @@
-"""Rigid motions: in space, in the plane, and the covariances of poses."""

@@ -1,0 +1,237 @@
+"""Pictures beside results: a rig, the scanners' alignment, errors at reference poses (PNG)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from redetect.groundtruth.lasers.alignment import Alignment, StillScan
+from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.markers.calibration import Rig, marker_corners
+from redetect.groundtruth.markers.rig_estimation import RigEstimate
+from redetect.groundtruth.report.figures import draw_walls
+from redetect.groundtruth.trajectories import plane
+from redetect.groundtruth.trajectories.transforms import apply, inverse
+from redetect.groundtruth.validation.validate import PUBLISHED, Figures, PoseError, ReferencePose
+from redetect.reporting.page import figure_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FloatArray = NDArray[np.float64]
+
+
+_PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from the front"))
+_AXES = ("x", "y", "z")
+_AGREES, _DIFFERS = "#2a78b5", "#d9822b"
+
+
+def draw_rig(estimate: RigEstimate) -> bytes:
+    """Draw a rig from three sides; a PNG's bytes, the same for the same input.
+
+    Pairwise estimates are drawn where they would put a marker, seen from the other one.
+    """
+    rig = estimate.rig
+    agreeing, differing = _clouds(estimate, rig)
+    with figure_file((13.5, 5.0), "png") as (figure, content):
+        centre = rig.robot_from_marker[:, :3, 3]
+        middle = 0.5 * (centre.min(axis=0) + centre.max(axis=0))
+        reach = 0.5 * float(np.ptp(centre, axis=0).max()) + float(rig.widths_m.max())
+        for axes, (across, up, title) in zip(figure.subplots(1, 3), _PLANES):
+            # Wrong estimates are far away: only those inside the picture are drawn.
+            axes.scatter(
+                differing[:, across], differing[:, up], s=14, marker="x", color=_DIFFERS, lw=0.8,
+                label=f"pairwise, differs ({len(differing)})", zorder=1,
+            )  # fmt: skip
+            axes.scatter(
+                agreeing[:, across], agreeing[:, up], s=9, color=_AGREES, alpha=0.35, lw=0,
+                label=f"pairwise, agrees ({len(agreeing)})", zorder=2,
+            )  # fmt: skip
+            _draw_markers(axes, rig, across, up)
+            axes.set_xlim(middle[across] - reach, middle[across] + reach)
+            axes.set_ylim(middle[up] - reach, middle[up] + reach)
+            axes.set_aspect("equal")
+            axes.set_xlabel(f"{_AXES[across]} / m")
+            axes.set_ylabel(f"{_AXES[up]} / m")
+            axes.set_title(title)
+            axes.grid(alpha=0.25)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return content.getvalue()
+
+
+def _clouds(estimate: RigEstimate, rig: Rig) -> tuple[FloatArray, FloatArray]:
+    """Markers' centres by the pairwise estimates that agree, and by those that do not."""
+    agreeing, differing = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for (a, b), pair in sorted(estimate.pairs.items()):
+        poses = rig.robot_from_marker
+        places = np.concatenate(
+            [
+                (poses[a] @ pair.estimates)[:, :3, 3],
+                (poses[b] @ inverse(pair.estimates))[:, :3, 3],
+            ]
+        )
+        agrees = np.tile(pair.agrees, 2)
+        agreeing.append(places[agrees])
+        differing.append(places[~agrees])
+    return np.concatenate(agreeing), np.concatenate(differing)
+
+
+def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
+    for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker):
+        outline = apply(pose, marker_corners(width)[[0, 1, 2, 3, 0]])
+        label = "adjusted markers" if marker == rig.ids[0] else None
+        axes.plot(outline[:, across], outline[:, up], color="black", lw=1.4, label=label, zorder=3)
+        normal = apply(pose, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6 * width]]))
+        axes.plot(normal[:, across], normal[:, up], color="black", lw=0.8, zorder=3)
+        axes.annotate(
+            str(marker), (float(normal[1, across]), float(normal[1, up])), ha="center",
+            va="center", fontsize=10,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+            zorder=4, annotation_clip=True,
+        )  # fmt: skip
+
+
+_COLOURS = ("#2a78b5", "#d9822b", "#3a9150", "#8e5bb0", "#b03a48", "#6b6b6b")
+
+
+def draw_alignment(
+    measured: tuple[Scanner, ...],
+    alignment: Alignment,
+    scans: list[StillScan],
+    building: FloatArray,
+) -> bytes:
+    """Draw the scans on the map by the measured poses and by those found; a PNG's bytes.
+
+    The same input gives the same bytes.
+    """
+    with figure_file((13.5, 6.2), "png") as (figure, content):
+        after = [scanner.pose for scanner in alignment.scanners]
+        before = [scanner.pose for scanner in measured]
+        everything = np.concatenate([plane.apply(p, s.points) for p, s in zip(after, scans)])
+        low, high = everything.min(axis=0) - 0.5, everything.max(axis=0) + 0.5
+        panels = zip(figure.subplots(1, 2), (before, after), ("measured by hand", "aligned"))
+        for axes, poses, title in panels:
+            draw_walls(axes, building)
+            for k, (pose, scan) in enumerate(zip(poses, scans)):
+                colour = _COLOURS[k % len(_COLOURS)]
+                points = plane.apply(pose, scan.points)
+                axes.scatter(points[:, 0], points[:, 1], s=7, color=colour, lw=0, zorder=2)
+                ahead = plane.apply(pose, np.array([[0.0, 0.0], [0.5, 0.0]]))
+                axes.plot(ahead[:, 0], ahead[:, 1], color=colour, lw=2.0, zorder=3)
+                axes.plot(
+                    *pose[:2], "o", color=colour, ms=7, zorder=3, label=alignment.scanners[k].name
+                )
+            axes.set_xlim(low[0], high[0])
+            axes.set_ylim(low[1], high[1])
+            axes.set_aspect("equal")
+            axes.set_xlabel("x / m")
+            axes.set_ylabel("y / m")
+            axes.set_title(title)
+            axes.grid(alpha=0.25)
+        axes.legend(loc="upper right", framealpha=0.9)
+    return content.getvalue()
+
+
+_BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
+
+
+def draw_errors(
+    references: Sequence[ReferencePose],
+    errors: Sequence[PoseError],
+    figures: Figures,
+    building: FloatArray | None = None,
+) -> bytes:
+    """Draw errors with bounds by their covariances; returns a PNG's bytes.
+
+    The same input gives the same bytes.
+
+    `errors`: at least one. `figures`: of the errors. `building` (S, 4): walls to draw on the map
+    (m).
+    """
+    with figure_file((13.5, 6.4), "png") as (figure, content):
+        grid = figure.add_gridspec(2, 2, width_ratios=[1.25, 1.0])
+        linear, angular = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
+        names = [str(error.index) for error in errors]
+        at = np.arange(len(errors))
+        heights = 1e3 * np.array([error.linear_m for error in errors])
+        linear.bar(at, heights, color=_BLUE, width=0.6, label="error")
+        # Of two independent directions: the root mean square, so that it compares with errors.
+        expected = 1e3 * np.array([error.sigma_linear_m for error in errors])
+        if np.isfinite(expected).any():
+            linear.plot(at, expected, "_", color=_ORANGE, ms=11, mew=2, label="expected (rms)")
+        linear.axhline(1e3 * figures.linear_mean_m, color=_BLUE, lw=1.0, ls="--", label="mean")
+        published = PUBLISHED[0]
+        label = f"mean of {published.name}: {1e3 * published.position_mean_m:g} mm"
+        if published.position_mean_m < 2.0 * figures.linear_worst_m:
+            height = 1e3 * published.position_mean_m
+            linear.axhline(height, color=_GREY, lw=1.0, ls=":", label=label)
+        else:
+            linear.plot([], [], " ", label=f"{label}, above the plot")
+        linear.set_ylabel("linear error / mm")
+        linear.set_title(
+            f"linear: mean {1e3 * figures.linear_mean_m:.2f} mm, sigma "
+            f"{1e3 * figures.linear_sigma_m:.2f} mm, worst {1e3 * figures.linear_worst_m:.2f} mm",
+            fontsize=10,
+        )
+        turns = np.degrees([error.angular_rad for error in errors])
+        sigma = np.degrees([error.sigma_angular_rad for error in errors])
+        angular.axhline(0.0, color=_GREY, lw=0.8)
+        angular.errorbar(
+            at, turns, yerr=np.where(np.isfinite(sigma), sigma, 0.0), fmt="o", color=_BLUE,
+            ecolor=_ORANGE, ms=4.5, capsize=2.5, label="error, one sigma expected",
+        )  # fmt: skip
+        angular.set_ylabel("angular error / deg")
+        angular.set_xlabel("reference pose")
+        angular.set_title(
+            f"angular: mean {math.degrees(figures.angular_mean_rad):+.3f} deg, sigma "
+            f"{math.degrees(figures.angular_sigma_rad):.3f} deg, worst "
+            f"{math.degrees(figures.angular_worst_rad):.3f} deg",
+            fontsize=10,
+        )
+        for axes in (linear, angular):
+            axes.set_xticks(at, names, fontsize=8, rotation=90 if len(at) > 40 else 0)
+            axes.set_xlim(-0.7, len(at) - 0.3)
+            axes.grid(axis="y", alpha=0.25)
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high + 0.22 * (high - low))  # space for the legend
+            axes.legend(loc="upper center", ncols=4, fontsize=8, framealpha=0.9)
+
+        where = figure.add_subplot(grid[:, 1])
+        if building is not None:
+            draw_walls(where, building)
+        by_index = {reference.index: reference for reference in references}
+        poses = np.array([by_index[error.index].pose for error in errors])
+        shown = np.array([[error.x_m, error.y_m] for error in errors])
+        span = float(np.ptp(poses[:, :2], axis=0).max()) if len(errors) > 1 else 1.0
+        factor = _round_factor(0.12 * max(span, 1.0) / max(figures.linear_worst_m, 1e-6))
+        where.quiver(
+            poses[:, 0], poses[:, 1], factor * shown[:, 0], factor * shown[:, 1], angles="xy",
+            scale_units="xy", scale=1.0, color=_BLUE, width=0.004, zorder=3,
+        )  # fmt: skip
+        ahead = poses[:, :2] + 0.2 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+        ends = np.stack([poses[:, :2], ahead])
+        where.plot(ends[:, :, 0], ends[:, :, 1], color="0.2", lw=1.2, zorder=2)
+        where.plot(poses[:, 0], poses[:, 1], "o", color="0.2", ms=3, zorder=2)
+        for error, pose in zip(errors, poses):
+            where.annotate(
+                str(error.index), pose[:2], xytext=(4, 4), textcoords="offset points", fontsize=7
+            )
+        low, high = poses[:, :2].min(axis=0) - 1.5, poses[:, :2].max(axis=0) + 1.5
+        where.set_xlim(low[0], high[0])
+        where.set_ylim(low[1], high[1])
+        where.set_aspect("equal")
+        where.set_xlabel("x / m")
+        where.set_ylabel("y / m")
+        where.set_title(f"errors, drawn {factor:g} times as long", fontsize=10)
+        where.grid(alpha=0.25)
+    return content.getvalue()
+
+
+def _round_factor(wanted: float) -> float:
+    """The largest of 1, 2, 5, 10, ... that is at most `wanted`; 1 if that is below 1."""
+    power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))

@@ -1,0 +1,90 @@
+"""The parts of a report, of which ``page.html`` makes a page, and the files of its figures.
+
+A page has no scripts and loads nothing: its figures are data: addresses. Pages and figures are the
+same each time, whatever the user's own matplotlib settings are.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import matplotlib as mpl
+from jinja2 import Environment, StrictUndefined
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+_DPI = 120
+_TEMPLATE = Path(__file__).with_name("page.html")
+_FORBIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]")
+
+
+class Part(NamedTuple):
+    """A piece of a section; its kind says what the template makes of it.
+
+    `words` are the text or the caption. Rows of figures are names and values, those of a key
+    colours and words. `left` are the columns of a table that have text, `bold` the rows to point
+    out.
+    """
+
+    kind: str
+    words: str = ""
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    left: tuple[int, ...] = (0,)
+    bold: tuple[int, ...] = ()
+    address: str = ""
+    width: int = 0
+    height: int = 0
+
+
+class Section(NamedTuple):
+    """A section with its heading."""
+
+    key: str
+    name: str
+    parts: Sequence[Part]
+
+
+def image_part(words: str, content: bytes, kind: str, width: float, height: float) -> Part:
+    """An image with its caption; `kind` is its type behind ``image/``."""
+    address = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return Part("image", words, address=address, width=round(width), height=round(height))
+
+
+def page_of(title: str, sections: Sequence[Section]) -> bytes:
+    """The whole page, UTF-8; all text is escaped."""
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=printable
+    )
+    template = environment.from_string(_TEMPLATE.read_text("utf-8"))
+    return (template.render(title=title, sections=sections).rstrip("\n") + "\n").encode("utf-8")
+
+
+def printable(value: Any) -> Any:
+    """Text without characters that are not allowed in a page; anything else as it is."""
+    return _FORBIDDEN.sub("\ufffd", value) if type(value) is str else value
+
+
+@contextmanager
+def figure_file(
+    size: tuple[float, float], kind: Literal["png", "svg"]
+) -> Iterator[tuple[Figure, io.BytesIO]]:
+    """An empty figure of a width and height (inches) to draw into, and its file afterwards."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        # Names of parts are hashes with a fixed salt; text remains text, in the viewer's own font.
+        mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
+        mpl.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        content = io.BytesIO()
+        yield figure, content
+        # Without date, name and version of the program: the same bytes each time.
+        nameless = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+        figure.savefig(content, format=kind, dpi=_DPI, metadata=nameless)
