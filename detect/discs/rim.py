@@ -55,6 +55,8 @@ _START_X, _START_Y = (
     np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
     for of in (np.cos, np.sin)
 )
+#: So many points must a circle have more that is a standard deviation of the radius off.
+_POINTS_PER_SIGMA = 0.5
 #: Steps from each start, and the longest of them, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
@@ -322,7 +324,7 @@ def best_circle(
         points += weight[k] > 0.0
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    best_count = 0
+    best_count, best_score = 0, 0.0
     for start in range(_STARTS):
         circle = Circle(_START_X[start], _START_Y[start], 1.0, 0.0, 0.0, 0.0)
         count, _ = _choose(x, y, weight, tolerance, circle, 2.5, chosen)
@@ -335,13 +337,15 @@ def best_circle(
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
             if i > 2 and not changed and moved < _ARRIVED:
                 break
-        if count > best_count:
-            best_count = count
+        # Of a circle of another size more points are asked for, as the prior has it.
+        score = count - _POINTS_PER_SIGMA * ((circle.radius - 1.0) / RADIUS_SIGMA) ** 2
+        if count >= LEAST_POINTS and score > best_score:
+            best_count, best_score = count, score
             best = circle
             for k in range(DIRECTIONS):
                 best_chosen[k] = chosen[k]
             # What has more points than this shares most of them: it is the same circle.
-            if count >= _CERTAINLY_BEST * points:
+            if score >= _CERTAINLY_BEST * points:
                 break
     return best, best_count
 

@@ -43,7 +43,7 @@ _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = slice(1, 3), slice(5, 7)
-_LEAST_STEPS = 0.35
+_LEAST_STEPS = 0.24
 #: Least share of the rim that is on a circle.
 _LEAST_RIM = 0.35
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
