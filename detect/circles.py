@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
-from detect.discs.fit import blur_ratio_of, fit_settings
+from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
+from detect.discs.placing import place_all_by_part
 from detect.discs.positions import refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
@@ -141,14 +142,17 @@ def _with_fit(
     image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The default detector: discs that are fitted from the best centres."""
-    noise, _, centres, found = first_look(image, camera, table, settings)
+    noise, _, centres, found, scene = first_look(image, camera, table, settings)
     pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
     floor_xy, fitted, evidence = found.floor_xy, found.covariance, found.evidence
     if looks_twice(settings):
         more = second_looks_at(image, camera, table, settings, floor_xy, noise)
         is_disc = more.log_odds >= 0.0
         if is_disc.any():
-            more_xy = more.floor_xy[is_disc]
+            placed = place_all_by_part(
+                scene, more.floor_xy[is_disc], more.step[is_disc], working_space()
+            )
+            more_xy, more_covariance = fitted_positions(placed)
             last = [camera.width - 1, camera.height - 1]
             more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
             pixels = np.concatenate([pixels, more_pixels])
@@ -156,7 +160,7 @@ def _with_fit(
             pixels = pixels[order]
             found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
             floor_xy = np.concatenate([floor_xy, more_xy])[order]
-            fitted = np.concatenate([fitted, more.covariance[is_disc]])[order]
+            fitted = np.concatenate([fitted, more_covariance])[order]
             evidence = np.concatenate([evidence, settings.evidence + more.log_odds[is_disc]])[order]
     covariance = refined_covariance(camera, floor_xy, fitted, settings)
     if not settings.refine:
@@ -177,6 +181,7 @@ class FirstLook(NamedTuple):
     weakest: float  # least contrast, grey levels
     centres: Centres
     found: FoundDiscs
+    scene: Scene
 
 
 def first_look(
@@ -192,7 +197,7 @@ def first_look(
         image, table.floor_xy, first_search(settings), fit_settings(noise, kernel.blur_ratio),
         kernel.numbers,
     )  # fmt: skip
-    return FirstLook(noise, weakest, centres, search_discs(scene, centres, weakest))
+    return FirstLook(noise, weakest, centres, search_discs(scene, centres, weakest), scene)
 
 
 def looks_twice(settings: CircleSettings) -> bool:

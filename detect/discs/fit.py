@@ -204,7 +204,7 @@ def fit_all(
     fitted = np.zeros(n, np.bool_)
     work = np.zeros(1, WORK)
     for i in range(n):
-        candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_guess[i])
+        candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_guess[i], 0)
         start = Disc(0.0, 0.0, 1.0, math.log(blur_guess[i]))
         fitted[i] = fit_disc(
             image, floor_xy, candidate, settings, start, effort, PATIENT, work[0], results[i]

@@ -24,9 +24,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
+from detect.discs.patch import DIRECTIONS
 
-#: Directions in which the rim is searched, and steps along each of them.
-DIRECTIONS = 32
+#: Steps along each of the `DIRECTIONS` in which the rim is searched.
 STEPS = 32
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
@@ -103,6 +103,8 @@ class Rim(NamedTuple):
     cov_yy: float
     radius_px: float
     """Geometric mean of the radius over the directions, pixels."""
+    hidden: int
+    """Directions in or beside which the rim is not on the circle, a bit each."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -392,7 +394,7 @@ def follow_rim(
     chosen = np.zeros(DIRECTIONS)
     best, best_count = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(log_px)
-    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px)
+    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0)
     if best_count < LEAST_POINTS:
         return nothing
     height, width = image.shape
@@ -417,8 +419,10 @@ def follow_rim(
             mean_2 += step[k] ** 2
     mean /= best_count
     mean_2 = max(mean_2 / best_count - mean * mean, 0.0)
-    runs = 0
+    runs = hidden_bits = 0
     for k in range(DIRECTIONS):
+        around = min(chosen[(k - 1) % DIRECTIONS], chosen[k], chosen[(k + 1) % DIRECTIONS])
+        hidden_bits |= (around == 0.0) << k
         # A stretch begins after a direction that agrees, and has two that do not.
         last, following = (k - 1) % DIRECTIONS, (k + 1) % DIRECTIONS
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
@@ -432,7 +436,7 @@ def follow_rim(
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
         x + radius * best.x, y + radius * best.y, radius_found,
         area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
-        area * (share * best.cov_yy + by_yy), radius_px,
+        area * (share * best.cov_yy + by_yy), radius_px, hidden_bits,
     )  # fmt: skip
 
 

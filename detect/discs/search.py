@@ -23,6 +23,7 @@ from detect.discs.evidence_kernels import (
 from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
+from detect.discs.placing import WELL_EXPLAINED, place_by_part
 from detect.discs.quality import Centres
 from detect.discs.rim import Rim, follow_rim
 
@@ -56,10 +57,12 @@ _BY_FIT = 0.5
 _WHOLE_RIM = 0.9
 #: A rim whose step varies by less than this over the directions, relative to its mean, is even.
 _EVEN = 0.18
+#: Nothing moves where the blur is less than this, pixels.
+_SHARP_PX = 1.2
 #: A fit that explains less of the variance than this is of a disc that something hides.
 _LITTLE = 0.7
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
-_WELL_EXPLAINED, _HALF_RIM = 0.97, 0.5
+_HALF_RIM = 0.5
 
 
 #: Candidates of a lower quality than this are kept only if the grey value steps in this share
@@ -193,7 +196,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         if search.verify and not worth_a_look(scene, u, v, quality, contrast):
             fate[k] = _FEW_STEPS
             continue
-        candidate = Candidate(u, v, search.radius, first_blur)
+        candidate = Candidate(u, v, search.radius, first_blur, 0)
         start = Disc(0.0, 0.0, 1.0, math.log(first_blur))
         hope = _hope(search, quality)
         if fit_disc(image, floor_xy, candidate, settings, start, LOOK, hope, work, result):
@@ -215,7 +218,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         blur = max(result.blur, first_blur)
         is_disc = False
         for _ in range(1 + _MOST_REFITS):
-            candidate = Candidate(u, v, search.radius, blur)
+            candidate = Candidate(u, v, search.radius, blur, 0)
             start = Disc(
                 (result.x - floor_xy[v, u, 0]) / search.radius,
                 (result.y - floor_xy[v, u, 1]) / search.radius,
@@ -228,7 +231,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             )
             evidence[k] = _evidence(result, search) if is_disc else -np.inf
             if is_disc and search.verify:
-                evidence[k] = _with_rim(scene, quality, evidence[k], result)
+                evidence[k] = _with_rim(scene, quality, evidence[k], work, result)
                 is_disc = evidence[k] >= search.least_evidence
             if not is_disc or result.blur <= _AT_BOUND * result.blur_bound:
                 break
@@ -332,12 +335,11 @@ def _hope(search: DiscSearch, quality: float) -> Hope:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> float:
+def _with_rim(scene: Scene, quality: float, log_odds: float, work: Any, result: Any) -> float:
     """The evidence of a fit with its rim, where it is doubtful; the rim may place the disc.
 
-    It places a partly hidden disc, and one that the fit explains in part if it states the smaller
-    covariance: a shadow's edge, a sun patch or a sheet of paper pull at the fit of a whole disc,
-    and much less at the points of the rim beside them.
+    It places a partly hidden disc, and one that the fit explains in part: a shadow's edge, a sun
+    patch or a sheet of paper pull at the fit of a whole disc (`detect.discs.placing`).
     """
     search = scene.search
     is_clear = log_odds >= search.least_evidence + CLEAR_EVIDENCE
@@ -345,7 +347,7 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> flo
     possible = (
         RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result.middle_step > LEAST_MIDDLE_STEP
     )
-    if (is_clear and result.explained >= _WELL_EXPLAINED) or not possible:
+    if (is_clear and result.explained >= WELL_EXPLAINED) or not possible:
         return log_odds
     if _radius_px(scene, result.x, result.y) < LEAST_RIM_PX:
         return log_odds
@@ -363,13 +365,13 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> flo
         or result.outline_deviation > _MOST_UNEVEN
         or by_rim < search.least_evidence <= log_odds
     ):
-        surer = rim.cov_xx + rim.cov_yy < result.cov_xx + result.cov_yy
-        partly = result.explained < _WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
-        if partly and surer and _places_well(rim, result.explained):
-            _place_by_rim(result, rim)
+        if result.explained < WELL_EXPLAINED and _HALF_RIM <= rim.agreeing < _WHOLE_RIM:
+            is_even = _is_even(rim, result)
+            place_by_part(scene, rim, result.blur, is_even, work, result)
         return by_fit
-    if _places_well(rim, result.explained):
-        _place_by_rim(result, rim)
+    if rim.agreeing < _WHOLE_RIM:
+        is_even = _is_even(rim, result)
+        place_by_part(scene, rim, result.blur, is_even, work, result)
     return by_rim
 
 
@@ -386,20 +388,13 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _places_well(rim: Rim, explained: float) -> bool:
-    """Whether a rim is hidden in part, and steps by as much all round where it is not.
+def _is_even(rim: Rim, result: Any) -> bool:
+    """Whether a rim is found at its place all round where it is not hidden.
 
     Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
-    explains most, though.
+    explains most, though, and says that it is blurred.
     """
-    even = rim.unevenness < _EVEN or explained < _LITTLE
-    return even and rim.agreeing < _WHOLE_RIM
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _place_by_rim(result: Any, rim: Rim) -> None:
-    result.x, result.y = rim.x, rim.y
-    result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
+    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
+from detect.discs.placing import RIM_SLACK
 from detect.discs.rim import (
     COS,
     DIRECTIONS,
@@ -48,8 +49,6 @@ _LEAST_STEPS = 0.24
 _LEAST_RIM = 0.35
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
 _WITHIN = 0.75
-#: A rim followed from its own middle may lose this share and is still the better one.
-_RIM_SLACK = 0.07
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc.
@@ -81,6 +80,8 @@ class SecondLooks(NamedTuple):
         Metres.
     covariance : (N, 2, 2) float64
         Square metres.
+    step : (N,) float64
+        Of the grey value at the rim, inside minus outside.
     quality : (N,) float64
         Otsu's, of the disc and the floor round its rim.
     log_odds : (N,) float64
@@ -90,6 +91,7 @@ class SecondLooks(NamedTuple):
     features: FloatArray
     floor_xy: FloatArray
     covariance: FloatArray
+    step: FloatArray
     quality: FloatArray
     log_odds: FloatArray
 
@@ -133,7 +135,7 @@ def _look_at_all(
     features = np.empty((n, len(FEATURES)))
     place = np.empty((n, 2))
     covariance = np.empty((n, 2, 2))
-    quality = np.empty(n)
+    step, quality = np.empty(n), np.empty(n)
     log_odds = np.empty(n)
     count = 0
     for i in range(n):
@@ -151,7 +153,7 @@ def _look_at_all(
         if rim.agreeing < _LEAST_RIM:
             continue
         again = follow_rim(image, camera_numbers, rim.x, rim.y, sought.radius, rim.step)
-        if again.agreeing >= rim.agreeing - _RIM_SLACK:
+        if again.agreeing >= rim.agreeing - RIM_SLACK:
             rim = again
         if _near_any(found_xy, rim.x, rim.y, sought.separation):
             continue
@@ -161,14 +163,15 @@ def _look_at_all(
         grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
         inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
         log_odds[count] = network_log_odds(inputs, scales, features[count], networks.look) - _TAKEN
-        quality[count] = _quality(grey)
+        step[count], quality[count] = rim.step, _quality(grey)
         place[count, 0], place[count, 1] = rim.x, rim.y
         covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
         covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
         count += 1
     return SecondLooks(
-        features[:count], place[:count], covariance[:count], quality[:count], log_odds[:count]
-    )
+        features[:count], place[:count], covariance[:count], step[:count], quality[:count],
+        log_odds[:count],
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

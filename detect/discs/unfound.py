@@ -229,7 +229,7 @@ def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate
     taken = [found.floor_xy]
     noise, weakest = 0.0, settings.least_contrast
     if settings.verify or settings.refine:
-        noise, weakest, centres, by_fit = scene.first
+        noise, weakest, centres, by_fit, _ = scene.first
         looks, least = by_fit.looks, first_search(settings).least_evidence
         best = strong_and_alone(centres, table.floor_xy, weakest, near)
         at = looks.pixels

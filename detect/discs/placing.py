@@ -1,0 +1,113 @@
+"""Where a disc is of which only a part is seen: by the part of its rim that is in view.
+
+Something before a disc, or a stain on it, pulls at the fit of the whole disc. The rim
+(`detect.discs.rim`) says in which directions the disc ends where it should. To the pixels about
+the edge in these directions the same model is fitted again; where that explains them, it places the
+disc, to a fraction of what single points of the rim do. Where it does not, as beside a shadow's
+edge, which leaves the rim in its place and changes the grey values about it, the points place it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from camera.kernels import project_floor_point
+from detect.discs.descent import Hope
+from detect.discs.fit import RESULT, fit_disc
+from detect.discs.model import Disc
+from detect.discs.patch import FULL, Candidate, FitSettings
+from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim
+
+if TYPE_CHECKING:
+    from detect.discs.search import Scene
+
+#: A fit explains so much of the variance if nothing but a disc and noise is there.
+WELL_EXPLAINED = 0.97
+#: The fit to what is in view is at most this far from the rim, radii.
+_MOST_OFF_RIM = 0.15
+#: A rim followed from its own middle may lose this share and is still the better one.
+RIM_SLACK = 0.07
+#: Blur from which the fits of a second look start, pixels.
+_BLUR_PX = 1.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def place_by_part(
+    scene: Scene, rim: Rim, blur: float, by_points: bool, work: Any, result: Any
+) -> None:
+    """Place a disc by the part of its rim that is in view.
+
+    Parameters
+    ----------
+    scene : Scene
+    rim : Rim
+    blur : float
+        About how blurred it is (along u), pixels.
+    by_points : bool
+        Whether the rim's points place it where no fit does.
+    work : WORK
+        Working space.
+    result : RESULT
+        Its centre and covariance are replaced.
+    """
+    search, numbers = scene.search, scene.camera_numbers
+    again = follow_rim(scene.image, numbers, rim.x, rim.y, search.radius, rim.step)
+    if again.agreeing >= rim.agreeing - RIM_SLACK:
+        rim = again
+    of_part = np.zeros(1, RESULT)
+    part = of_part[0]
+    if (
+        rim.hidden != 0
+        and _fit_in_view(scene, rim, blur, work, part)
+        and part.explained >= WELL_EXPLAINED
+    ):
+        result.x, result.y = part.x, part.y
+        result.cov_xx, result.cov_xy, result.cov_yy = part.cov_xx, part.cov_xy, part.cov_yy
+    elif by_points:
+        result.x, result.y = rim.x, rim.y
+        result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def place_all_by_part(
+    scene: Scene, floor_xy: NDArray[np.float64], step: NDArray[np.float64], space: NDArray[Any]
+) -> Any:
+    """(N,) `RESULT` of discs near (N, 2) places, with the (N,) steps at their rims."""
+    results = np.zeros(len(floor_xy), RESULT)
+    for k in range(len(floor_xy)):
+        x, y = floor_xy[k, 0], floor_xy[k, 1]
+        rim = follow_rim(scene.image, scene.camera_numbers, x, y, scene.search.radius, step[k])
+        place_by_part(scene, rim, _BLUR_PX, True, space[0], results[k])
+    return results
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_in_view(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) -> bool:
+    """Whether a fit to the pixels in view comes to a disc near the rim, of about its size."""
+    floor_xy, radius, given = scene.floor_xy, scene.search.radius, scene.settings
+    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, rim.x, rim.y)
+    height, width = scene.image.shape
+    u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
+    start = Disc(
+        (rim.x - floor_xy[v, u, 0]) / radius,
+        (rim.y - floor_xy[v, u, 1]) / radius,
+        rim.radius / radius,
+        math.log(blur),
+    )
+    settings = FitSettings(
+        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, PLACING_SIGMA,
+        given.blur_px, given.blur_sigma, given.blur_ratio,
+    )  # fmt: skip
+    hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
+    candidate = Candidate(u, v, radius, blur, rim.hidden)
+    if not fit_disc(scene.image, floor_xy, candidate, settings, start, FULL, hope, work, result):
+        return False
+    off = math.hypot(result.x - rim.x, result.y - rim.y)
+    most = _MOST_OFF_RIM * radius
+    near = off < most and abs(result.radius - rim.radius) < most
+    return bool(near and result.contrast * rim.step > 0.0)
