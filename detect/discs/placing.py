@@ -21,7 +21,7 @@ from detect.discs.descent import Hope
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
-from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim
+from detect.discs.rim import Rim, follow_rim
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
@@ -32,14 +32,16 @@ WELL_EXPLAINED = 0.97
 _MOST_OFF_RIM = 0.15
 #: A rim followed from its own middle may lose this share and is still the better one.
 RIM_SLACK = 0.07
+#: How much of the squared difference of fit and rim is added to the covariance of the fit.
+_DISAGREEMENT = 1.0
+#: Standard deviation of the radius, relative: the height above the floor may be off by as much.
+_RADIUS_SIGMA = 0.045
 #: Blur from which the fits of a second look start, pixels.
 _BLUR_PX = 1.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def place_by_part(
-    scene: Scene, rim: Rim, blur: float, by_points: bool, work: Any, result: Any
-) -> None:
+def place_by_part(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) -> None:
     """Place a disc by the part of its rim that is in view.
 
     Parameters
@@ -48,8 +50,6 @@ def place_by_part(
     rim : Rim
     blur : float
         About how blurred it is (along u), pixels.
-    by_points : bool
-        Whether the rim's points place it where no fit does.
     work : WORK
         Working space.
     result : RESULT
@@ -67,8 +67,12 @@ def place_by_part(
         and part.explained >= WELL_EXPLAINED
     ):
         result.x, result.y = part.x, part.y
-        result.cov_xx, result.cov_xy, result.cov_yy = part.cov_xx, part.cov_xy, part.cov_yy
-    elif by_points:
+        # What fit and points of the rim disagree by is a sample of what either may be wrong by.
+        dx, dy = part.x - rim.x, part.y - rim.y
+        result.cov_xx = part.cov_xx + _DISAGREEMENT * dx * dx
+        result.cov_xy = part.cov_xy + _DISAGREEMENT * dx * dy
+        result.cov_yy = part.cov_yy + _DISAGREEMENT * dy * dy
+    else:
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
 
@@ -82,7 +86,7 @@ def place_all_by_part(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, scene.search.radius, step[k])
-        place_by_part(scene, rim, _BLUR_PX, True, space[0], results[k])
+        place_by_part(scene, rim, _BLUR_PX, space[0], results[k])
     return results
 
 
@@ -100,7 +104,7 @@ def _fit_in_view(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) ->
         math.log(blur),
     )
     settings = FitSettings(
-        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, PLACING_SIGMA,
+        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, _RADIUS_SIGMA,
         given.blur_px, given.blur_sigma, given.blur_ratio,
     )  # fmt: skip
     hope = Hope(-math.inf, -math.inf, scene.search.optics_px)

@@ -365,13 +365,12 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, work: Any, result: 
         or result.outline_deviation > _MOST_UNEVEN
         or by_rim < search.least_evidence <= log_odds
     ):
-        if result.explained < WELL_EXPLAINED and _HALF_RIM <= rim.agreeing < _WHOLE_RIM:
-            is_even = _is_even(rim, result)
-            place_by_part(scene, rim, result.blur, is_even, work, result)
+        partly = result.explained < WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
+        if partly and _places_well(rim, result):
+            place_by_part(scene, rim, result.blur, work, result)
         return by_fit
-    if rim.agreeing < _WHOLE_RIM:
-        is_even = _is_even(rim, result)
-        place_by_part(scene, rim, result.blur, is_even, work, result)
+    if _places_well(rim, result):
+        place_by_part(scene, rim, result.blur, work, result)
     return by_rim
 
 
@@ -388,13 +387,14 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _is_even(rim: Rim, result: Any) -> bool:
-    """Whether a rim is found at its place all round where it is not hidden.
+def _places_well(rim: Rim, result: Any) -> bool:
+    """Whether a rim is hidden in part, and found at its place all round where it is not.
 
     Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
     explains most, though, and says that it is blurred.
     """
-    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
+    even = rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX
+    return bool(even and rim.agreeing < _WHOLE_RIM)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
