@@ -21,7 +21,7 @@ from detect.discs.descent import Hope
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
-from detect.discs.rim import Rim, follow_rim
+from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim, median
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
@@ -32,38 +32,41 @@ WELL_EXPLAINED = 0.97
 _MOST_OFF_RIM = 0.15
 #: A rim followed from its own middle may lose this share and is still the better one.
 RIM_SLACK = 0.07
-#: How much of the squared difference of fit and rim is added to the covariance of the fit.
-_DISAGREEMENT = 1.0
-#: Standard deviation of the radius, relative: the height above the floor may be off by as much.
-_RADIUS_SIGMA = 0.045
-#: Blur from which the fits of a second look start, pixels.
+#: Share of the squared difference of fit and rim that is added to the covariance of the fit.
+_DISAGREEMENT = 0.5
+#: So many discs that are wholly in view say how large discs seem to be.
+_LEAST_WHOLE = 3
+#: Blur from which fits start: that of a whole disc's fit is also of what hides a part, pixels.
 _BLUR_PX = 1.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def place_by_part(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) -> None:
+def place_by_part(
+    scene: Scene, radius: float, rim: Rim, by_points: bool, work: Any, result: Any
+) -> None:
     """Place a disc by the part of its rim that is in view.
 
     Parameters
     ----------
     scene : Scene
+    radius : float
+        That discs of the image seem to have (`apparent_radius`), metres.
     rim : Rim
-    blur : float
-        About how blurred it is (along u), pixels.
+    by_points : bool
+        Whether the points of the rim place it where no fit does.
     work : WORK
         Working space.
     result : RESULT
         Its centre and covariance are replaced.
     """
-    search, numbers = scene.search, scene.camera_numbers
-    again = follow_rim(scene.image, numbers, rim.x, rim.y, search.radius, rim.step)
+    again = follow_rim(scene.image, scene.camera_numbers, rim.x, rim.y, radius, rim.step)
     if again.agreeing >= rim.agreeing - RIM_SLACK:
         rim = again
     of_part = np.zeros(1, RESULT)
     part = of_part[0]
     if (
         rim.hidden != 0
-        and _fit_in_view(scene, rim, blur, work, part)
+        and _fit_in_view(scene, radius, rim, work, part)
         and part.explained >= WELL_EXPLAINED
     ):
         result.x, result.y = part.x, part.y
@@ -72,28 +75,44 @@ def place_by_part(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) -
         result.cov_xx = part.cov_xx + _DISAGREEMENT * dx * dx
         result.cov_xy = part.cov_xy + _DISAGREEMENT * dx * dy
         result.cov_yy = part.cov_yy + _DISAGREEMENT * dy * dy
-    else:
+    elif by_points:
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def place_all_by_part(
-    scene: Scene, floor_xy: NDArray[np.float64], step: NDArray[np.float64], space: NDArray[Any]
+    scene: Scene,
+    radius: float,
+    floor_xy: NDArray[np.float64],
+    step: NDArray[np.float64],
+    space: NDArray[Any],
 ) -> Any:
     """(N,) `RESULT` of discs near (N, 2) places, with the (N,) steps at their rims."""
     results = np.zeros(len(floor_xy), RESULT)
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
-        rim = follow_rim(scene.image, scene.camera_numbers, x, y, scene.search.radius, step[k])
-        place_by_part(scene, rim, _BLUR_PX, space[0], results[k])
+        rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, step[k])
+        place_by_part(scene, radius, rim, True, space[0], results[k])
     return results
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fit_in_view(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) -> bool:
+def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
+    """The radius that discs of an image seem to have, by those that are wholly in view.
+
+    All are larger or smaller where the camera hangs lower or higher than calibrated. The radius of
+    a part of a disc trades with its place, so it has to be known otherwise.
+    """
+    if len(radii) < _LEAST_WHOLE:
+        return nominal
+    return median(radii)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_in_view(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
     """Whether a fit to the pixels in view comes to a disc near the rim, of about its size."""
-    floor_xy, radius, given = scene.floor_xy, scene.search.radius, scene.settings
+    floor_xy, given = scene.floor_xy, scene.settings
     pixel_u, pixel_v = project_floor_point(scene.camera_numbers, rim.x, rim.y)
     height, width = scene.image.shape
     u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
@@ -101,14 +120,14 @@ def _fit_in_view(scene: Scene, rim: Rim, blur: float, work: Any, result: Any) ->
         (rim.x - floor_xy[v, u, 0]) / radius,
         (rim.y - floor_xy[v, u, 1]) / radius,
         rim.radius / radius,
-        math.log(blur),
+        math.log(_BLUR_PX),
     )
     settings = FitSettings(
-        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, _RADIUS_SIGMA,
+        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, PLACING_SIGMA,
         given.blur_px, given.blur_sigma, given.blur_ratio,
     )  # fmt: skip
     hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
-    candidate = Candidate(u, v, radius, blur, rim.hidden)
+    candidate = Candidate(u, v, radius, _BLUR_PX, rim.hidden)
     if not fit_disc(scene.image, floor_xy, candidate, settings, start, FULL, hope, work, result):
         return False
     off = math.hypot(result.x - rim.x, result.y - rim.y)

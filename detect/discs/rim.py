@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
-from detect.discs.patch import DIRECTIONS
+from detect.discs.patch import DIRECTIONS as DIRECTIONS
 
 #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 STEPS = 32
@@ -36,7 +36,7 @@ LEAST_STEP = 0.35
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 #: Of the radius about the nominal one, relative, to find the circle (the calibrated height may be
 #: off by some percent), and to place it: of a short arc, place and radius trade off.
-RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.045
+RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
 #: Fewer points than this make no circle.

@@ -23,7 +23,7 @@ from detect.discs.evidence_kernels import (
 from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
-from detect.discs.placing import WELL_EXPLAINED, place_by_part
+from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_part
 from detect.discs.quality import Centres
 from detect.discs.rim import Rim, follow_rim
 
@@ -148,6 +148,8 @@ class FoundDiscs(NamedTuple):
     floor_xy, covariance : (M, 2), (M, 2, 2) float64
         Fitted places and their covariances by the fits alone, metres, square metres.
     evidence : (M,) float64
+    radius : float
+        That the discs seem to have, metres.
     looks : Looks
     """
 
@@ -155,6 +157,7 @@ class FoundDiscs(NamedTuple):
     floor_xy: NDArray[np.float64]
     covariance: NDArray[np.float64]
     evidence: NDArray[np.float64]
+    radius: float
     looks: Looks
 
 
@@ -168,8 +171,10 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     weakest : float
         Least contrast, grey levels.
     """
-    centre, xy, covariance, evidence, looks = _search(scene, centres, weakest, working_space())
-    return FoundDiscs(centre, xy, covariance, evidence, Looks(*looks))
+    centre, xy, covariance, evidence, radius, looks = _search(
+        scene, centres, weakest, working_space()
+    )
+    return FoundDiscs(centre, xy, covariance, evidence, radius, Looks(*looks))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -185,6 +190,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
     results: Any = np.zeros(count, RESULT)
     place = np.zeros((count, 2))
     evidence, score = np.full(count, -np.inf), np.full(count, -np.inf)
+    rim_xy, rim_step = np.zeros((count, 2)), np.zeros(count)
     fate, log_odds_of_looks = np.full(count, _LOOK, np.int8), np.full(count, -np.inf)
     first_blur = max(settings.blur_px, 0.6 * search.optics_px)
     for k in range(count):
@@ -231,7 +237,9 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             )
             evidence[k] = _evidence(result, search) if is_disc else -np.inf
             if is_disc and search.verify:
-                evidence[k] = _with_rim(scene, quality, evidence[k], work, result)
+                verdict = _with_rim(scene, quality, evidence[k], result)
+                evidence[k], rim_step[k] = verdict.log_odds, verdict.rim_step
+                rim_xy[k, 0], rim_xy[k, 1] = verdict.rim_x, verdict.rim_y
                 is_disc = evidence[k] >= search.least_evidence
             if not is_disc or result.blur <= _AT_BOUND * result.blur_bound:
                 break
@@ -246,6 +254,16 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         elif is_disc:
             fate[k] = _ELSEWHERE
         place[k, 0], place[k, 1] = (result.x, result.y) if search.refine else (x, y)
+    radius = _apparent_radius(results, evidence, search)
+    for k in range(count):
+        if fate[k] == _BESIDE and rim_step[k] != 0.0:
+            result = results[k]
+            rim = follow_rim(
+                image, scene.camera_numbers, rim_xy[k, 0], rim_xy[k, 1], radius, rim_step[k]
+            )
+            place_by_part(scene, radius, rim, _is_even(rim, result), work, result)
+            if search.refine:
+                place[k, 0], place[k, 1] = result.x, result.y
     best = best_apart(place, score, search.separation)
     fate[best] = _RARE
     if search.verify:
@@ -266,7 +284,22 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         found_xy[i, 0], found_xy[i, 1] = result.x, result.y
         covariance[i, 0, 0], covariance[i, 1, 1] = result.cov_xx, result.cov_yy
         covariance[i, 0, 1] = covariance[i, 1, 0] = result.cov_xy
-    return found, found_xy, covariance, log_odds, (starts, fate, log_odds_of_looks, results)
+    looks = (starts, fate, log_odds_of_looks, results)
+    return found, found_xy, covariance, log_odds, radius, looks
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _apparent_radius(
+    results: NDArray[Any], evidence: NDArray[np.float64], search: DiscSearch
+) -> float:
+    """The radius that the clear discs of an image seem to have."""
+    radii, count = np.empty(len(results)), 0
+    for k in range(len(results)):
+        clear = evidence[k] >= search.least_evidence + CLEAR_EVIDENCE
+        if clear and results[k].explained >= WELL_EXPLAINED:
+            radii[count] = results[k].radius
+            count += 1
+    return apparent_radius(search.radius, radii[:count])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -334,8 +367,18 @@ def _hope(search: DiscSearch, quality: float) -> Hope:
     return Hope(_LEAST_SHARE, search.least_evidence - slack, search.optics_px)
 
 
+class _Verdict(NamedTuple):
+    """The evidence of a fit with its rim; where the rim is, if it is to place the disc."""
+
+    log_odds: float
+    rim_x: float
+    rim_y: float
+    rim_step: float
+    """0 where the fit places the disc."""
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _with_rim(scene: Scene, quality: float, log_odds: float, work: Any, result: Any) -> float:
+def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> _Verdict:
     """The evidence of a fit with its rim, where it is doubtful; the rim may place the disc.
 
     It places a partly hidden disc, and one that the fit explains in part: a shadow's edge, a sun
@@ -348,9 +391,9 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, work: Any, result: 
         RADIUS_RANGE[0] < relative < RADIUS_RANGE[1] and result.middle_step > LEAST_MIDDLE_STEP
     )
     if (is_clear and result.explained >= WELL_EXPLAINED) or not possible:
-        return log_odds
+        return _Verdict(log_odds, 0.0, 0.0, 0.0)
     if _radius_px(scene, result.x, result.y) < LEAST_RIM_PX:
-        return log_odds
+        return _Verdict(log_odds, 0.0, 0.0, 0.0)
     rim = follow_rim(
         scene.image, scene.camera_numbers, result.x, result.y, search.radius, result.contrast
     )
@@ -360,18 +403,15 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, work: Any, result: 
     by_fit, by_rim = log_odds, search.least_evidence + together - _RESCUED
     if not is_clear and log_odds >= search.least_evidence and together < _REFUTED:
         by_fit = -math.inf
+    step = rim.step if rim.agreeing < _WHOLE_RIM else 0.0
     if (
         log_odds >= search.least_evidence + _BY_FIT
         or result.outline_deviation > _MOST_UNEVEN
         or by_rim < search.least_evidence <= log_odds
     ):
         partly = result.explained < WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
-        if partly and _places_well(rim, result):
-            place_by_part(scene, rim, result.blur, work, result)
-        return by_fit
-    if _places_well(rim, result):
-        place_by_part(scene, rim, result.blur, work, result)
-    return by_rim
+        return _Verdict(by_fit, rim.x, rim.y, step if partly else 0.0)
+    return _Verdict(by_rim, rim.x, rim.y, step)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -387,14 +427,13 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _places_well(rim: Rim, result: Any) -> bool:
-    """Whether a rim is hidden in part, and found at its place all round where it is not.
+def _is_even(rim: Rim, result: Any) -> bool:
+    """Whether the points of a rim are found at its place all round where it is not hidden.
 
     Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
     explains most, though, and says that it is blurred.
     """
-    even = rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX
-    return bool(even and rim.agreeing < _WHOLE_RIM)
+    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

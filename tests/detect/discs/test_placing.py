@@ -1,0 +1,64 @@
+"""Where partly hidden discs are placed, against the truth, and how sure that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from camera import Camera
+from detect.circles import detect_circles, disc_shape
+from detect.discs.placing import apparent_radius
+from detect.discs.rim import DIRECTIONS, best_circle
+from detect.settings import CircleSettings
+from lut import DiscTable, build_disc_table
+from tests.detect.discs.test_rim import PLACES, door_over
+from tests.detect.painted_floor import LIGHT, PaintedFloor
+
+SETTINGS = CircleSettings(tilt_sigma_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def table(published_camera: Camera) -> DiscTable:
+    return build_disc_table(published_camera, disc_shape(SETTINGS))
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_a_door_over_a_disc_does_not_move_it(
+    published_camera: Camera, table: DiscTable, share: float
+) -> None:
+    rng = np.random.default_rng(3)
+    off_px, squares = [], []
+    for seed in range(40):
+        place = PLACES[seed % len(PLACES)] + rng.uniform(-0.05, 0.05, 2)
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        door_over(published_camera, floor, place, share)
+        found = detect_circles(floor.image(seed=seed), published_camera, table, SETTINGS)
+        distance = np.hypot(*(found.floor_xy - place).T)
+        if distance.min(initial=1.0) > 0.05:
+            continue
+        k = int(distance.argmin())
+        seen = published_camera.project_floor(np.array([found.floor_xy[k], place]))
+        off_px.append(seen[0] - seen[1])
+        error = found.floor_xy[k] - place
+        squares.append(error @ np.linalg.solve(found.covariance[k], error) / 2.0)
+    assert len(squares) >= 36
+    assert np.sqrt(np.median(np.square(off_px))) < 0.06
+    assert 0.2 < np.median(squares) / np.log(2.0) < 2.0
+
+
+def test_a_circle_of_another_size_needs_more_points() -> None:
+    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    radius = np.where(np.arange(DIRECTIONS) < 15, 1.0, 0.72)
+    chosen = np.zeros(DIRECTIONS)
+    tolerance: NDArray[np.float64] = np.full(DIRECTIONS, 0.05)
+    circle, count = best_circle(
+        radius * np.cos(angle), radius * np.sin(angle), np.ones(DIRECTIONS), tolerance, chosen
+    )
+    assert count == pytest.approx(15, abs=1)
+    assert circle.radius == pytest.approx(1.0, abs=0.03)
+
+
+def test_discs_that_are_wholly_in_view_say_how_large_discs_seem() -> None:
+    assert apparent_radius(0.1, np.array([0.09, 0.091])) == 0.1
+    assert apparent_radius(0.1, np.array([0.096, 0.02, 0.095])) == 0.095
