@@ -17,16 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.calibration.model import INTRINSICS
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
-from detect.circles import CircleDetections
+from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
+from detect.settings import CircleSettings
 from redetect.landmarks import read_frames
 
 FloatArray = NDArray[np.float64]
 
-#: The parameters that move all pixels alike.
-_OFFSETS = [INTRINSICS.index("offsetX"), INTRINSICS.index("offsetY")]
 #: Over which angle levelled positions are differenced, either way (rad).
 _STEP_RAD = 1e-6
 
@@ -39,13 +37,13 @@ def common_covariance(
     `unstated_px` is the standard deviation of the pixels of a camera that doesn't state its
     covariance; `by_verticals`: the positions are levelled by the verticals that the camera sees.
     """
-    if len(floor_xy) == 0:
-        return np.zeros((0, 2, 2))
-    jacobian = floor_by_parameters(camera, floor_xy)
+    nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)
     if covariance is None:
-        by_pixel = unstated_px * jacobian[:, :, _OFFSETS]
-        return np.asarray(by_pixel @ by_pixel.swapaxes(1, 2))
+        return refined_covariance(camera, floor_xy, nothing, _wrong_by(unstated_px))
+    if len(floor_xy) == 0 or not covariance.any():
+        return nothing
+    jacobian = floor_by_parameters(camera, floor_xy)
     if by_verticals:
         steps = _STEP_RAD * np.vstack([np.eye(2), -np.eye(2)])
         p, r, minus_p, minus_r = level_seen(
@@ -54,6 +52,11 @@ def common_covariance(
         by_tilt = np.stack([p - minus_p, r - minus_r], axis=-1) / (2.0 * _STEP_RAD)
         jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)
     return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
+
+
+@lru_cache(maxsize=4)
+def _wrong_by(pixels: float) -> CircleSettings:
+    return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
 
 
 @lru_cache(maxsize=4)
@@ -81,22 +84,17 @@ def with_common(
     return replace(found, covariance=found.covariance + common)
 
 
-def sentence_of(circles: Path, camera: Camera, unstated_px: float) -> str:
+def sentence_of(circles: Path, camera: Camera) -> str:
     """How much of the variances of the rows of a file is the calibration's own."""
     shares = []
     for frame in read_frames(circles):
         rows = frame.circles
         xy = np.array([(row.px, row.py) for row in rows]).reshape(-1, 2)
         by_verticals = frame.levelled_by is not None and any(frame.levelled_by)
-        common = common_covariance(camera, xy, unstated_px, by_verticals=by_verticals)
+        common = common_covariance(camera, xy, 0.0, by_verticals=by_verticals)
         shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
     share = 100.0 * float(np.median(shares)) if shares else 0.0
-    source = (
-        f"taken to be wrong by {unstated_px:g} px (--calibration-px), as its file does not say"
-        if camera.covariance is None
-        else "as its file states"
-    )
     return (
-        f"{share:.0f} % of the discs' variance (median) are the calibration's, {source}: the same "
-        "error in all rows"
+        f"{share:.0f} % of the discs' variance (median) are the calibration's, as its file states: "
+        "the same error in all rows"
     )

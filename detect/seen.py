@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect.landmarks import Frame, Step
@@ -58,6 +57,8 @@ def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
     tilt = np.asarray(levelled_by, dtype=np.float64)
     vectors = np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
+    from scipy.spatial.transform import Rotation  # a process that delegates starts without it
+
     turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     return np.asarray(turns.reshape(*tilt.shape[:-1], 3, 3))
 

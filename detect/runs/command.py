@@ -194,11 +194,15 @@ def _print_results(job: Job, summary: RunSummary) -> None:
         if kind in places:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
     camera, circles = job.plan.camera, job.plan.circles
-    is_exact = camera is None or (camera.covariance is not None and not any(camera.covariance))
-    if circles and circles.refine and camera and not is_exact:
+    if circles and circles.refine and camera and camera.covariance is None:
+        print(
+            "the calibration does not state its covariance: it is taken to be wrong by "
+            f"{circles.calibration_px:g} px (--calibration-px)"
+        )
+    elif circles and circles.refine and camera and any(camera.covariance or ()):
         from detect.calibration_error import sentence_of  # loads the compiler
 
-        print(sentence_of(places["circles"], camera, circles.calibration_px))
+        print(sentence_of(places["circles"], camera))
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

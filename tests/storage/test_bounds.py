@@ -30,8 +30,6 @@ ENDLESS = {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
         "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",
     },
-    "ScanMatchSettings": {"largest_shift_m"},
-    "AlignmentSettings": {"inconsistent_m"},
     "LocalSettings": {"forget_sigma_m"},
     "LoopSettings": {"most_turn_rad", "most_shift_m"},
 }  # fmt: skip
@@ -39,7 +37,6 @@ ENDLESS = {
 #: Which may be negative.
 SIGNED = {
     "CircleSettings": {"evidence"},  # log-odds
-    "AlignmentSettings": {"turns_deg"},  # to either side
     "PoseSettings": {"floor_z_m"},  # a height in the world
 }
 
