@@ -333,8 +333,10 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
         (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
         (`Camera.floor_jacobian_published`).
     """
-    kernel, floor_xy = _kernel_camera(camera), floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
-    floor_variance = np.tile(PUBLISHED_FLOOR_M**2 * np.eye(2), (len(pixels), 1, 1))
+    kernel = _kernel_camera(camera)
+    floor_xy = floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
+    floor_variance = np.zeros((len(pixels), 2, 2))
+    floor_variance[:, 0, 0] = floor_variance[:, 1, 1] = PUBLISHED_FLOOR_M**2
     covariance = refined_covariances(
         kernel.published, kernel.centre, floor_xy, floor_variance, PUBLISHED_PIXEL_VARIANCE, 0.0
     )

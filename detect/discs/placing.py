@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 WELL_EXPLAINED = 0.97
 #: The fit to what is in view is at most this far from the rim, radii.
 _MOST_OFF_RIM = 0.15
-#: A rim followed from its own middle may lose this share and is still the better one.
-RIM_SLACK = 0.07
 #: Share of the squared difference of fit and rim that is added to the covariance of the fit.
 _DISAGREEMENT = 0.5
 #: So many discs that are wholly in view say how large discs seem to be.
@@ -52,6 +50,7 @@ def place_by_part(
     radius : float
         That discs of the image seem to have (`apparent_radius`), metres.
     rim : Rim
+        Followed from about its own middle.
     by_points : bool
         Whether the points of the rim place it where no fit does.
     work : WORK
@@ -59,9 +58,6 @@ def place_by_part(
     result : RESULT
         Its centre and covariance are replaced.
     """
-    again = follow_rim(scene.image, scene.camera_numbers, rim.x, rim.y, radius, rim.step)
-    if again.agreeing >= rim.agreeing - RIM_SLACK:
-        rim = again
     of_part = np.zeros(1, RESULT)
     part = of_part[0]
     if (

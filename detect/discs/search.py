@@ -62,7 +62,7 @@ _SHARP_PX = 1.2
 #: A fit that explains less of the variance than this is of a disc that something hides.
 _LITTLE = 0.7
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
-_HALF_RIM = 0.5
+_IN_PART, _HALF_RIM = 0.94, 0.5
 
 
 #: Candidates of a lower quality than this are kept only if the grey value steps in this share
@@ -409,7 +409,7 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> _Ve
         or result.outline_deviation > _MOST_UNEVEN
         or by_rim < search.least_evidence <= log_odds
     ):
-        partly = result.explained < WELL_EXPLAINED and rim.agreeing >= _HALF_RIM
+        partly = result.explained < _IN_PART and rim.agreeing >= _HALF_RIM
         return _Verdict(by_fit, rim.x, rim.y, step if partly else 0.0)
     return _Verdict(by_rim, rim.x, rim.y, step)
 
