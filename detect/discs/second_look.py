@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
+from detect.discs.placing import RIM_SLACK
 from detect.discs.rim import (
     COS,
     DIRECTIONS,
@@ -48,8 +49,6 @@ _LEAST_STEPS = 0.24
 _LEAST_RIM = 0.35
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
 _WITHIN = 0.75
-#: A rim followed from its own middle may lose this share and is still the better one.
-_RIM_SLACK = 0.07
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc.
@@ -154,7 +153,7 @@ def _look_at_all(
         if rim.agreeing < _LEAST_RIM:
             continue
         again = follow_rim(image, camera_numbers, rim.x, rim.y, sought.radius, rim.step)
-        if again.agreeing >= rim.agreeing - _RIM_SLACK:
+        if again.agreeing >= rim.agreeing - RIM_SLACK:
             rim = again
         if _near_any(found_xy, rim.x, rim.y, sought.separation):
             continue
