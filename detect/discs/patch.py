@@ -78,8 +78,7 @@ _DENSE_WINDOW = 2048
 #: Share of the distance between pixels that are taken by which they shift from row to row: one that
 #: never repeats soon.
 _SHIFT = 0.381966
-#: Directions from the middle of a disc that are told apart where it is partly hidden, and between
-#: which distances (radii) pixels are fitted then.
+#: Sectors of a disc that is partly hidden; pixels between these distances (radii) are fitted then.
 DIRECTIONS = 32
 NEAREST_IN_VIEW, FARTHEST_IN_VIEW = 0.45, 1.4
 

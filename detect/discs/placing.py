@@ -26,7 +26,7 @@ from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim, median
 if TYPE_CHECKING:
     from detect.discs.search import Scene
 
-#: A fit explains so much of the variance if nothing but a disc and noise is there.
+#: Share of the variance that a fit explains where nothing but a disc and noise is there.
 WELL_EXPLAINED = 0.97
 #: The fit to what is in view is at most this far from the rim, radii.
 _MOST_OFF_RIM = 0.15
@@ -34,7 +34,7 @@ _MOST_OFF_RIM = 0.15
 RIM_SLACK = 0.07
 #: Share of the squared difference of fit and rim that is added to the covariance of the fit.
 _DISAGREEMENT = 0.5
-#: So many discs that are wholly in view say how large discs seem to be.
+#: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
 #: Blur from which fits start: that of a whole disc's fit is also of what hides a part, pixels.
 _BLUR_PX = 1.0

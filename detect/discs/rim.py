@@ -55,7 +55,7 @@ _START_X, _START_Y = (
     np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
     for of in (np.cos, np.sin)
 )
-#: So many points must a circle have more that is a standard deviation of the radius off.
+#: Points that a circle must have more for each squared deviation of its radius.
 _POINTS_PER_SIGMA = 0.5
 #: Steps from each start, and the longest of them, nominal radii.
 _ITERATIONS = 8

@@ -210,7 +210,7 @@ def _respond_everywhere(
 
 @njit(cache=True, error_model="numpy")
 def empty_stripe(window: LineFilter) -> Stripe:
-    """Room for stripes of a filter."""
+    """Buffers for the stripes of a filter."""
     taps, length = window.across.shape[1], len(window.along)
     columns = -(-(_LEAST_COLUMNS + 2 * window.reach) // _VECTOR) * _VECTOR
     size = STRIPE_ROWS * columns

@@ -40,7 +40,7 @@ from detect.verticals.response import (
 )
 from detect.verticals.starts import LineStarts
 
-#: That an edge leans no more than verticals of a tilted camera counts like so many points.
+#: Points that the prior counts for: an edge leans no more than verticals of a tilted camera.
 _UPRIGHT_POINTS = 5
 #: Largest offset of a point from the place expected along verticals of known lean, pixels.
 _VERTICAL_REACH_PX = 1.0
