@@ -21,7 +21,7 @@ from detect.discs.descent import Hope
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
-from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim, median
+from detect.discs.rim import PLACING_SIGMA, Rim, follow_again, follow_rim, median
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
@@ -30,21 +30,12 @@ if TYPE_CHECKING:
 WELL_EXPLAINED = 0.97
 #: The fit to what is in view is at most this far from the rim, radii.
 _MOST_OFF_RIM = 0.15
-#: A rim followed from its own middle may lose this share and is still the better one.
-RIM_SLACK = 0.07
 #: Share of the squared difference of fit and rim that is added to the covariance of the fit.
 _DISAGREEMENT = 0.5
 #: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
 #: Blur from which fits start: that of a whole disc's fit is also of what hides a part, pixels.
 _BLUR_PX = 1.0
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def follow_again(scene: Scene, radius: float, rim: Rim) -> Rim:
-    """The rim followed from its own middle, unless less of it is found from there."""
-    again = follow_rim(scene.image, scene.camera_numbers, rim.x, rim.y, radius, rim.step)
-    return again if again.agreeing >= rim.agreeing - RIM_SLACK else rim
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -98,7 +89,7 @@ def place_all_by_part(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, step[k])
-        rim = follow_again(scene, radius, rim)
+        rim = follow_again(scene.image, scene.camera_numbers, radius, rim)
         place_by_part(scene, radius, rim, True, space[0], results[k])
     return results
 

@@ -65,6 +65,9 @@ _ARRIVED = 1e-4
 #: With this share of the points on it, no other circle has more.
 _CERTAINLY_BEST = 0.9
 
+#: A rim followed from its own middle may lose this share and is still the better one.
+_SLACK = 0.07
+
 _1 = np.uint64(1)
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -438,6 +441,15 @@ def follow_rim(
         area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
         area * (share * best.cov_yy + by_yy), radius_px, hidden_bits,
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def follow_again(
+    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], radius: float, rim: Rim
+) -> Rim:
+    """The rim followed from its own middle, unless less of it is found from there."""
+    again = follow_rim(image, camera_numbers, rim.x, rim.y, radius, rim.step)
+    return again if again.agreeing >= rim.agreeing - _SLACK else rim
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

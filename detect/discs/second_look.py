@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
-from detect.discs.placing import RIM_SLACK
 from detect.discs.rim import (
     COS,
     DIRECTIONS,
@@ -29,6 +28,7 @@ from detect.discs.rim import (
     SIN,
     STEPS,
     Rim,
+    follow_again,
     follow_rim,
     median,
     profiles,
@@ -78,8 +78,6 @@ class SecondLooks(NamedTuple):
     features : (N, len(FEATURES)) float64
     floor_xy : (N, 2) float64
         Metres.
-    covariance : (N, 2, 2) float64
-        Square metres.
     step : (N,) float64
         Of the grey value at the rim, inside minus outside.
     quality : (N,) float64
@@ -90,7 +88,6 @@ class SecondLooks(NamedTuple):
 
     features: FloatArray
     floor_xy: FloatArray
-    covariance: FloatArray
     step: FloatArray
     quality: FloatArray
     log_odds: FloatArray
@@ -134,7 +131,6 @@ def _look_at_all(
     n = len(candidates.score)
     features = np.empty((n, len(FEATURES)))
     place = np.empty((n, 2))
-    covariance = np.empty((n, 2, 2))
     step, quality = np.empty(n), np.empty(n)
     log_odds = np.empty(n)
     count = 0
@@ -152,9 +148,7 @@ def _look_at_all(
         rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
         if rim.agreeing < _LEAST_RIM:
             continue
-        again = follow_rim(image, camera_numbers, rim.x, rim.y, sought.radius, rim.step)
-        if again.agreeing >= rim.agreeing - RIM_SLACK:
-            rim = again
+        rim = follow_again(image, camera_numbers, sought.radius, rim)
         if _near_any(found_xy, rim.x, rim.y, sought.separation):
             continue
         if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
@@ -165,11 +159,9 @@ def _look_at_all(
         log_odds[count] = network_log_odds(inputs, scales, features[count], networks.look) - _TAKEN
         step[count], quality[count] = rim.step, _quality(grey)
         place[count, 0], place[count, 1] = rim.x, rim.y
-        covariance[count, 0, 0], covariance[count, 1, 1] = rim.cov_xx, rim.cov_yy
-        covariance[count, 0, 1] = covariance[count, 1, 0] = rim.cov_xy
         count += 1
     return SecondLooks(
-        features[:count], place[:count], covariance[:count], step[:count], quality[:count],
+        features[:count], place[:count], step[:count], quality[:count],
         log_odds[:count],
     )  # fmt: skip
 
