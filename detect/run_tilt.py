@@ -28,14 +28,16 @@ FloatArray = NDArray[np.float64]
 
 #: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
-#: Prior of the spread of the true tilt about its constant, a robot on an even floor (rad), and the
-#: standard deviation of its logarithm.
+#: Priors of what is learned, and the standard deviations of their logarithms: the spread of the
+#: true tilt about its constant, a robot on an even floor (rad); how many frames a deviation lasts,
+#: a robot swings on its springs; the factors by which stated deviations of verticals and of
+#: outlines are off, which a run of few frames cannot know well.
 _SPREAD_RAD, _LOG_SPREAD_SIGMA = math.radians(0.3), 0.3
-#: Standard deviation of the logarithm of the factor by which stated deviations are off.
-_LOG_SCALE_SIGMA = 1.0
-#: The constants are searched in this unit (rad), to a hundredth.
+_FRAMES, _LOG_FRAMES_SIGMA = 2.3, 0.3
+_LOG_FACTOR_SIGMA = 0.5
+#: The constants are searched in this unit (rad).
 _UNIT_RAD = math.radians(0.1)
-_SEARCH = {"fatol": 1e-3, "xatol": 1e-2, "maxiter": 2000}
+_SEARCH = {"gtol": 1e-2}
 #: Systematic error of any number of verticals: the lens's error common to all of them towards the
 #: image's border (rad). It is given, not estimated: a run shows its sum with the true lean.
 COMMON_RAD = math.radians(0.15)
@@ -44,8 +46,6 @@ COMMON_RAD = math.radians(0.15)
 _EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
 #: How far the outlines' pitch moves (rad) if the camera hangs higher, per share of its height.
 OUTLINE_PITCH_PER_HEIGHT = 0.45
-#: Correlation of true deviations from frame to frame: a robot swings on its springs.
-MEMORY = 0.65
 #: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
 LASTING_SHARE, LASTING = 0.5, 0.9
 #: How often, and how far, a frame shows a wrong tilt (rad): a consensus of lines that are no
@@ -54,7 +54,7 @@ STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
 #: How often, and how far, the robot tilts for a moment (rad): a wheel is on a sill or a cable.
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
 #: Least standard deviation of a frame's tilt (rad).
-_LEAST_RAD = math.radians(0.01)
+_LEAST_RAD = math.radians(0.02)
 
 
 class FrameTilts(NamedTuple):
@@ -124,7 +124,7 @@ def tilt_of_run(
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
-    found = [_learned(axis) for axis in series]
+    found = _learned(series)
     apart = [one.apart for one in found]
     exact = _share_exact(apart)
     # Of a calibration that states its covariance, verticals and height are as good as it says.
@@ -159,6 +159,7 @@ class _Axis(NamedTuple):
 
     lean: float
     spread: float
+    memory: float  # correlation of deviations from frame to frame
     verticals_scale: float
     outlines_scale: float
     apart: float = math.nan  # by how much the outlines' constant differs from the verticals'
@@ -191,7 +192,7 @@ class _Series(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = (information * np.nan_to_num(values)).sum(axis=0) / total
             likelihood, deviation, of_deviation = smooth_axis(
-                mean - axis.lean, 1.0 / np.sqrt(total), axis.spread
+                mean - axis.lean, 1.0 / np.sqrt(total), axis.spread, axis.memory
             )
         difference, of_difference = values[1] - values[0], variance.sum(axis=0)
         both = np.isfinite(difference)
@@ -219,37 +220,64 @@ def _log_density(difference: FloatArray, variance: FloatArray) -> float:
     return float(np.logaddexp(log_good, log_bad).sum())
 
 
-def _learned(series: _Series) -> _Axis:
-    """The constants, spread and factors of the largest likelihood.
+def _learned(series: Sequence[_Series]) -> list[_Axis]:
+    """What is learned of the axes: what has the largest likelihood.
 
-    The factors are known by how verticals and outlines differ; without these they are 1.
+    The factors are known by how verticals and outlines differ; without these they are 1. That of
+    verticals is the same in all axes: what makes lines lean makes them lean in any direction.
     """
     from scipy.optimize import minimize  # takes as long as a hundred frames
 
-    has_outlines = bool(np.isfinite(series.outlines).any())
-    lean = float(np.nanmedian(series.verticals))
-    apart = float(np.nanmedian(series.outlines - series.verticals)) if has_outlines else math.nan
+    has_outlines = any(np.isfinite(axis.outlines).any() for axis in series)
+    middle = [
+        (
+            float(np.nanmedian(axis.verticals)),
+            float(np.nanmedian(axis.outlines - axis.verticals)) if has_outlines else math.nan,
+        )
+        for axis in series
+    ]
+    # Of the logarithm of the verticals' factor, then of what `axes_of` names of each axis.
+    of_axis = [math.inf, _LOG_SPREAD_SIGMA, _LOG_FRAMES_SIGMA, _LOG_FACTOR_SIGMA, math.inf]
+    prior_sigma = np.array([_LOG_FACTOR_SIGMA] + of_axis * len(series))
+    is_free = np.array(
+        [has_outlines] + [True, True, True, has_outlines, has_outlines] * len(series)
+    )
 
-    def axis_of(unknowns: FloatArray) -> _Axis:
-        to_lean, spread, *others = unknowns.tolist()
-        verticals, outlines, to_apart = others or (0.0, 0.0, 0.0)
-        scales = _SPREAD_RAD * math.exp(spread), math.exp(verticals), math.exp(outlines)
-        return _Axis(lean + _UNIT_RAD * to_lean, *scales, apart + _UNIT_RAD * to_apart)
+    def axes_of(unknowns: FloatArray) -> list[_Axis]:
+        return [
+            _Axis(
+                lean + _UNIT_RAD * to_lean,
+                _SPREAD_RAD * math.exp(spread),
+                math.exp(-math.exp(-frames) / _FRAMES),
+                math.exp(unknowns[0]),
+                math.exp(outlines),
+                apart + _UNIT_RAD * to_apart,
+            )
+            for (lean, apart), (to_lean, spread, frames, outlines, to_apart) in zip(
+                middle, unknowns[1:].reshape(len(series), -1), strict=True
+            )
+        ]
 
     def cost(unknowns: FloatArray) -> float:
-        prior = (unknowns[1] / _LOG_SPREAD_SIGMA) ** 2
-        prior += float(np.sum((unknowns[2:4] / _LOG_SCALE_SIGMA) ** 2))
-        return float(0.5 * prior - series.smoothed(axis_of(unknowns))[0])
+        likelihoods = [
+            axis.smoothed(one)[0] for axis, one in zip(series, axes_of(unknowns), strict=True)
+        ]
+        return float(0.5 * np.sum((unknowns / prior_sigma) ** 2) - sum(likelihoods))
 
-    start = np.zeros(5 if has_outlines else 2)
-    simplex = np.vstack([start, start + np.diag([1.0, 0.3, -0.5, -0.5, 0.5][: len(start)])])
-    search = {**_SEARCH, "initial_simplex": simplex}
-    found = minimize(cost, start, method="Nelder-Mead", options=search)
-    step = np.zeros(len(start))
-    step[0] = 0.2
-    curvature = (cost(found.x + step) - 2.0 * found.fun + cost(found.x - step)) / 0.2**2
-    variance = _UNIT_RAD**2 / max(curvature, 1e-4)
-    return axis_of(found.x)._replace(lean_variance=variance)
+    def cost_of_free(values: FloatArray) -> float:
+        unknowns = np.zeros(len(is_free))
+        unknowns[is_free] = values
+        return cost(unknowns)
+
+    found = np.zeros(len(is_free))
+    found[is_free] = minimize(cost_of_free, found[is_free], method="BFGS", options=_SEARCH).x
+    learned = []
+    for k, axis in enumerate(axes_of(found)):
+        step = np.zeros(len(found))
+        step[1 + 5 * k] = 0.2
+        curvature = (cost(found + step) - 2.0 * cost(found) + cost(found - step)) / 0.2**2
+        learned.append(axis._replace(lean_variance=_UNIT_RAD**2 / max(curvature, 1e-4)))
+    return learned
 
 
 def _share_exact(apart: Sequence[float]) -> float:
@@ -277,7 +305,10 @@ def _weighed(share: float, off: float, variance: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def smooth_axis(
-    deviation: NDArray[np.float64], sigma: NDArray[np.float64], spread: float
+    deviation: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    spread: float,
+    memory: float,
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """True deviations of one angle from the run's constant lean, by all frames.
 
@@ -289,8 +320,8 @@ def smooth_axis(
     variance are those of the mixture.
 
     Of (N,) measured angles less the lean (rad; NaN where there is none), their standard deviations
-    and that of x, returns the log-likelihood of the measurements, and the (N,) means and variances
-    of the deviations given all frames (rad, rad^2).
+    and that of x, and the correlation of x from frame to frame, returns the log-likelihood of the
+    measurements, and the (N,) means and variances of the deviations given all frames (rad, rad^2).
     """
     count = len(deviation)
     # Filtered and predicted: means of x and u, variances of both and their covariance.
@@ -299,9 +330,9 @@ def smooth_axis(
     x, u, xx, xu, uu = 0.0, 0.0, spread * spread, 0.0, 1.0
     for k in range(count):
         if k > 0:
-            x, u = MEMORY * x, LASTING * u
-            xx = MEMORY * MEMORY * xx + (1.0 - MEMORY * MEMORY) * spread * spread
-            xu = MEMORY * LASTING * xu
+            x, u = memory * x, LASTING * u
+            xx = memory * memory * xx + (1.0 - memory * memory) * spread * spread
+            xu = memory * LASTING * xu
             uu = LASTING * LASTING * uu + 1.0 - LASTING * LASTING
         before[k, 0], before[k, 1], before[k, 2], before[k, 3], before[k, 4] = x, u, xx, xu, uu
         if not math.isnan(deviation[k]):
@@ -331,7 +362,7 @@ def smooth_axis(
             fx, fu, fxx, fxu, fuu = after[k]
             determinant = pxx * puu - pxu * pxu
             # Rows of the smoother's gain, for x and for u.
-            cxx, cxu, cux, cuu = MEMORY * fxx, LASTING * fxu, MEMORY * fxu, LASTING * fuu
+            cxx, cxu, cux, cuu = memory * fxx, LASTING * fxu, memory * fxu, LASTING * fuu
             gxx = (cxx * puu - cxu * pxu) / determinant
             gxu = (cxu * pxx - cxx * pxu) / determinant
             gux = (cux * puu - cuu * pxu) / determinant

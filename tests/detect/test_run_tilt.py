@@ -167,6 +167,24 @@ def test_how_good_verticals_are_is_learned_by_outlines(seed: int, factor: float)
     assert np.all((normalised > 0.4) & (normalised < 1.7)), normalised
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_short_run_does_not_believe_too_much(seed: int) -> None:
+    """Errors of verticals are a third of the stated ones, but for some frames, and tilts slow."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(80)[:, None]
+    true = np.radians(0.3 * np.sin(time / (9.0, 13.0)) + 0.2 * np.cos(time / 30.0))
+    sigma = np.radians(rng.uniform(0.05, 0.2, true.shape))
+    verticals = true + sigma * np.where(time % 8 == 0, 1.0, 0.3) * rng.standard_normal(true.shape)
+    outlines = true + np.radians(0.1) * rng.standard_normal(true.shape)
+    stated = np.full(true.shape, np.radians(0.3) ** 2)
+
+    run = tilt_of_run(FrameTilts(verticals, sigma**2), FrameTilts(outlines, stated), np.zeros(2))
+
+    assert run is not None
+    assert np.mean((run.tilt - true) ** 2 / run.variance) < 1.5
+    assert np.std(run.tilt - true) < 0.8 * np.std(verticals - true)
+
+
 def test_outlines_that_disagree_leave_the_lens_in_doubt() -> None:
     true, measured, variance = sequence(3)
     sigma = np.radians(0.2)
