@@ -117,7 +117,8 @@ class Stage:
         along_v = optics * self.camera.scale_y / self.camera.scale_x
         fine = cv2.GaussianBlur(fine, (0, 0), optics * across, sigmaY=max(along_v * down, 0.3))
         if motion > 0.0:
-            fine = cv2.blur(fine, (round(motion * across), 1))
+            # An even number of cells would move everything by half of one.
+            fine = cv2.blur(fine, (2 * (round(motion * across) // 2) + 1, 1))
         size = self.camera.width, self.camera.height
         pixels = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
         noisy = np.clip(np.rint(pixels + rng.normal(0.0, _NOISE, pixels.shape)), 0, 255)
