@@ -254,7 +254,7 @@ class TrainRimNetwork:
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
     every: int = 8  # Every n-th frame of the recorded run is used.
-    scenes: int = 500  # Rendered floors with disturbed discs.
+    scenes: int = 1000  # Rendered floors with disturbed discs.
     seed: int = 1  # Of the disturbances and the networks.
     output: Path = Path("build/rim_network.npz")
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
