@@ -66,14 +66,22 @@ def place_by_part(
         and part.explained >= WELL_EXPLAINED
     ):
         result.x, result.y = part.x, part.y
+        result.cov_xx, result.cov_xy, result.cov_yy = part.cov_xx, part.cov_xy, part.cov_yy
         # What fit and points of the rim disagree by is a sample of what either may be wrong by.
-        dx, dy = part.x - rim.x, part.y - rim.y
-        result.cov_xx = part.cov_xx + _DISAGREEMENT * dx * dx
-        result.cov_xy = part.cov_xy + _DISAGREEMENT * dx * dy
-        result.cov_yy = part.cov_yy + _DISAGREEMENT * dy * dy
+        _add_square(result, _DISAGREEMENT, part.x - rim.x, part.y - rim.y)
+        _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
     elif by_points:
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
+        _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _add_square(result: Any, share: float, x: float, y: float) -> None:
+    """Add a share of the square of (x, y), metres, to the covariance of a result."""
+    result.cov_xx += share * x * x
+    result.cov_xy += share * x * y
+    result.cov_yy += share * y * y
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

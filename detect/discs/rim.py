@@ -57,6 +57,8 @@ _START_X, _START_Y = (
 )
 #: Points that a circle must have more for each squared deviation of its radius.
 _POINTS_PER_SIGMA = 0.5
+#: By how much the logarithm of the odds of a circle grows with each point on it.
+_PER_POINT = 0.5
 #: Steps from each start, and the longest of them, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
@@ -106,6 +108,9 @@ class Rim(NamedTuple):
     cov_yy: float
     radius_px: float
     """Geometric mean of the radius over the directions, pixels."""
+    doubt_x: float
+    """Towards another circle that the rim may be: its square adds to any covariance, metres."""
+    doubt_y: float
     hidden: int
     """Directions in or beside which the rim is not on the circle, a bit each."""
 
@@ -310,8 +315,8 @@ def best_circle(
     weight: NDArray[np.float64],
     tolerance: NDArray[np.float64],
     best_chosen: NDArray[np.float64],
-) -> tuple[Circle, int]:
-    """The circle that most of some points are on, and how many they are.
+) -> tuple[Circle, int, tuple[float, float]]:
+    """The circle that most of some points are on.
 
     Parameters
     ----------
@@ -323,6 +328,15 @@ def best_circle(
         What is nearer than this to a circle is on it, nominal radii.
     best_chosen : (DIRECTIONS,) float64
         Result: the weights of the points on the circle, 0 of the others.
+
+    Returns
+    -------
+    circle : Circle
+    count : int
+        How many points are on it.
+    doubt : (float, float)
+        Towards another circle that points may be of: the square of this is what that adds to the
+        covariance of the centre, nominal radii.
     """
     points = 0
     for k in range(DIRECTIONS):
@@ -330,6 +344,7 @@ def best_circle(
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     best_count, best_score = 0, 0.0
+    ends, scores = np.zeros((_STARTS, 2)), np.full(_STARTS, -np.inf)
     for start in range(_STARTS):
         circle = Circle(_START_X[start], _START_Y[start], 1.0, 0.0, 0.0, 0.0)
         count, _ = _choose(x, y, weight, tolerance, circle, 2.5, chosen)
@@ -344,6 +359,8 @@ def best_circle(
                 break
         # Of a circle of another size more points are asked for, as the prior has it.
         score = count - _POINTS_PER_SIGMA * ((circle.radius - 1.0) / RADIUS_SIGMA) ** 2
+        if count >= LEAST_POINTS:
+            ends[start, 0], ends[start, 1], scores[start] = circle.x, circle.y, score
         if count >= LEAST_POINTS and score > best_score:
             best_count, best_score = count, score
             best = circle
@@ -352,7 +369,15 @@ def best_circle(
             # What has more points than this shares most of them: it is the same circle.
             if score >= _CERTAINLY_BEST * points:
                 break
-    return best, best_count
+    # Of the other circles that were come to, the one that adds most.
+    doubt = 0.0, 0.0
+    for start in range(_STARTS):
+        odds = math.exp(_PER_POINT * (scores[start] - best_score))
+        share = math.sqrt(odds / (1.0 + odds))
+        dx, dy = share * (ends[start, 0] - best.x), share * (ends[start, 1] - best.y)
+        if dx * dx + dy * dy > doubt[0] ** 2 + doubt[1] ** 2:
+            doubt = dx, dy
+    return best, best_count, doubt
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -395,9 +420,9 @@ def follow_rim(
             at_x[k], at_y[k] = distance[k] * COS[k], distance[k] * SIN[k]
             weight[k] = (scale[k] / POINT_SIGMA_PX) ** 2
     chosen = np.zeros(DIRECTIONS)
-    best, best_count = best_circle(at_x, at_y, weight, tolerance, chosen)
+    best, best_count, doubt = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(log_px)
-    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0)
+    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0, 0)
     if best_count < LEAST_POINTS:
         return nothing
     height, width = image.shape
@@ -439,7 +464,8 @@ def follow_rim(
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
         x + radius * best.x, y + radius * best.y, radius_found,
         area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
-        area * (share * best.cov_yy + by_yy), radius_px, hidden_bits,
+        area * (share * best.cov_yy + by_yy), radius_px, radius * doubt[0], radius * doubt[1],
+        hidden_bits,
     )  # fmt: skip
 
 

@@ -52,11 +52,26 @@ def test_a_circle_of_another_size_needs_more_points() -> None:
     radius = np.where(np.arange(DIRECTIONS) < 15, 1.0, 0.72)
     chosen = np.zeros(DIRECTIONS)
     tolerance: NDArray[np.float64] = np.full(DIRECTIONS, 0.05)
-    circle, count = best_circle(
+    circle, count, _ = best_circle(
         radius * np.cos(angle), radius * np.sin(angle), np.ones(DIRECTIONS), tolerance, chosen
     )
     assert count == pytest.approx(15, abs=1)
     assert circle.radius == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize(("points", "expected"), [(16, 0.5), (12, 0.119), (8, 0.018)])
+def test_a_second_circle_casts_doubt_on_the_first(points: int, expected: float) -> None:
+    """Half of the squared distance where both have as many points, and less where it has fewer."""
+    angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.01) / DIRECTIONS
+    first: NDArray[np.bool_] = np.cos(angle) > 0.0
+    x, y = np.where(first, 0.25, -0.25) + np.cos(angle), np.sin(angle)
+    weight = np.ones(DIRECTIONS)
+    weight[np.flatnonzero(~first)[points:]] = 0.0
+    tolerance: NDArray[np.float64] = np.full(DIRECTIONS, 0.03)
+    circle, count, doubt = best_circle(x, y, weight, tolerance, np.zeros(DIRECTIONS))
+    assert count == 16
+    np.testing.assert_allclose(circle[:3], [0.25, 0.0, 1.0], atol=0.01)
+    assert np.square(doubt).sum() / 0.5**2 == pytest.approx(expected, rel=0.1)
 
 
 def test_discs_that_are_wholly_in_view_say_how_large_discs_seem() -> None:
