@@ -12,15 +12,14 @@ A board's points go row by row from the top left.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
+from camera.options import BoardFlags, BoardKind
 
 FloatArray = NDArray[np.float64]
-Kind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Board:
         If there can be no such board.
     """
 
-    kind: Kind
+    kind: BoardKind
     columns: int
     rows: int
     square_m: float
@@ -119,3 +118,11 @@ _WHAT_IS_COUNTED: dict[str, str] = {
     "circles": "circles",
     "asymmetric-circles": "circles",
 }
+
+
+def board_of(flags: BoardFlags) -> Board:
+    """The board that flags describe; not `discs`, which are none."""
+    return Board(
+        flags.board, flags.columns, flags.rows, flags.square_m, flags.marker_m, flags.dictionary,
+        flags.circle_m,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Calibration boards, and discs, as pages at true scale.
+"""``camera board``: calibration boards, and discs, as PDF pages at true scale.
 
 A sheet is a list of black shapes in metres, its origin in the middle, x right, y up: the frame of
 `camera.boards.board`.
@@ -16,9 +16,12 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from camera.boards.board import Board
+from camera import options
+from camera.boards.board import Board, board_of
 from camera.boards.charuco import dictionary_of
 from camera.errors import CalibrationError
+from redetect.storage import write_whole
+from redetect.storage.parts import demand_place
 
 #: Sheets of paper, metres, the smallest first.
 PAGES = {
@@ -32,6 +35,21 @@ PAGES = {
 _MARGIN_M, _TEXT_M = 0.004, 0.012
 _RULER_M = 0.1
 _M_PER_INCH = 0.0254
+
+
+def perform(command: options.Board) -> int:
+    """Carry the command out; returns the exit code."""
+    demand_place(command.output, overwrite=command.force)
+    if command.board == "discs":
+        sheet = sheet_of_discs(command.circle_m, command.columns, command.rows)
+    else:
+        sheet = sheet_of_board(board_of(command))
+    width, height = page_for(sheet, command.page)
+    with write_whole(command.output, overwrite=command.force) as stream:
+        stream.write(pdf_of(sheet, (width, height)))
+    name = next(name for name, sides in PAGES.items() if set(sides) == {width, height})
+    print(f"written: {command.output}: {sheet.text}, on {name}; print at 100 %, measure the bar")
+    return 0
 
 
 class Disc(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from camera import Camera
 from camera.boards.board import Board
 from camera.calibration.model import cross_matrices, project_points, rotation_of
-from camera.calibration.projection import intrinsics_of, pixel_grid
+from camera.uncertainty import intrinsics_of, pixel_grid
 from tools.arrays import ByteArray, FloatArray, IntArray
 
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0

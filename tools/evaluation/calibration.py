@@ -12,23 +12,21 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.boards.points import circle_centroids, find_board
-from camera.calibration.adjustment import Estimate, Points
+from camera.calibration.adjustment import Estimate, Points, circle_shifts, fit_points
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
-from camera.calibration.fit import circle_shifts, fit_points
 from camera.calibration.images import read_grey
-from camera.calibration.model import INTRINSICS
-from camera.calibration.projection import (
+from camera.calibration.model import INTRINSICS, CalibrationSettings, FreeLens
+from camera.errors import CalibrationError
+from camera.formats.command import MODELS
+from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
+from camera.formats.models import ForeignCamera, Model
+from camera.uncertainty import (
     intrinsics_of,
     pixel_grid,
     projection_sigma,
     with_intrinsics,
 )
-from camera.calibration.settings import CalibrationSettings, FreeLens
-from camera.commands.convert import MODELS
-from camera.errors import CalibrationError
-from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
-from camera.formats.models import ForeignCamera, Model
 from tools.arrays import FloatArray, IntArray
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.tables import Table

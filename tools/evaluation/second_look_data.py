@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from camera.calibration.floor import with_pose
 from camera.kernels import camera_numbers
+from camera.uncertainty import with_pose
 from detect.circles import candidates_at, detect_circles, disc_shape, second_looks_at
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork

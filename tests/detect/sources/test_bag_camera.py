@@ -15,7 +15,7 @@ pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 from camera import Camera
 from camera.formats.conversion import convert_to_foreign
 from camera.formats.models import ForeignCamera
-from camera.formats.ros import ROS_NAMES
+from camera.formats.yaml_files import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions

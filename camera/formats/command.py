@@ -14,14 +14,22 @@ from camera.formats.conversion import (
     convert_to_camera,
     convert_to_foreign,
 )
-from camera.formats.kalibr import format_kalibr, parse_kalibr
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.opencv import format_opencv, parse_opencv
-from camera.formats.plain_yaml import parse_yaml, read_content, text_of
-from camera.formats.ros import format_ros, parse_ros
+from camera.formats.yaml_files import (
+    format_kalibr,
+    format_opencv,
+    format_ros,
+    parse_kalibr,
+    parse_opencv,
+    parse_ros,
+    parse_yaml,
+    read_content,
+    text_of,
+)
 from camera.model import Camera
 from camera.options import Convert, Format
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import write_whole
+from redetect.storage.parts import demand_place
 
 #: The models that each format has, the simplest first.
 MODELS: dict[str, tuple[Model, ...]] = {
@@ -36,8 +44,7 @@ _FREE = {("kalibr", "radtan"): 4, ("colmap", "radtan"): 4, ("colmap", "rational"
 
 def perform(options: Convert) -> int:
     """Carry the command out; returns the exit code."""
-    if options.target.exists() and not options.force:
-        raise OutputExistsError(options.target)
+    demand_place(options.target, overwrite=options.force)
     text = read_text(options.source)
     from_format = options.from_format
     if from_format == "auto":
