@@ -11,8 +11,7 @@ from camera import Camera, read_camera
 from detect.discs.unfound import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates
 from detect.errors import DetectError
-from detect.run import camera_in, read_image
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, camera_in, read_image
 from detect.viewing_options import Explain
 from redetect.landmarks import Step
 from redetect.storage import OutputExistsError, write_whole

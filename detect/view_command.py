@@ -17,8 +17,8 @@ from detect.comparison.compare import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
-from detect.run import read_image
 from detect.seen import circle_on_floor, image_positions, summed_steps
+from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View

@@ -28,8 +28,8 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.run import camera_in
 from detect.seen import Sight
+from detect.sources.interface import camera_in
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_whole

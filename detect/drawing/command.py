@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
-from detect.run import Run, read_image
+from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Draw

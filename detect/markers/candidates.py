@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary
-from detect.markers.settings import Darkness, MarkerSettings
+from detect.settings import Darkness, MarkerSettings
 
 FloatArray = NDArray[np.float64]
 GreyImage = NDArray[np.uint8]

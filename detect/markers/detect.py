@@ -38,7 +38,7 @@ from detect.markers.geometry import (
     square_homography,
 )
 from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
-from detect.markers.settings import MarkerSettings
+from detect.settings import MarkerSettings
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.markers.settings import CornerAlgorithm
 from detect.noise import estimate_noise
+from detect.settings import CornerAlgorithm
 
 FloatArray = NDArray[np.float64]
 

@@ -18,11 +18,10 @@ from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.frame import EXTRA_COLOUR, MISSED_COLOUR, Colour, draw_curve, draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
-from detect.run import ImageRun, Run, read_image
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, circle_on_floor
-from detect.sources.interface import RunFrame
+from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.viewing_options import CompareOptions, Gates, RowFiles
 from redetect.landmarks import circle_arrays
 from redetect.reporting.page import Part, image_part

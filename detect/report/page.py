@@ -16,7 +16,6 @@ from detect.comparison.result import Comparison, DiscComparison, LineComparison,
 from detect.drawing.inputs import picture_name
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.markers.settings import MarkerSettings
 from detect.report.figures import (
     RateCurve,
     bearings_figure,
@@ -33,7 +32,7 @@ from detect.report.figures import (
     whitened_figure,
 )
 from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
 from redetect.reporting.page import Part, Section, page_of

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from redetect.storage.bounded import read_bounded
-from redetect.storage.image_header import MOST_PIXELS, claimed_size, without_orientation
+from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded, without_orientation
 
 #: Significant bits of a 16-bit image.
 BIT_DEPTHS = (8, 10, 12, 14, 16)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import ImageRun, Run, camera_in
 from detect.sources.image_files import (
     IMAGE_SUFFIXES,
     WILDCARDS,
@@ -23,7 +22,7 @@ from detect.sources.image_files import (
     bits_of_images,
     images_of_folder,
 )
-from detect.sources.interface import Frames
+from detect.sources.interface import Frames, ImageRun, Run, camera_in
 
 if TYPE_CHECKING:
     from detect.sources.interface import Source

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates
-from detect.run import read_image
 from detect.settings import CircleSettings, Polarity
+from detect.sources.interface import read_image
 from redetect.interface.detection import (
     CameraLike,
     ImageLike,

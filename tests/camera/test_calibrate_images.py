@@ -17,7 +17,7 @@ from detect.sources.gray import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
-from redetect.storage.image_header import without_orientation
+from redetect.storage.bounded import without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6

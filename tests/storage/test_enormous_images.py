@@ -15,7 +15,7 @@ from detect.errors import FrameError
 from detect.sources.gray import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
-from redetect.storage.image_header import MOST_PIXELS, claimed_size
+from redetect.storage.bounded import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
 CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))

@@ -13,7 +13,7 @@ from pathlib import Path
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from detect.run import Run
+from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from redetect.storage import OutputExistsError, write_whole
 from redetect.storage.command_line import exit_code_of

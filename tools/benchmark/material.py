@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera, write_camera
-from detect.run import Run
+from detect.sources.interface import Run
 from redetect.landmarks import Frame, write_frames
 from tools.arrays import ByteArray, FloatArray
 from tools.simulator.single_disc import render_disc

@@ -171,7 +171,7 @@ def time_searches(
     """
     from detect.markers.candidates import closing
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
+    from detect.settings import MarkerSettings
 
     cv2.setNumThreads(1)
     (dictionary,) = settings.dictionaries

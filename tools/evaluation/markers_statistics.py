@@ -61,7 +61,7 @@ def known_to_opencv(dictionary: str) -> bool:
 
 def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
+    from detect.settings import MarkerSettings
 
     found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
     return Found(found.ids, found.corners, found.covariance)

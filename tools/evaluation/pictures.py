@@ -20,9 +20,9 @@ from detect.circles import detect_circles, disc_shape
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
-from detect.run import read_image
 from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
+from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
@@ -301,7 +301,7 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
     """The three phases: dark regions, corners and edges, identities."""
     from detect.markers.candidates import closing, dark_pixels
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
+    from detect.settings import MarkerSettings
 
     camera, image = _frame(run, frame)
     found = detect_markers(image, MarkerSettings(), camera)

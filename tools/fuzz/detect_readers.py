@@ -28,7 +28,7 @@ from detect.sources.gray import (
 from detect.sources.interface import read_image_times
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
-from redetect.storage.image_header import claimed_size
+from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
 from tools.arrays import ByteArray
 from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader

@@ -35,8 +35,7 @@ from camera.errors import CalibrationError
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.files import numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
-from redetect.storage.bounded import path_inside, read_bounded
-from redetect.storage.image_header import claimed_size
+from redetect.storage.bounded import claimed_size, path_inside, read_bounded
 from redetect.storage.messages import excerpt, one_line
 
 FloatArray = NDArray[np.float64]

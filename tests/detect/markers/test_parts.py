@@ -29,9 +29,9 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
-from detect.markers.settings import MarkerSettings
 from detect.noise import estimate_noise
 from detect.positive_definite import invert_positive, solve_positive
+from detect.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 

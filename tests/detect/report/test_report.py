@@ -18,8 +18,8 @@ from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
 from detect.report.figures import binned, disc_rates, line_rates, whitened
-from detect.run import camera_in
 from detect.seen import Sight
+from detect.sources.interface import camera_in
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
 from tests.detect.test_cli import assert_refused

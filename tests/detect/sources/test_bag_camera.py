@@ -19,8 +19,8 @@ from camera.formats.yaml_files import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import Run
 from detect.sources.bag import pose_in_dataset, rotation_of
+from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said
