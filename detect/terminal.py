@@ -118,12 +118,14 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted
         return
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich import console
+    from rich import progress as bars
 
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
-    rate = TextColumn("{task.fields[rate]}")
-    progress = Progress(*columns, rate, console=Console(stderr=True))
+    columns = (
+        *bars.Progress.get_default_columns(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(),
+    )  # fmt: skip
+    rate = bars.TextColumn("{task.fields[rate]}")
+    progress = bars.Progress(*columns, rate, console=console.Console(stderr=True))
     task = progress.add_task(label, total=total, rate="")
 
     def advance() -> None:

@@ -40,7 +40,7 @@ from redetect.landmarks import (
     read_tilts,
 )
 from redetect.reporting.page import figure_file
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_bytes
 
 
 def perform(options: Tune) -> int:
@@ -106,8 +106,7 @@ def perform(options: Tune) -> int:
     }
     output.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
-        with write_whole(outputs[name], overwrite=options.force) as stream:
-            stream.write(content)
+        write_bytes(outputs[name], content, overwrite=options.force)
     print(f"{output}: {title}: {', '.join(contents)}")
     for record in records:
         if record["knee"]:

@@ -4,6 +4,7 @@
 >>> camera = rd.Camera.read("images/e/e.cam")                                  # doctest: +SKIP
 >>> found = rd.detect("images/e/images/e.0000.png", camera, radius_m=0.10)     # doctest: +SKIP
 >>> found.discs.xy, found.discs.covariance                                     # doctest: +SKIP
+>>> found.to_dataframe()                                                       # doctest: +SKIP
 
 What is listed in `__all__` is the public interface; each name is imported when it is first used.
 """

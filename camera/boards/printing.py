@@ -20,8 +20,7 @@ from camera import options
 from camera.boards.board import Board, board_of
 from camera.boards.charuco import dictionary_of
 from camera.errors import CalibrationError
-from redetect.storage import write_whole
-from redetect.storage.parts import demand_place
+from redetect.storage import demand_place, write_bytes
 
 #: Sheets of paper, metres, the smallest first.
 PAGES = {
@@ -45,8 +44,7 @@ def perform(command: options.Board) -> int:
     else:
         sheet = sheet_of_board(board_of(command))
     width, height = page_for(sheet, command.page)
-    with write_whole(command.output, overwrite=command.force) as stream:
-        stream.write(pdf_of(sheet, (width, height)))
+    write_bytes(command.output, pdf_of(sheet, (width, height)), overwrite=command.force)
     name = next(name for name, sides in PAGES.items() if set(sides) == {width, height})
     print(f"written: {command.output}: {sheet.text}, on {name}; print at 100 %, measure the bar")
     return 0

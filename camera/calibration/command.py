@@ -42,8 +42,7 @@ from camera.errors import CalibrationError, CameraError
 from camera.model import PARAMETERS, Camera
 from camera.options import Calibrate
 from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
-from redetect.storage import write_whole
-from redetect.storage.parts import demand_place
+from redetect.storage import demand_place, write_bytes
 
 #: How many pictures are looked through for the true size of a checkerboard, and how many agree.
 _COUNTED_PICTURES, _VOTES = 8, 2
@@ -106,12 +105,11 @@ def perform(options: Calibrate) -> int:
             write_floor_pictures(options, options.floor, camera)
     drawn = pictures(calibration, camera)
     for name, path in names.items():
-        with write_whole(path, overwrite=options.force) as stream:
-            stream.write(drawn[name])
-    with write_whole(report, overwrite=options.force) as stream:
-        stream.write(report_text(options, calibration, camera, placed).encode())
-    with write_whole(output, overwrite=options.force) as stream:
-        stream.write(format_camera(camera).encode())
+        write_bytes(path, drawn[name], overwrite=options.force)
+    write_bytes(
+        report, report_text(options, calibration, camera, placed).encode(), overwrite=options.force
+    )
+    write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
     print(f"written: {output}, {report.name}, {', '.join(p.name for p in names.values())}")
     return 0
 

@@ -35,10 +35,9 @@ from camera.errors import CalibrationError
 from camera.model import Camera
 from camera.options import Calibrate, Floor
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
-from redetect.storage import write_whole
+from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt
-from redetect.storage.parts import demand_place
 
 FloatArray = NDArray[np.float64]
 
@@ -302,8 +301,7 @@ def write_floor_pictures(options: Calibrate | Floor, floor: Path, camera: Camera
 def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> None:
     """Write a PNG file, its folder if need be."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    with write_whole(place, overwrite=force) as stream:
-        stream.write(cv2.imencode(".png", picture)[1].tobytes())
+    write_bytes(place, cv2.imencode(".png", picture)[1].tobytes(), overwrite=force)
     print(f"written: {place}")
 
 

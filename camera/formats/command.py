@@ -28,8 +28,7 @@ from camera.formats.yaml_files import (
 )
 from camera.model import Camera
 from camera.options import Convert, Format
-from redetect.storage import write_whole
-from redetect.storage.parts import demand_place
+from redetect.storage import demand_place, write_bytes
 
 #: The models that each format has, the simplest first.
 MODELS: dict[str, tuple[Model, ...]] = {
@@ -77,8 +76,7 @@ def perform(options: Convert) -> int:
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose stays behind: the format has none (--pose-from brings it back)")
     written = format_of(camera, to_format, options.camera_name)
-    with write_whole(options.target, overwrite=options.force) as stream:
-        stream.write(written.encode())
+    write_bytes(options.target, written.encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

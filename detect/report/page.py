@@ -36,7 +36,7 @@ from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report
 from redetect.reporting.page import Part, Section, page_of
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_bytes
 
 
 def perform(options: Report) -> int:
@@ -46,12 +46,10 @@ def perform(options: Report) -> int:
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
-    if output.exists() and not options.force:
-        raise OutputExistsError(output)
+    demand_place(output, overwrite=options.force)
     inputs = gather(run, options.files, options.gates, options.time_frames)
     page = report_page(inputs, options.worst)
-    with write_whole(output, overwrite=options.force) as stream:
-        stream.write(page)
+    write_bytes(output, page, overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")

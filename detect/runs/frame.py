@@ -17,7 +17,6 @@ from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
-from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks
+from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.levelling import (
@@ -217,10 +216,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
             pictures=tuple(
-                (
-                    f"{Path(task.frame.step.prefix).name}{ending}",
-                    cv2.imencode(".png", picture)[1].tobytes(),
-                )
+                (f"{Path(task.frame.step.prefix).name}{ending}", png_of(picture))
                 for ending, picture in _drawn(rows, found, plan)
             ),
         )

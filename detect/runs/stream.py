@@ -30,7 +30,7 @@ from detect.runs.journal import Journal, made_by, task_digest
 from detect.runs.outputs import Output, is_log, log_text, outputs_of
 from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_bytes
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 _log = logging.getLogger("redetect")
@@ -104,8 +104,7 @@ def _write_pictures(
 ) -> None:
     for _, rows in frames:
         for name, picture in rows.pictures:
-            with write_whole(folder / name, overwrite=overwrite) as stream:
-                stream.write(picture)
+            write_bytes(folder / name, picture, overwrite=overwrite)
 
 
 class RunFiles:

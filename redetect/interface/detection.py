@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from detect.drawing.frame import draw_rows, png_of
+from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.line_settings import LineSettings
 from detect.runs.frame import FrameDetections, detect_batch
@@ -21,6 +23,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
+from detect.viewing_options import CompareOptions
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import CircleLandmark, Frame, FrameTilt, Step
 from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
@@ -188,10 +191,6 @@ class Detection(Table):
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
-        from detect.drawing.frame import draw_rows
-        from detect.drawing.inputs import SeenRows
-        from detect.viewing_options import CompareOptions
-
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
         sight = Sight(self.camera, self.settings.radius_m)
         return draw_rows(self.image, sight, rows, self.settings, CompareOptions(), self.name)
@@ -323,13 +322,6 @@ def grey_image(image: NDArray[Any]) -> NDArray[np.uint8]:
             "shape (H, W); files of colours or 16 bits can be named by their path"
         )
     return np.ascontiguousarray(image)
-
-
-def png_of(picture: NDArray[np.uint8]) -> bytes:
-    """A picture as a PNG file."""
-    import cv2
-
-    return cv2.imencode(".png", picture)[1].tobytes()
 
 
 def frame_of_image(image: ImageLike) -> RunFrame:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
-from detect.drawing.frame import draw_disc_candidates
+from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import read_image
 from redetect.interface.detection import (
@@ -20,7 +20,6 @@ from redetect.interface.detection import (
     ImageLike,
     camera_of,
     frame_of_image,
-    png_of,
     settings_of,
 )
 from redetect.interface.tables import Table
