@@ -19,7 +19,7 @@ from redetect.storage.command_line import exit_code_of
 #: Files are at most twice as long as the longest that a reader accepts, and at least so long.
 _SHORT_BYTES = 2048
 _INSTRUMENTED = (
-    "camera", "detect.drawing.inputs", "detect.runs.journal", "detect.sources", "redetect",
+    "camera", "detect.drawing.inputs", "detect.runs.stream", "detect.sources", "redetect",
     "tools.fuzz", "csv",
 )  # fmt: skip
 

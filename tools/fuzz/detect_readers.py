@@ -16,8 +16,8 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.journal import Journal
 from detect.runs.outputs import is_log
+from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.gray import (
     bounded_content,
