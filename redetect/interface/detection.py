@@ -346,7 +346,8 @@ def _detection(
     assert found.lines is not None
     lines, discs = found.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
-    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance)
+    unknown = np.full(len(discs), -1)
+    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     return Detection(
         discs=Discs(
             u=pixels[:, 0],
