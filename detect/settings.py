@@ -179,9 +179,6 @@ def parameter_value(kind: type, name: str, text: str) -> Any:
     raise DetectError(f"{name} is {excerpt(text)}: expected {expected}")
 
 
-Darkness = Literal["ratio", "difference"]
-CornerAlgorithm = Literal["A", "B"]
-
 _LEAST_WIDTH = Bounds("4 or more", 4.0, below=True)
 _AREA_FACTOR = Bounds("above 1", 1.0, above=True, below=True)
 
@@ -198,10 +195,9 @@ class MarkerSettings:
     #: Expected width of the markers in the image, pixels, right to a factor of about 2; 0: unknown,
     #: several scales are tried.
     width_px: NotNegative = 0.0
-    #: A pixel is dark if its darkness exceeds this; each threshold gives candidates of its own.
+    #: A pixel is dark if 1 - I1/I2 of the image I1 and its closing I2 exceeds this; each threshold
+    #: gives candidates of its own.
     thresholds: Annotated[tuple[float, ...], PROBABILITY] = (0.5, 0.25, 0.12, 0.06, 0.03)
-    #: 1 - I1/I2 of image I1 and its closing I2, or I2 - I1 in parts of 255.
-    darkness: Darkness = "ratio"
     disc_widths: Positive = 0.5  #: Radius of the closing's disc in widths of the marker.
     pyramid: bool = True  #: Search large markers in reduced images.
     #: Dark pixels are darker than the closing by at least this many standard deviations of the
@@ -220,9 +216,6 @@ class MarkerSettings:
     #: white share (0.25 of 1/8 in the report).
     least_white: NotNegative = 0.0
     most_white: NotNegative = 3.0  #: Greatest such area (3 of 1/8 in the report).
-    #: Rough corners: A the maxima of the distance from the barycentre, B the quadrangle of largest
-    #: area.
-    corners: CornerAlgorithm = "B"
     least_square: Share = 0.75  #: Area of the rough quadrangle over that of the convex hull.
     #: Fit the whole marker, cells included, to the grey values; its corners are more exact than
     #: those of four separate edges, and its residuals reveal false markers.

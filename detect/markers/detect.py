@@ -201,7 +201,7 @@ def detect_markers(
 
 def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
     """Rough corners of a region by its straight hull, or the cause of there being none."""
-    corners = rough_corners(hull, settings.corners)
+    corners = rough_corners(hull)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
     if signed_area(corners) < settings.least_square * cv2.contourArea(hull.astype(np.float32)):

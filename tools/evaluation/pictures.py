@@ -322,7 +322,7 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
             xlim=(max(low[0], 0), min(high[0], camera.width)),
             ylim=(min(high[1], camera.height), max(low[1], 0)),
         )
-    dark = dark_pixels(image, closing(image, 12), 0.5, 0.0, "ratio")
+    dark = dark_pixels(image, closing(image, 12), 0.5, 0.0)
     panels[0].imshow(np.where(dark > 0, 1.0, np.nan), cmap="autumn", vmin=0, vmax=1, alpha=0.6)
     for candidate in found.candidates:
         _polygon(panels[1], candidate.outline, "#3498db")
