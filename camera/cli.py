@@ -16,7 +16,7 @@ PROGRAM = Program(
     "Print boards, calibrate a camera, place it on the floor, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
-        Board: "camera.boards.printing",
+        Board: "camera.boards.board",
         Calibrate: "camera.calibration.command",
         Floor: "camera.calibration.floor",
         # Needs detection, so the command is implemented in `detect`.

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.boards.board import Board
+from camera.boards.board import Board, dictionary_of
 from camera.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]
@@ -51,24 +51,6 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     grid = measured_corners(image, grid, board.marker_m / board.square_m)
     found = np.flatnonzero(np.isfinite(grid[..., 0]).ravel())
     return found, grid.reshape(-1, 2)[found]
-
-
-def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """The dictionary that a ChArUco board's markers are of."""
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or number is None:
-        raise CalibrationError(
-            f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
-            "DICT_5X5_100"
-        )
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
-    markers, most = board.columns * board.rows // 2, len(dictionary.bytesList)
-    if markers > most:
-        raise CalibrationError(
-            f"dictionary {board.dictionary} has {most} markers, and a {board} {markers}: expected "
-            "the dictionary that the board was printed with"
-        )
-    return dictionary
 
 
 def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from camera.boards.board import Board, board_of
-from camera.boards.charuco import dictionary_of
+from camera.boards.board import Board, board_of, dictionary_of
 from camera.boards.points import corners_counted, find_board
 from camera.calibration.calibrate import (
     BoardView,

@@ -13,13 +13,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from detect.errors import DetectError, FrameError
-from detect.sources.gray import significant_bits_of_file
 from detect.sources.interface import (
     Frames,
     RunFrame,
     Source,
     frame_prefix,
     read_image_times,
+    significant_bits_of_file,
     still,
 )
 from redetect.landmarks import read_steps

@@ -25,8 +25,7 @@ import cv2
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
-from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import RunFrame, Source, numbered_prefix, still
+from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 
 _log = logging.getLogger("redetect")
 

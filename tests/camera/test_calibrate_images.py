@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.calibration.images import calibration_images, read_grey
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards

@@ -12,7 +12,7 @@ import pytest
 from camera import Camera, CameraError
 from camera.calibration.images import read_grey
 from detect.errors import FrameError
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
 from redetect.storage.bounded import MOST_PIXELS, claimed_size

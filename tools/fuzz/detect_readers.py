@@ -19,13 +19,13 @@ from detect.errors import DetectError, FrameError
 from detect.runs.outputs import is_log
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
-from detect.sources.gray import (
+from detect.sources.interface import (
     bounded_content,
     decode_gray,
     gray_of_pixels,
+    read_image_times,
     significant_bits_of_file,
 )
-from detect.sources.interface import read_image_times
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
 from redetect.storage.bounded import claimed_size

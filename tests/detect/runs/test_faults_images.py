@@ -17,8 +17,7 @@ import pytest
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.sources.gray import bounded_content, demand_bounded
-from detect.sources.interface import RunFrame, read_image
+from detect.sources.interface import RunFrame, bounded_content, demand_bounded, read_image
 from redetect.landmarks import Step
 from redetect.storage.bounded import MOST_PIXELS, claimed_size
 
