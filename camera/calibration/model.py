@@ -154,14 +154,10 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
     coef, brown = coefficients(intrinsics), brown_terms(intrinsics)
     if any(brown):
         return _holds_border(intrinsics, coef, brown, width, height)
-    fold = fold_radius(coef)
-    if not np.isfinite(fold):
-        # r f(r) grows without end, but towards a limit where the coefficients make f fall as 1 / r.
-        fold = 1e6
-    a2, a3, b1, b2, b3 = coef
-    factor = 1.0 + fold * (a2 + fold * a3) / (1.0 + fold * (b1 + fold * (b2 + fold * b3)))
+    # Without a fold r f(r) grows without end, but towards a limit where f falls as 1 / r.
+    fold = min(fold_radius(coef), 1e6)
     corner = corner_radius(intrinsics, width, height)
-    return bool(corner * (1.0 + _FOLD_MARGIN) < fold * factor)
+    return bool(corner * (1.0 + _FOLD_MARGIN) < fold * radial_factor(np.array(fold), coef))
 
 
 def _holds_border(

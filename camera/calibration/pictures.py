@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from camera.calibration.adjustment import project_estimate
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
+from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,29 +22,21 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _ARROW_SHARE = 0.05
-_DPI = 110
 
 
 def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
     """PNG files by name: `residuals`, `views`, `coverage`."""
-    return {
-        "residuals": _png(_residuals(calibration)),
-        "views": _png(_views(calibration)),
-        "coverage": _png(_coverage(calibration, camera)),
-    }
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    # Without a date, the same calibration gives the same bytes.
-    figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
-    return stream.getvalue()
+    shown = len(calibration.names) + len(calibration.outliers)
+    contents = {}
+    for name, size, draw in (
+        ("residuals", (13.0, 5.0), _draw_residuals),
+        ("views", (max(6.0, 0.22 * shown + 2.0), 4.2), _draw_views),
+        ("coverage", (13.0, 4.6), partial(_draw_coverage, camera)),
+    ):
+        with figure_file(size, "png") as (figure, content):
+            draw(calibration, figure)
+        contents[name] = content.getvalue()
+    return contents
 
 
 def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: int) -> Axes:
@@ -59,9 +50,8 @@ def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: i
     return axes
 
 
-def _residuals(calibration: Calibration) -> Figure:
+def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
     points, residuals = calibration.points, calibration.adjusted.residuals
-    figure = _figure(13.0, 5.0)
     axes = _image_axes(figure, 1, calibration, 2)
     typical = float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
     gain = _ARROW_SHARE * points.width / max(3.0 * typical, 1e-9)
@@ -84,13 +74,11 @@ def _residuals(calibration: Calibration) -> Figure:
         f"RMS {calibration.adjusted.rms_px:.3f} px; rings: 1 and 2 times "
         f"{calibration.adjusted.sigma_px:.3f} px"
     )
-    return figure
 
 
-def _views(calibration: Calibration) -> Figure:
+def _draw_views(calibration: Calibration, figure: Figure) -> None:
     rms = calibration.view_rms_px
     shown = len(rms) + len(calibration.outliers)
-    figure = _figure(max(6.0, 0.22 * shown + 2.0), 4.2)
     axes = figure.add_subplot()
     names = [*calibration.names, *(name for name, _ in calibration.outliers)]
     values = [*rms, *(value for _, value in calibration.outliers)]
@@ -100,12 +88,10 @@ def _views(calibration: Calibration) -> Figure:
     axes.set_xticks(np.arange(shown), names, rotation=90, fontsize=6)
     axes.set_ylabel("RMS residual (px)")
     axes.set_title("Each picture; red: left out" if calibration.outliers else "Each picture")
-    return figure
 
 
-def _coverage(calibration: Calibration, camera: Camera) -> Figure:
+def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:
     points = calibration.points
-    figure = _figure(13.0, 4.6)
     axes = _image_axes(figure, 1, calibration, 2)
     counts = coverage(points)
     extent = (-0.5, points.width - 0.5, points.height - 0.5, -0.5)
@@ -126,7 +112,6 @@ def _coverage(calibration: Calibration, camera: Camera) -> Figure:
     bar = figure.colorbar(shown, ax=axes, shrink=0.8)
     bar.set_label("px")
     axes.set_title("Standard deviation of the projection")
-    return figure
 
 
 Picture = NDArray[np.uint8]
