@@ -12,8 +12,8 @@ from importlib import import_module
 from typing import Annotated, Any, Union
 
 from redetect.programs import DIRECT, PROGRAMS
+from redetect.storage import __version__
 from redetect.storage.command_line import FOR_ALL, end_with, no_such
-from redetect.storage.version import __version__
 
 _QUIET = ("-q", "--quiet")
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 
 FloatArray = NDArray[np.float64]
 

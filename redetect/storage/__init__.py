@@ -7,3 +7,6 @@ from redetect.storage.parts import OutputExistsError as OutputExistsError
 from redetect.storage.parts import demand_place as demand_place
 from redetect.storage.parts import write_bytes as write_bytes
 from redetect.storage.parts import write_whole as write_whole
+
+#: The version of this project, defined only here.
+__version__ = "0.1.0"

@@ -22,8 +22,8 @@ from typing import Annotated, Any, Union, get_type_hints
 import tyro
 from tyro.conf import OmitArgPrefixes, Suppress, arg, subcommand
 
+from redetect.storage import __version__
 from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
-from redetect.storage.version import __version__
 
 #: The command could not be carried out.
 EXIT_ERROR = 1

@@ -13,10 +13,10 @@ from camera import Camera
 from detect.circles import detect_circles, disc_shape
 from detect.cli import carry_out
 from detect.discs.quality import Limits, centres_of, quality_of_centres
+from detect.grey_values import estimate_noise
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
-from detect.noise import estimate_noise
 from detect.options import All, Circles, Lines
 from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings

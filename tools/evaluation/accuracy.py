@@ -15,7 +15,7 @@ import numpy as np
 from camera import Camera, read_camera
 from detect.circles import disc_shape, refined_covariance
 from detect.discs.fit import blur_ratio_of, fit_discs
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
 from tools.arrays import ByteArray, FloatArray

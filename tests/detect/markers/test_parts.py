@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
 from camera import Camera
+from detect.grey_values import estimate_noise
 from detect.markers import pattern_model as model
 from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
@@ -29,7 +30,6 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
-from detect.noise import estimate_noise
 from detect.positive_definite import invert_positive, solve_positive
 from detect.settings import MarkerSettings
 
