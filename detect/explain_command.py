@@ -10,9 +10,8 @@ from camera import Camera, read_camera
 from detect.discs.unfound import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.errors import DetectError
-from detect.sources.interface import RunFrame, camera_in, read_image
+from detect.sources.interface import RunFrame, camera_in, read_image, still
 from detect.viewing_options import Explain
-from redetect.landmarks import Step
 from redetect.storage import demand_place, write_bytes
 
 
@@ -24,7 +23,7 @@ def perform(command: Explain) -> int:
     if not command.image.is_file():
         raise DetectError(f"{command.image}: no such image: expected one image of a run")
     camera = _camera(command)
-    image = read_image(RunFrame(Step("image", *[0.0] * 9), command.image), camera)
+    image = read_image(RunFrame(still("image"), command.image), camera)
     found = explain_discs(image, camera, command.settings, command.at)
     _print(found)
     if command.output is not None:

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import math
-import statistics
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
-from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from detect import __version__
 from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
@@ -22,7 +16,7 @@ from detect.comparison.report import (
     worst_frames_table,
 )
 from detect.comparison.result import Comparison, DiscComparison, LineComparison, number
-from detect.drawing.frame import EXTRA_COLOUR, MISSED_COLOUR, Colour, draw_curve, draw_rows
+from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
@@ -41,26 +35,13 @@ from detect.report.figures import (
     whitened,
     whitened_figure,
 )
-from detect.runs.frame import detect_batch
-from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import Sight, circle_on_floor
+from detect.seen import Sight
 from detect.settings import CircleSettings, MarkerSettings
-from detect.sources.interface import ImageRun, Run, RunFrame, read_image
+from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import CompareOptions, Gates, Report, RowFiles
-from redetect.landmarks import circle_arrays
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Processor time per frame, medians (ms): decoding the image, and everything else."""
-
-    frames: int
-    decoding_ms: float
-    detecting_ms: float
-    what: str
 
 
 @dataclass(frozen=True)
@@ -79,11 +60,10 @@ class ReportInputs:
     sight: Sight | None
     discs: DiscComparison | None
     lines: LineComparison | None
-    timing: Timing | None
 
 
-def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> ReportInputs:
-    """Read and compare all rows of a run, and detect `time_frames` frames to measure the time.
+def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
+    """Read and compare all rows of a run.
 
     Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
     """
@@ -114,131 +94,23 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates, time_frames: int) -> 
             unlisted=rows_beside(files.reference["lines"], "unlisted.lines"),
             names=(files.reference["lines"].name, files.detected["lines"].name),
         )
-    timing = _measured(run, files, len(names), time_frames)
-    return ReportInputs(run, files, names, rows, compare, sight, discs, lines, timing)
-
-
-def _measured(run: ImageRun, files: RunRows, count: int, wanted: int) -> Timing | None:
-    if wanted < 0:
-        raise DetectError(f"time_frames is {wanted}: expected 0 or more")
-    if wanted == 0:
-        return None
-    circles = files.circle_settings if "circles" in files.heads else None
-    lines = files.heads["lines"].line_settings if "lines" in files.heads else None
-    if not isinstance(run, Run) or (circles is None and lines is None):
-        raise DetectError("--time-frames: expected a calibration, and rows of discs or verticals")
-    plan = FramePlan(run.camera, lines=lines, circles=circles)
-    every = max(1, count // wanted)
-    chosen = list(islice(run.frames, 0, every * wanted, every))
-    decoding, detecting = [], []
-    # The first frame, which compiles and fills caches, is processed twice.
-    for frame in [chosen[0], *chosen]:
-        try:
-            start = time.thread_time()
-            read_image(frame, run.camera)
-            between = time.thread_time()
-            detect_batch([FrameTask(frame)], plan)
-            end = time.thread_time()
-        except FrameError:
-            continue
-        decoding.append(between - start)
-        detecting.append((end - between) - (between - start))
-    if len(decoding) < 2:
-        raise DetectError("--time-frames: no image can be read: expected some of them")
-    what = " and ".join(
-        kind for kind, settings in (("discs", circles), ("verticals", lines)) if settings
-    )
-    return Timing(
-        len(decoding) - 1,
-        1e3 * statistics.median(decoding[1:]),
-        1e3 * statistics.median(detecting[1:]),
-        what,
-    )
+    return ReportInputs(run, files, names, rows, compare, sight, discs, lines)
 
 
 _JPEG_QUALITY = 88
-_MOST, _IN_A_ROW = 18, 6
-_HALF_PX = (48, 32)
-_TIMES, _GAP_PX = 2, 4
-#: Outlines are drawn larger than the disc by this factor, so that they do not hide its edge.
-_WIDER = 1.6
-_FATES = {
-    "missed": (MISSED_COLOUR, "reference rows that are missing"),
-    "extra": (EXTRA_COLOUR, "rows that fit no reference row"),
-}
 
 
 def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
     """The picture of a frame with its rows; or a note that says why there is none."""
     frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
     try:
-        image = _read(inputs, frame)
+        image = read_image(frame, None if inputs.sight is None else inputs.sight.camera)
     except FrameError as error:
         return Part("note", f"{words}: {error}")
     rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
-    return _jpeg(words, draw_rows(image, inputs.sight, rows, settings, inputs.options))
-
-
-def gallery(inputs: ReportInputs, fate: Literal["missed", "extra"]) -> list[Part]:
-    """An image of cut-outs of some missed or extra discs, evenly over the run, if there are any."""
-    edges = list(_edges(inputs, fate))
-    if not edges:
-        return []
-    frames = {picture_name(frame.step.prefix): frame for frame in inputs.run.frames}
-    chosen = np.unique(np.linspace(0, len(edges) - 1, min(_MOST, len(edges))).round().astype(int))
-    tiles = []
-    colour, words = _FATES[fate]
-    for name, edge in (edges[k] for k in chosen):
-        try:
-            tiles.append(_tile(_read(inputs, frames[name]), edge, colour))
-        except FrameError:
-            continue
-    if not tiles:
-        return []
-    words = (
-        f"{len(tiles)} of the {len(edges)} {words}, evenly over the run; the outline is wider than "
-        "the disc."
-    )
-    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % _IN_A_ROW)
-    rows = [np.hstack(tiles[k : k + _IN_A_ROW]) for k in range(0, len(tiles), _IN_A_ROW)]
-    return [_jpeg(words, np.vstack(rows))]
-
-
-def _read(inputs: ReportInputs, frame: RunFrame) -> NDArray[np.uint8]:
-    return read_image(frame, inputs.run.camera if isinstance(inputs.run, Run) else None)
-
-
-def _jpeg(words: str, picture: NDArray[np.uint8]) -> Part:
+    picture = draw_rows(image, inputs.sight, rows, settings, inputs.options)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
-
-
-def _edges(inputs: ReportInputs, fate: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Frame and image of a circle round each disc that was missed, or is extra."""
-    for match in () if inputs.discs is None else inputs.discs.frames:
-        view = match.frame.view
-        if view is None:
-            continue
-        rows, seen_at = match.missed, view.reference_px
-        if fate == "extra":
-            rows, seen_at = match.extra, view.detected_px
-        rings = circle_on_floor(circle_arrays(rows).xy, _WIDER * view.radius_m)
-        for edge in seen_at(rings):
-            if np.isfinite(edge).all():
-                yield picture_name(match.frame.name), edge
-
-
-def _tile(image: NDArray[np.uint8], edge: NDArray[np.float64], colour: Colour) -> NDArray[np.uint8]:
-    """A cut-out, enlarged, with a curve drawn in and a gap beside it; white beyond the image."""
-    begin = np.rint(edge.mean(axis=0)) - _HALF_PX
-    # Pixels are squares round their centres.
-    shift = 0.5 * (_TIMES - 1) - _TIMES * begin
-    enlarge = np.column_stack([_TIMES * np.eye(2), shift])
-    size = (2 * _TIMES * _HALF_PX[0], 2 * _TIMES * _HALF_PX[1])
-    cut = cv2.warpAffine(image, enlarge, size, flags=cv2.INTER_CUBIC, borderValue=(255,))
-    canvas = np.asarray(cv2.cvtColor(cut, cv2.COLOR_GRAY2BGR), np.uint8)
-    draw_curve(canvas, _TIMES * edge + shift, colour, closed=True)
-    return np.pad(canvas, ((0, _GAP_PX), (0, _GAP_PX), (0, 0)), constant_values=255)
 
 
 def perform(options: Report) -> int:
@@ -249,7 +121,7 @@ def perform(options: Report) -> int:
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
     demand_place(output, overwrite=options.force)
-    inputs = gather(run, options.files, options.gates, options.time_frames)
+    inputs = gather(run, options.files, options.gates)
     page = report_page(inputs, options.worst)
     write_bytes(output, page, overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
@@ -277,7 +149,6 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
     sections.append(_frames(inputs, worst))
     if "tilt" in detected:
         sections.append(Section("tilt", "Tilt", _tilt(inputs)))
-    sections.append(Section("timing", "Timing", [_timing(inputs)]))
     sections.append(Section("settings", "Effective configuration", _settings(inputs)))
     return page_of(f"Detections of {inputs.run.name}", sections)
 
@@ -315,7 +186,7 @@ def _summary(inputs: ReportInputs) -> list[Part]:
 
 
 def _discs(inputs: ReportInputs) -> list[Part]:
-    """Rates and errors of discs, whether covariances are right, and discs cut out."""
+    """Rates and errors of discs, and whether covariances are right."""
     result = inputs.discs
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
@@ -331,8 +202,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result.lean is not None:
         what += ", after the common lean"
         parts.append(Part("table", *floor_table(result)))
-    parts += _honesty(result, what)
-    return [*parts, *gallery(inputs, "missed"), *gallery(inputs, "extra")]
+    return [*parts, *_honesty(result, what)]
 
 
 def _lines(inputs: ReportInputs) -> list[Part]:
@@ -393,7 +263,7 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     return [whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
-# -- frames, tilt, time, settings -------------------------------------------------------------
+# -- frames, tilt, settings -------------------------------------------------------------
 
 
 def _frames(inputs: ReportInputs, worst: int) -> Section:
@@ -451,22 +321,6 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
     caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
     figure = [tilt_figure(inputs.rows)] if len(tilts) > 1 else []
     return [*figure, Part("table", caption, head, tuple(rows))]
-
-
-def _timing(inputs: ReportInputs) -> Part:
-    timing = inputs.timing
-    if timing is None:
-        words = "Not measured: --time-frames 20 detects 20 of the frames again and states it."
-        return Part("note", words)
-    rows = tuple(
-        (what, f"{ms:.2f}", f"{ms / timing.decoding_ms:.2f}")
-        for what, ms in (
-            ("decoding the image", timing.decoding_ms),
-            (f"detecting {timing.what}", timing.detecting_ms),
-        )
-    )
-    caption = f"Processor time, medians of {timing.frames} frames, on the machine of this report"
-    return Part("table", caption, ("", "ms", "x decoding"), rows)
 
 
 def _settings(inputs: ReportInputs) -> list[Part]:

@@ -23,7 +23,7 @@ from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import RunFrame, read_image
+from detect.sources.interface import RunFrame, read_image, still
 from detect.viewing_options import CompareOptions
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
@@ -330,12 +330,11 @@ def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
-        return RunFrame(Step("image", *[0.0] * 9), None, content=grey_image(image))
+        return RunFrame(still("image"), None, content=grey_image(image))
     path = Path(image)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
-    # A prefix is one word.
-    return RunFrame(Step("_".join(path.stem.split()) or "image", *[0.0] * 9), path)
+    return RunFrame(still("_".join(path.stem.split()) or "image"), path)  # a prefix is one word
 
 
 def _detection(
