@@ -11,6 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from camera.boards.board import Board, dictionary_of
 from camera.errors import CalibrationError
@@ -98,7 +99,8 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
         # First the given corners, then, ring by ring, the neighbours of those found.
         known = rough if not tried.any() else result
         present = np.isfinite(known[..., 0])
-        wanted = (present if not tried.any() else _bordering(present)) & ~tried
+        wanted = present if not tried.any() else binary_dilation(present, np.ones((3, 3)))
+        wanted = wanted & ~tried
         if not wanted.any() or present.sum() < _FEWEST_FOUND:
             return result
         homography = _homography(known, present)
@@ -113,17 +115,6 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
             parity = int(row + column) % 2
             found[row, column] = _measured(grey, gradient, at, axes, white, parity)
         result = found
-
-
-def _bordering(present: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Places that touch a present one, also across a corner."""
-    padded = np.pad(present, 1)
-    rows, columns = present.shape
-    near = np.zeros_like(present)
-    for down in range(3):
-        for right in range(3):
-            near |= padded[down : down + rows, right : right + columns]
-    return near & ~present
 
 
 def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | None:
