@@ -6,7 +6,7 @@ A board's frame: origin in the middle of its points, x right, y up, z out of the
 - a ChArUco board's first marker is at the top left, as OpenCV prints it;
 - the first of a circle grid's points is at the top left.
 
-A board's points go row by row from the top left. A sheet to print is a list of black shapes in
+A board's points go row by row from the top left. What is printed is a list of black shapes in
 metres, in the same frame.
 """
 
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Patch, Rectangle
 from numpy.typing import NDArray
 
 from camera import options
@@ -168,6 +168,7 @@ PAGES = {
 _MARGIN_M, _TEXT_M = 0.004, 0.012
 _RULER_M = 0.1
 _M_PER_INCH = 0.0254
+_INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 
 
 def perform(command: options.Board) -> int:
@@ -184,27 +185,10 @@ def perform(command: options.Board) -> int:
     return 0
 
 
-class Disc(NamedTuple):
-    """A black disc: middle and radius, metres."""
-
-    x: float
-    y: float
-    radius: float
-
-
-class Box(NamedTuple):
-    """A rectangle: lower left corner, width and height, metres."""
-
-    x: float
-    y: float
-    width: float
-    height: float
-
-
 class Sheet(NamedTuple):
     """What is printed black, and the width and height that it takes up, metres."""
 
-    shapes: Sequence[Disc | Box]
+    shapes: Sequence[Patch]
     width: float
     height: float
     text: str
@@ -218,7 +202,7 @@ def sheet_of_board(board: Board) -> Sheet:
         if board.circle_m == 0.0:
             raise CalibrationError("circle_m is 0: circles are printed with a diameter")
         radius = 0.5 * board.circle_m
-        dots: list[Disc | Box] = [Disc(float(x), float(y), radius) for x, y, _ in board.points]
+        dots = [Circle((x, y), radius, **_INK) for x, y, _ in board.points.tolist()]
         width, height = (high - low)[:2] + board.circle_m
         text = f"{board}: distance {millimetres:g} mm, diameter {1e3 * board.circle_m:g} mm"
         return Sheet(dots, float(width), float(height), text)
@@ -227,8 +211,8 @@ def sheet_of_board(board: Board) -> Sheet:
     if board.kind == "checkerboard":
         columns, rows = columns + 1, rows + 1
     left, top = -0.5 * columns * side, 0.5 * rows * side
-    black: list[Disc | Box] = [
-        Box(left + column * side, top - (row + 1) * side, side, side)
+    black = [
+        Rectangle((left + column * side, top - (row + 1) * side), side, side, **_INK)
         for row in range(rows)
         for column in range(columns)
         if (row + column) % 2 == 0
@@ -240,7 +224,7 @@ def sheet_of_board(board: Board) -> Sheet:
     return Sheet(black, columns * side, rows * side, text)
 
 
-def _charuco(board: Board, left: float, top: float) -> list[Disc | Box]:
+def _charuco(board: Board, left: float, top: float) -> list[Rectangle]:
     """Markers, and the squares in which OpenCV puts none."""
     dictionary = dictionary_of(board)
     pattern = cv2.aruco.CharucoBoard(
@@ -248,7 +232,7 @@ def _charuco(board: Board, left: float, top: float) -> list[Disc | Box]:
     )
     side, cells = board.square_m, dictionary.markerSize + 2
     cell = board.marker_m / cells
-    shapes: list[Disc | Box] = []
+    shapes = []
     white = set()
     for number, corners in zip(np.ravel(pattern.getIds()), pattern.getObjPoints()):
         # OpenCV's board has its origin at the top left, y down.
@@ -256,11 +240,11 @@ def _charuco(board: Board, left: float, top: float) -> list[Disc | Box]:
         white.add((int(y // side), int(x // side)))
         bits = cv2.aruco.generateImageMarker(dictionary, int(number), cells)
         shapes += [
-            Box(left + x + column * cell, top - y - (row + 1) * cell, cell, cell)
+            Rectangle((left + x + column * cell, top - y - (row + 1) * cell), cell, cell, **_INK)
             for row, column in np.argwhere(bits < 128).tolist()
         ]
-    squares: list[Disc | Box] = [
-        Box(left + column * side, top - (row + 1) * side, side, side)
+    squares = [
+        Rectangle((left + column * side, top - (row + 1) * side), side, side, **_INK)
         for row in range(board.rows)
         for column in range(board.columns)
         if (row, column) not in white
@@ -278,8 +262,9 @@ def sheet_of_discs(diameter_m: float, columns: int, rows: int) -> Sheet:
     apart = 1.1 * diameter_m
     width, height = apart * (columns - 1) + diameter_m, apart * (rows - 1) + diameter_m
     radius = 0.5 * diameter_m
+    left, bottom = radius - 0.5 * width, radius - 0.5 * height
     discs = [
-        Disc(column * apart - 0.5 * width + radius, row * apart - 0.5 * height + radius, radius)
+        Circle((column * apart + left, row * apart + bottom), radius, **_INK)
         for row in range(rows)
         for column in range(columns)
     ]
@@ -314,15 +299,11 @@ def pdf_of(sheet: Sheet, page_m: tuple[float, float]) -> bytes:
     axes.set_axis_off()
     axes.set_xlim(-0.5 * width, 0.5 * width)
     axes.set_ylim(-0.5 * height, 0.5 * height)
-    ink: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
     for shape in sheet.shapes:
-        if isinstance(shape, Disc):
-            axes.add_patch(Circle((shape.x, shape.y), shape.radius, **ink))
-        else:
-            axes.add_patch(Rectangle((shape.x, shape.y), shape.width, shape.height, **ink))
+        axes.add_patch(shape)
     bottom = -0.5 * height + _MARGIN_M
     left = -0.5 * width + _MARGIN_M
-    axes.add_patch(Rectangle((left, bottom), _RULER_M, 0.002, **ink))
+    axes.add_patch(Rectangle((left, bottom), _RULER_M, 0.002, **_INK))
     axes.text(
         left,
         bottom + 0.004,
