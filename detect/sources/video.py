@@ -19,7 +19,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 from numpy.typing import NDArray
@@ -99,14 +99,6 @@ PATIENCE_S = 10.0
 _LOOK_S = 0.002
 
 
-class Capture(Protocol):
-    """The interface of an OpenCV capture that is used."""
-
-    def read(self) -> tuple[bool, NDArray[Any] | None]: ...
-
-    def release(self) -> None: ...
-
-
 class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
 
@@ -135,7 +127,7 @@ class LiveCamera(Source):
 class _Newest:
     """The newest image of a camera that a thread reads."""
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: cv2.VideoCapture) -> None:
         self._capture = capture
         self._image: deque[tuple[float, NDArray[Any]]] = deque(maxlen=1)
         self._ended = threading.Event()
@@ -192,7 +184,7 @@ def _stoppable() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _open_camera(index: int) -> Capture:
+def _open_camera(index: int) -> cv2.VideoCapture:
     with quiet_opencv():
         capture = cv2.VideoCapture(index)
     if not capture.isOpened():
