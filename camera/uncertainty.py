@@ -23,8 +23,10 @@ IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.
 #: A camera without a pose, to be given intrinsics.
 UNPOSED = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, (0.0,) * 5, IDENTITY, IDENTITY)
 
+_COLUMNS, _ROWS = 49, 37
 
-def pixel_grid(width: int, height: int, columns: int = 49, rows: int = 37) -> FloatArray:
+
+def pixel_grid(width: int, height: int, columns: int = _COLUMNS, rows: int = _ROWS) -> FloatArray:
     """(rows * columns, 2) pixels from corner to corner of an image."""
     u, v = np.meshgrid(np.linspace(0.0, width - 1.0, columns), np.linspace(0.0, height - 1.0, rows))
     return np.stack([u, v], axis=-1).reshape(-1, 2)
@@ -55,24 +57,22 @@ def with_pose(camera: Camera, pose: FloatArray) -> Camera:
     return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
 
 
-def projection_sigma(
-    camera: Camera, covariance: FloatArray, columns: int = 49, rows: int = 37
-) -> FloatArray:
+def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
     """Standard deviation of where directions are projected, whatever the camera's rotation.
 
     A small rotation has the same effect as a shift of the principal point, and the pose absorbs it;
     so the component common with a rotation is removed, as in mrcal.
 
-    Root of the trace of each pixel's covariance (u and v together), (rows, columns) pixels, by the
-    (14, 14) covariance of the intrinsics.
+    Root of the trace of each pixel's covariance (u and v together) over the image, (37, 49) pixels,
+    by the (14, 14) covariance of the intrinsics.
     """
-    rays = camera.unproject(pixel_grid(camera.width, camera.height, columns, rows))
+    rays = camera.unproject(pixel_grid(camera.width, camera.height))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
     J = by_intrinsics.reshape(-1, COUNT)
     turn = (-by_point @ cross_matrices(rays)).reshape(-1, 3)
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(rows, columns))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(_ROWS, _COLUMNS))
 
 
 _LOWER = np.tril_indices(PARAMETERS)
