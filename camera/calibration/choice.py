@@ -13,7 +13,6 @@ from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, fi
 from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
 from redetect.least_squares.solver import StartError
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FOLDS = 8
