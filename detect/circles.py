@@ -26,6 +26,7 @@ from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.placing import place_all_by_part
 from detect.discs.positions import refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
+from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import DiscSearch, FoundDiscs, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
