@@ -91,7 +91,7 @@ def test_discs_that_nobody_reported_are_not_shown(recorded: tuple[Path, Path, Pa
     looking[:] = [8.0, 9.8, 0.0]
     from dataclasses import replace
 
-    there = replace(run, world=replace(run.world, poses=looking))
+    there = replace(run, world=run.world._replace(poses=looking))
     frame = reenacted_frame(there, 0, REENACTED_SENSOR)
     assert frame.discs == ()
     pixel = true_camera(there, 0).project_floor(world_to_robot(looking[0], DISC_XY[3]))
