@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -15,15 +12,19 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2
 
-from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
 from redetect.groundtruth.fusion.inputs import FuseSettings
-from redetect.groundtruth.trajectories.matching import matched_streams
+from redetect.groundtruth.trajectories.matching import (
+    matched_streams,
+    pose_differences,
+    squared_lengths,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray
+from tools.evaluation.lasers import run_groundtruth, table_of_sessions
 from tools.evaluation.tables import Table
 from tools.simulator.laser.motion import Route, measured_path
 from tools.simulator.laser.session_files import write_session
@@ -69,14 +70,11 @@ class FusionStudy:
     visits: int = 3
 
     def __call__(self) -> int:
-        table = Table({"seed": "<5", **_COLUMNS})
-        rows = []
-        with ExitStack() as stack:
-            folder = self.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            for seed in range(self.first, self.first + self.seeds):
-                row = one_session(folder / f"{self.fault}{self.visits}-{seed}", seed, self)
-                rows.append([row[key] for key in _COLUMNS])
-                table.row(str(seed), *rows[-1])
+        def measured(folder: Path, seed: int) -> dict[str, float]:
+            return one_session(folder / f"{self.fault}{self.visits}-{seed}", seed, self)
+
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_COLUMNS, self.folder, seeds, measured)
         table.row("mean", *np.nanmean(rows, axis=0))
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
@@ -89,23 +87,21 @@ def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float
     if not (session / "truth.json").exists():
         settings = replace(LaserSettings(), visits=study.visits, faults=_FAULTS[study.fault])
         write_session(settings, session, seed=seed)
-    at = {name: str(session / f"{name}.csv") for name in ("odometry", "laser", "camera", "fused")}
-    clock = str(session / "clock.json")
-    _run("lasers", str(session))
-    _run("laser", str(session))
-    _run("sync", at["odometry"], at["laser"], "-o", clock)
+    at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
+    clock = session / "clock.json"
+    run_groundtruth("lasers", session)
+    run_groundtruth("laser", session)
+    run_groundtruth("sync", at["odometry"], at["laser"], "-o", clock)
     streams = ["--laser", at["laser"], "--camera", at["camera"]]
-    _run("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
+    run_groundtruth("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
 
     truth = read_planar_poses(session / "truth.csv")
-    laser, camera, fused = (
-        read_planar_poses(session / f"{name}.csv") for name in ("laser", "camera", "fused")
-    )
+    laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
     seen = _seen_by(laser, fused.times_s)
     alone = score_poses(*matched_streams(laser, truth))
-    inside = score_poses(*matched_streams(_some(fused, seen), truth))
-    bridged = score_poses(*matched_streams(_some(fused, ~seen), truth))
-    instant = _some(fused, np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
+    inside = score_poses(*matched_streams(fused.only(seen), truth))
+    bridged = score_poses(*matched_streams(fused.only(~seen), truth))
+    instant = fused.only(np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
     account = json.loads((session / "fused.json").read_text())
     return {
         **_clock_errors(session, list(read_clock(clock).segments)),
@@ -126,26 +122,12 @@ def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float
     }
 
 
-def _run(*arguments: str) -> None:
-    """Run a command of `groundtruth`, and fail if it does."""
-    out = io.StringIO()
-    with redirect_stdout(out):
-        code = groundtruth([*arguments, "--force"])
-    if code != 0:
-        raise RuntimeError(f"groundtruth {' '.join(arguments)} ended with {code}: {out.getvalue()}")
-
-
 def _seen_by(laser: PlanarPoses, times_s: FloatArray) -> BoolArray:
     """Which times lie between poses of the laser that follow each other closely."""
     after = np.clip(np.searchsorted(laser.times_s, times_s), 1, len(laser) - 1)
     close = laser.times_s[after] - laser.times_s[after - 1] < _CONTINUOUS_S
     inside = (times_s >= laser.times_s[0]) & (times_s <= laser.times_s[-1])
     return np.asarray(close & inside)
-
-
-def _some(poses: PlanarPoses, which: BoolArray) -> PlanarPoses:
-    assert poses.covariances is not None
-    return PlanarPoses(poses.times_s[which], poses.poses[which], poses.covariances[which])
 
 
 def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, float]:
@@ -238,9 +220,8 @@ def _figures(fusion: Fusion, route: Route, begin: float, end: float) -> list[flo
     found = fusion.poses
     assert found.covariances is not None
     exact = route.poses(found.times_s)
-    error = found.poses - exact
-    error[:, 2] = wrap_angle(error[:, 2])
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error) / 3.0
+    error = pose_differences(found.poses, exact)
+    squared = squared_lengths(error, found.covariances) / 3.0
     inside = (found.times_s > begin) & (found.times_s < end)
     middle = int(np.argmin(np.abs(found.times_s - 0.5 * (begin + end))))
     late = int(np.argmin(np.abs(found.times_s - (0.1 * begin + 0.9 * end))))
@@ -276,14 +257,6 @@ def _route(rng: np.random.Generator, path: str, seconds: float) -> Route:
     return Route(waypoints, [], limits, -1.0)
 
 
-def _as_simulated(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return measured_path(poses, WheelErrors(), rng)
-
-
-def _slipping(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return measured_path(poses, WheelErrors(sigma_side_m=0.006), rng)
-
-
 def _wheel_by_wheel(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Two wheels that roll by shares too far and each slips by itself; summed up along arcs."""
     turn = np.diff(poses[:, 2])
@@ -304,8 +277,8 @@ def _wheel_by_wheel(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 _ODOMETRIES: dict[str, Odometry] = {
-    "simulated": _as_simulated,
-    "slipping": _slipping,
+    "simulated": lambda poses, rng: measured_path(poses, WheelErrors(), rng),
+    "slipping": lambda poses, rng: measured_path(poses, WheelErrors(sigma_side_m=0.006), rng),
     "wheels": _wheel_by_wheel,
 }
 

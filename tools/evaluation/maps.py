@@ -77,21 +77,22 @@ def distance(mapped: MappedRun, truth: Truth) -> Distance:
     rms, most = path_distance(mapped.estimate.poses, truth)
     true = np.array([truth.discs[int(i)] for i in mapped.graph.disc_ids])
     off = mapped.estimate.disc_xy - true
-    spread = np.linalg.inv(mapped.covariance.discs)
-    return Distance(
-        path_rms_m=rms,
-        path_most_m=most,
-        discs_rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-        discs_nees=float(np.mean(np.einsum("ni,nij,nj->n", off, spread, off))),
-    )
+    discs_rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    nees = float(np.mean(squared_mahalanobis(off, mapped.covariance.discs)))
+    return Distance(rms, most, discs_rms, nees)
+
+
+def drawn(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(n, d) errors drawn from covariances (n, d, d)."""
+    root = np.linalg.cholesky(covariance)
+    return np.asarray(np.einsum("nij,nj->ni", root, rng.standard_normal(root.shape[:2])))
 
 
 def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Recording:
     """A run whose wrong steps are measured anew, with errors as their covariances say."""
     rng = np.random.default_rng(seed)
     true = relative_pose(truth.poses[:-1], truth.poses[1:])
-    root = np.linalg.cholesky(step_covariance(true))
-    fresh = true + np.einsum("nij,nj->ni", root, rng.standard_normal(true.shape))
+    fresh = true + drawn(step_covariance(true), rng)
     wrong = truth.wrong_odometry
     steps, covariance = recording.steps.copy(), recording.step_covariance.copy()
     steps[wrong] = fresh[wrong]
@@ -177,10 +178,9 @@ def with_true_places(recording: Recording, ids: IntArray, truth: Truth, seed: in
     known = np.flatnonzero(ids != UNKNOWN_ID)
     rng = np.random.default_rng(seed)
     places = np.array([truth.discs[int(i)] for i in ids[known]])
-    root = np.linalg.cholesky(circles.covariance[known])
     xy = circles.xy.copy()
     xy[known] = disc_in_robot(truth.poses[circles.frame[known] + 1], places)
-    xy[known] += np.einsum("nij,nj->ni", root, rng.standard_normal((len(known), 2)))
+    xy[known] += drawn(circles.covariance[known], rng)
     return replace(recording, circles=replace(circles, xy=xy, ids=ids))
 
 
@@ -261,19 +261,12 @@ def miswritten(
     rays = np.column_stack([seen, np.zeros(len(seen))]) - mounted
     nominal = np.column_stack([camera.rotation, camera.centre])
     written, _ = rows_through_mounting(camera, rays @ turn.T, nominal)
-    rng = np.random.default_rng(seed)
-    root = np.linalg.cholesky(circles.covariance[known])
-    errors = np.einsum("nij,nj->ni", root, rng.standard_normal((len(known), 2)))
-    return replace(
-        recording,
-        circles=replace(
-            circles,
-            frame=circles.frame[known],
-            xy=written + errors,
-            covariance=circles.covariance[known],
-            ids=circles.ids[known],
-        ),
-    )
+    errors = drawn(circles.covariance[known], np.random.default_rng(seed))
+    rows = replace(
+        circles, frame=circles.frame[known], xy=written + errors,
+        covariance=circles.covariance[known], ids=circles.ids[known],
+    )  # fmt: skip
+    return replace(recording, circles=rows)
 
 
 @dataclass(frozen=True)

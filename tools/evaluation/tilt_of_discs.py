@@ -13,8 +13,9 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from detect.seen import image_positions
 from detect.sources.image_files import image_name
-from redetect.landmarks import Frame, read_frames, read_tilts
+from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.slam.models.measurement import disc_in_robot
 from tools.arrays import FloatArray
 
 #: An error of the image smaller than this is not believed, pixels along u.
@@ -62,14 +63,12 @@ def tilt_of_discs(
     per_sigma = np.array([1.0, camera.scale_x / camera.scale_y]) / _LEAST_SIGMA_PX
 
     def residuals(unknowns: FloatArray) -> FloatArray:
-        x, y, heading, *tilt = unknowns
-        cosine, sine = np.cos(heading), np.sin(heading)
-        level = (map_xy - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
+        level, tilt = disc_in_robot(unknowns[:3], map_xy), unknowns[3:]
         off = image_positions(camera, level, (tilt[0], tilt[1]), raised_m) - seen
         of_discs = np.nan_to_num(off * per_sigma, nan=1000.0).ravel()
         if usual is None:
             return np.asarray(of_discs)
-        return np.concatenate([of_discs, (np.array(tilt) - usual) / _SPREAD_RAD])
+        return np.concatenate([of_discs, (tilt - usual) / _SPREAD_RAD])
 
     start = np.array([*pose, *(usual or (0.0, 0.0))])
     scale = [0.1, 0.1, 0.1, 0.01, 0.01]
@@ -102,7 +101,11 @@ def compare_tilts(
     for frame in read_frames(rows):
         name = image_name(frame.step.prefix)
         tilt, pose = by_lines.get(name), poses.get(name)
-        known = _known(frame, place)
+        known = [
+            ((row.px, row.py), place[row.ids[0]])
+            for row in frame.circles
+            if row.ids and row.ids[0] in place
+        ]
         if tilt is None or pose is None or tilt.lines < least or len(known) < least:
             continue
         rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
@@ -118,8 +121,8 @@ def compare_tilts(
     squared = []
     for tilt, disc in zip(first, shown, strict=True):
         covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]) + disc.covariance
-        off = np.array([tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad])
-        squared.append(float(off @ np.linalg.solve(covariance, off)))
+        off = tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad
+        squared.append(float(squared_mahalanobis(off, covariance)))
     return TiltComparison(
         prefixes,
         np.array([(tilt.pitch, tilt.roll) for tilt in first]).reshape(-1, 2),
@@ -156,17 +159,6 @@ def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
             f"{np.sqrt(result.squared[k]):.1f} sigma"
         )
     return lines
-
-
-def _known(
-    frame: Frame, place: dict[int, FloatArray]
-) -> list[tuple[tuple[float, float], FloatArray]]:
-    """Rows of a frame whose disc is in the map, with its place there."""
-    return [
-        ((row.px, row.py), place[row.ids[0]])
-        for row in frame.circles
-        if row.ids and row.ids[0] in place
-    ]
 
 
 @dataclass(frozen=True)

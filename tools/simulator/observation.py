@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect.landmarks import CircleLandmark, LineLandmark
+from redetect.slam.models.measurement import disc_in_robot
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from tools.simulator.driving import world_from_robot, world_to_robot
+from tools.simulator.driving import world_from_robot
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 
@@ -138,12 +139,9 @@ def see_discs(
     """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
     from tools.simulator.ray_kernels import points_visible
 
-    robot_xy = world_to_robot(pose, disc_xy)
+    robot_xy = disc_in_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
-    inside = (
-        (pixels[:, 0] >= -0.5) & (pixels[:, 0] < true.width - 0.5)
-        & (pixels[:, 1] >= -0.5) & (pixels[:, 1] < true.height - 0.5)
-    )  # fmt: skip
+    inside = _in_image(true, pixels)
     eye = camera_in_world(true, pose)[:, 3]
     spots = _sunflower(_DISC_POINTS) * radius_m
     seen: list[SeenDisc] = []
@@ -152,10 +150,7 @@ def see_discs(
         world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
         free = points_visible(scene, eye, world, _SLACK_M)
         uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
-        within = (
-            (uv[:, 0] >= -0.5) & (uv[:, 0] < true.width - 0.5)
-            & (uv[:, 1] >= -0.5) & (uv[:, 1] < true.height - 0.5)
-        )  # fmt: skip
+        within = _in_image(true, uv)
         share = float((free & within).mean())
         if share <= 0.0:
             continue
@@ -261,6 +256,11 @@ def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
         alpha=edge.bearing_rad, beta=float(np.arcsin(np.clip(normal[2], -1.0, 1.0))),
         quality=0.0, sigma=float(abs(bearing[0] - bearing[1])), ids=(edge.edge_id,),
     )  # fmt: skip
+
+
+def _in_image(camera: Camera, pixels: FloatArray) -> BoolArray:
+    size = np.array([camera.width, camera.height])
+    return np.asarray(np.all((pixels >= -0.5) & (pixels < size - 0.5), axis=-1))
 
 
 def _within_limits(nominal: Camera, pixel: FloatArray) -> bool:

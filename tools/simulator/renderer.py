@@ -186,13 +186,3 @@ def _through_lens(radiance: Float32Array, sensor: Sensor) -> FloatArray:
         scattered = cv2.resize(wide, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
         light = (1.0 - sensor.glare) * light + sensor.glare * scattered
     return np.asarray(light)
-
-
-def encode_jpeg(grey: ByteArray, quality: int) -> bytes:
-    """A grey JPEG file's bytes."""
-    import cv2
-
-    done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
-        raise ValueError(f"an image of {grey.shape} could not be encoded as JPEG")
-    return bytes(encoded)

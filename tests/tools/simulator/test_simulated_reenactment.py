@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from redetect.landmarks import CircleLandmark, Frame, read_frames, write_frames
+from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models.motion import relative_pose
 from tools.reenactment.world import World, write_world
-from tools.simulator.driving import relative_pose, step_record, with_mounting, world_to_robot
+from tools.simulator.driving import step_record, with_mounting
 from tools.simulator.reenact import (
     REENACTED_SENSOR,
     prepare,
@@ -47,7 +49,7 @@ def recorded(
     for prefix, step, pose in zip(PREFIXES, relative_pose(before, poses), poses):
         rows = tuple(
             CircleLandmark(float(x), float(y), 0.9, 0.002, 0.0, 0.003, (int(i),))
-            for i, (x, y) in zip(ids[:3], world_to_robot(pose, DISC_XY[:3]))
+            for i, (x, y) in zip(ids[:3], disc_in_robot(pose, DISC_XY[:3]))
         )
         frames.append(Frame(step_record(prefix, step), rows))
     write_frames(folder / "map.circles", frames)
@@ -72,7 +74,7 @@ def test_discs_are_rendered_through_the_true_camera(recorded: tuple[Path, Path, 
         frame = reenacted_frame(run, index, REENACTED_SENSOR)
         assert {d.disc_id for d in frame.discs} == {11, 12, 13}
         for disc in frame.discs:
-            robot_xy = world_to_robot(run.world.poses[index], DISC_XY[disc.disc_id - 11])
+            robot_xy = disc_in_robot(run.world.poses[index], DISC_XY[disc.disc_id - 11])
             # Mounting and tilt written out: the tilt turns the camera about its own centre.
             p, q = run.world.tilt[index]
             turn = cv2.Rodrigues(np.array([p, q, 0.0]))[0]
@@ -94,7 +96,7 @@ def test_discs_that_nobody_reported_are_not_shown(recorded: tuple[Path, Path, Pa
     there = replace(run, world=run.world._replace(poses=looking))
     frame = reenacted_frame(there, 0, REENACTED_SENSOR)
     assert frame.discs == ()
-    pixel = true_camera(there, 0).project_floor(world_to_robot(looking[0], DISC_XY[3]))
+    pixel = true_camera(there, 0).project_floor(disc_in_robot(looking[0], DISC_XY[3]))
     u, v = np.rint(pixel).astype(int)
     window = frame.grey[v - 12 : v + 13, u - 30 : u + 31]
     assert float(window.max()) - float(np.median(window)) < 40.0

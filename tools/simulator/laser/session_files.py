@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from redetect.groundtruth.files import read_json, write_json
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners, write_scanners
 from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
+from redetect.groundtruth.trajectories.plane import apply
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
@@ -21,8 +20,9 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.fiducials import Distance, Survey, read_survey
 from redetect.landmarks import wrap_angle
-from redetect.storage import write_whole
 from tools.arrays import BoolArray, FloatArray
+from tools.evaluation.tables import picture
+from tools.simulator.files import write_bytes
 from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
@@ -154,36 +154,27 @@ _PTPD_SIGMA_S = 20e-6
 
 
 def write_session(
-    settings: LaserSettings,
-    folder: Path,
-    *,
-    seed: int,
-    overwrite: bool = False,
-    on_file: Callable[[], None] | None = None,
+    settings: LaserSettings, folder: Path, *, seed: int, overwrite: bool = False
 ) -> SessionPlan:
     """Simulate a session and write its folder."""
     plan = plan_session(settings, seed)
     (folder / "empty").mkdir(parents=True, exist_ok=True)
     _write_site(plan, folder, overwrite)
-    for scanner, moved in zip(plan.scanners, plan.moved):
-        for place, run in ((folder / "empty", _empty_scans), (folder, _fixed_scans)):
-            scans = run(plan, scanner if place != folder else moved)
+    for place, run, scanners in (
+        (folder / "empty", _empty_scans, plan.scanners),
+        (folder, _fixed_scans, plan.moved),
+        (folder, _onboard_scans, plan.robot.scanners),
+    ):
+        for scanner in scanners:
+            scans = run(plan, scanner)
             write_scans(place / f"{scanner.name}.scans.npz", scans, overwrite=overwrite)
-            if on_file is not None:
-                on_file()
-    for scanner in plan.robot.scanners:
-        scans = _onboard_scans(plan, scanner)
-        write_scans(folder / f"{scanner.name}.scans.npz", scans, overwrite=overwrite)
-        if on_file is not None:
-            on_file()
     write_planar_poses(folder / "odometry.csv", odometry_stream(plan), overwrite=overwrite)
     write_planar_poses(folder / "camera.csv", camera_stream(plan), overwrite=overwrite)
     write_survey(folder / "fiducials.json", survey_of(plan), {"note": NOTE}, overwrite=overwrite)
     write_distances(folder / "distances.csv", measured_distances(plan), overwrite=overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
-    with write_whole(folder / "ptpd.log", overwrite=overwrite) as stream:
-        stream.write(("\n".join(lines) + "\n").encode())
+    write_bytes(folder / "ptpd.log", ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
     _write_truth(plan, folder, overwrite)
     return plan
 
@@ -316,48 +307,39 @@ _COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple")
 def draw_session(
     folder: Path, path: Path, *, at_s: float | None = None, overwrite: bool = False
 ) -> None:
-    """Draw a session from its files."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
+    """Draw a session from its files: map, way, scanners, and what they saw at a time."""
 
-    truth, camera = (read_planar_poses(folder / f"{n}.csv") for n in ("truth", "camera"))
-    at_s = float(camera.times_s[len(camera) // 2]) if at_s is None else at_s
-    robot_pose = truth.poses[np.argmin(np.abs(truth.times_s - at_s))]
-    robot = read_robot(folder / "robot.json")
-    figure = Figure(figsize=(12.0, 10.0), layout="tight")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(aspect="equal")
-    walls = read_building(folder / "building.csv").reshape(-1, 2, 2)
-    axes.add_collection(LineCollection(list(walls), colors="black", linewidths=1.2))
-    axes.plot(*truth.poses[:, :2].T, color="0.6", linewidth=0.8, label="way")
-    axes.plot(*camera.poses[:, :2].T, ".", color="tab:red", markersize=2, label="marker poses")
-    stands = read_planar_poses(folder / "reference.csv") if _has_rows(folder) else None
-    if stands is not None:
-        axes.plot(*stands.poses[:, :2].T, "k+", markersize=9, label="reference poses")
-    survey = read_survey(folder / "fiducials.json")
-    axes.plot(*np.stack(list(survey.fiducials.values())).T, "k*", label="fiducials")
-    scanners = read_scanners(folder / "scanners.truth.json")
-    for scanner, colour in zip(scanners, _COLOURS):
-        points = _points_at(folder, scanner, scanner.pose, at_s)
-        axes.plot(*points.T, ".", color=colour, markersize=3, label=scanner.name)
-        axes.plot(*_arrow(scanner.pose), color=colour, linewidth=2.5)
-    for scanner, colour in zip(robot.scanners, ("0.3", "tab:cyan")):
-        pose = compose(robot_pose[None], scanner.pose[None])[0]
-        points = _points_at(folder, scanner, pose, _robot_time(folder, at_s))
-        axes.plot(*points.T, "x", color=colour, markersize=3, label=f"{scanner.name} (on board)")
-    outline = np.vstack([robot.outline, robot.outline[:1]])
-    body = compose(
-        np.tile(robot_pose, (len(outline), 1)), np.column_stack([outline, 0 * outline[:, :1]])
-    )
-    axes.plot(*body[:, :2].T, color="tab:red", linewidth=1.5)
-    axes.autoscale_view()
-    axes.set(xlabel="x / m", ylabel="y / m", title=f"t = {at_s:.2f} s")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(buffer.getvalue())
+    def draw(figure: Any) -> None:
+        axes = figure.add_subplot(aspect="equal")
+        truth, camera = (read_planar_poses(folder / f"{n}.csv") for n in ("truth", "camera"))
+        time_s = float(camera.times_s[len(camera) // 2]) if at_s is None else at_s
+        walls = read_building(folder / "building.csv")
+        axes.plot(walls[:, ::2].T, walls[:, 1::2].T, color="black", linewidth=1.2)
+        axes.plot(*truth.poses[:, :2].T, color="0.6", linewidth=0.8, label="way")
+        axes.plot(*camera.poses[:, :2].T, ".", color="tab:red", markersize=2, label="marker poses")
+        if (folder / "reference.csv").stat().st_size > 0:
+            stands = read_planar_poses(folder / "reference.csv").poses
+            axes.plot(*stands[:, :2].T, "k+", markersize=9, label="reference poses")
+        fiducials = read_survey(folder / "fiducials.json").fiducials
+        axes.plot(*np.stack(list(fiducials.values())).T, "k*", label="fiducials")
+        for scanner, colour in zip(read_scanners(folder / "scanners.truth.json"), _COLOURS):
+            points = _points_at(folder, scanner, scanner.pose, time_s)
+            axes.plot(*points.T, ".", color=colour, markersize=3, label=scanner.name)
+            middle_beam = apply(scanner.pose, [[0.0, 0.0], [0.5, 0.0]])
+            axes.plot(*middle_beam.T, color=colour, linewidth=2.5)
+        robot = read_robot(folder / "robot.json")
+        pose = truth.poses[np.argmin(np.abs(truth.times_s - time_s))]
+        for scanner, colour in zip(robot.scanners, ("0.3", "tab:cyan")):
+            mounted = compose(pose[None], scanner.pose[None])[0]
+            points = _points_at(folder, scanner, mounted, _robot_time(folder, time_s))
+            label = f"{scanner.name} (on board)"
+            axes.plot(*points.T, "x", color=colour, markersize=3, label=label)
+        outline = np.vstack([robot.outline, robot.outline[:1]])
+        axes.plot(*apply(pose, outline).T, color="tab:red", linewidth=1.5)
+        axes.set(xlabel="x / m", ylabel="y / m", title=f"t = {time_s:.2f} s")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+
+    write_bytes(path, picture((12.0, 10.0), draw, dpi=100), overwrite=overwrite)
 
 
 def _robot_time(folder: Path, at_s: float) -> float:
@@ -369,20 +351,8 @@ def _robot_time(folder: Path, at_s: float) -> float:
     return time
 
 
-def _has_rows(folder: Path) -> bool:
-    return (folder / "reference.csv").stat().st_size > 0
-
-
-def _arrow(pose: FloatArray) -> FloatArray:
-    """(2, 2) ends of a short line from a scanner along its middle beam."""
-    tip = pose[:2] + 0.5 * np.array([np.cos(pose[2]), np.sin(pose[2])])
-    return np.stack([pose[:2], tip]).T
-
-
 def _points_at(folder: Path, scanner: Scanner, pose: FloatArray, at_s: float) -> FloatArray:
     """(M, 2) points in the world of the scan nearest in time."""
     scans = read_scans(find_scans(folder, scanner.name), scanner.readings)
     points = scanner.points(scans.ranges_mm[np.argmin(np.abs(scans.times_s - at_s))])
-    points = points[np.isfinite(points[:, 0])]
-    local = np.column_stack([points, np.zeros(len(points))])
-    return compose(np.tile(pose, (len(points), 1)), local)[:, :2]
+    return apply(pose, points[np.isfinite(points[:, 0])])

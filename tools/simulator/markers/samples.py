@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -13,8 +12,8 @@ import numpy as np
 
 from camera import Camera, format_camera, write_camera
 from detect.markers.dictionaries import marker_dictionary
-from redetect.storage import write_whole
 from tools.arrays import ByteArray, Float32Array, FloatArray
+from tools.simulator.files import encoded, write_bytes, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
 from tools.simulator.markers.rendering import (
     SAMPLES,
@@ -345,8 +344,6 @@ def _imaging(settings: SampleSettings, rng: np.random.Generator) -> Imaging:
 
 def _background(settings: SampleSettings, camera: Camera, rng: np.random.Generator) -> Float32Array:
     files = () if settings.photographs is None else photograph_files(settings.photographs)
-    if settings.photographs is not None and not files:
-        raise ValueError(f"{settings.photographs}: holds no photographs (.jpg, .png)")
     if files and rng.random() < 0.5:
         return photograph_background(rng, camera.width, camera.height, files)
     return shapes_background(rng, camera.width, camera.height)
@@ -417,48 +414,32 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float
 
 
 def write_samples(
-    settings: SampleSettings,
-    folder: Path,
-    *,
-    count: int,
-    seed: int,
-    jobs: int = 1,
+    settings: SampleSettings, folder: Path, *, count: int, seed: int, jobs: int = 1,
     overwrite: bool = False,
-    on_frame: Callable[[], None] | None = None,
-) -> int:
+) -> int:  # fmt: skip
     """Render random frames and write them as PNG files, with their calibrations and truth."""
-    import cv2
-
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras = sample_cameras(settings.width, settings.height)
     for number, camera in enumerate(cameras):
         write_camera(camera, folder / f"camera{number}.cam", overwrite=overwrite)
     names = {format_camera(camera): f"camera{k}.cam" for k, camera in enumerate(cameras)}
-    rows, markers = [], 0
+    rows: list[dict[str, Any]] = []
     for frame in sample_frames(settings, seed, range(count), jobs):
         prefix = f"s{seed}.{frame.index:05d}"
-        done, encoded = cv2.imencode(".png", frame.image)
-        if not done:
-            raise ValueError(f"{prefix}: could not be encoded")
-        with write_whole(folder / "images" / f"{prefix}.png", overwrite=overwrite) as stream:
-            stream.write(bytes(encoded))
-        row: dict[str, Any] = {"image": prefix, "camera": names[format_camera(frame.camera)]}
-        rows.append(json.dumps({**row, **frame.as_json()}, separators=(",", ":")))
-        markers += len(frame.markers)
-        if on_frame is not None:
-            on_frame()
-    head = json.dumps({"settings": {**asdict(settings), "photographs": None}}, indent=1)
-    text = head[:-2] + ',\n "frames": [\n' + ",\n".join(rows) + "\n ]\n}\n"
-    with write_whole(folder / "truth.json", overwrite=overwrite) as stream:
-        stream.write(text.encode())
-    return markers
+        png = encoded(frame.image, ".png")
+        write_bytes(folder / "images" / f"{prefix}.png", png, overwrite=overwrite)
+        row = {"image": prefix, "camera": names[format_camera(frame.camera)]}
+        rows.append({**row, **frame.as_json()})
+    head = {"settings": {**asdict(settings), "photographs": None}}
+    write_truth(folder / "truth.json", head, {"frames": rows}, overwrite=overwrite)
+    return sum(len(row["markers"]) for row in rows)
 
 
 def sample_frames(
-    settings: SampleSettings, seed: int, indices: Iterable[int], jobs: int = 1
+    settings: SampleSettings, seed: int, indices: Sequence[int], jobs: int = 1
 ) -> Iterator[SampleFrame]:
     """Frames of a seed in order, rendered by one or more processes; the same either way."""
-    yield from in_order(_sample, (settings, seed), indices, jobs)
+    return in_order(_sample, (settings, seed), indices, jobs)
 
 
 def _sample(state: tuple[SampleSettings, int], index: int) -> SampleFrame:

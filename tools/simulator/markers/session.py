@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +15,8 @@ from camera import Camera, format_camera, write_camera
 from redetect.groundtruth.markers.calibration import Network, Rig, write_network, write_rig
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse, planar_transform
-from redetect.storage import write_whole
 from tools.arrays import ByteArray, Float32Array, FloatArray
+from tools.simulator.files import encoded, rounded, write_bytes, write_truth
 from tools.simulator.markers.rendering import (
     Imaging,
     grey_image,
@@ -409,11 +408,6 @@ class SessionWriter:
     quality: int = 92  # Of the jpg files.
     overwrite: bool = False  # Whether existing files may be replaced.
 
-    def text(self, path: Path, content: str) -> None:
-        """Write a text file."""
-        with write_whole(path, overwrite=self.overwrite) as stream:
-            stream.write(content.encode())
-
     def calibrations(self, plan: SessionPlan, folder: Path) -> None:
         """Write ``network.json``, ``rig.json`` and a ``.cam`` per camera; make the folders."""
         seed = plan.settings.seed
@@ -429,13 +423,8 @@ class SessionWriter:
     def image(self, folder: Path, camera: str, prefix: str, image: ByteArray) -> str:
         """Write a camera's image; returns its place in the session's folder."""
         place = f"{camera}/images/{prefix}.{self.image_format}"
-        jpg = self.image_format == "jpg"
-        options = [cv2.IMWRITE_JPEG_QUALITY, self.quality] if jpg else []
-        done, encoded = cv2.imencode(f".{self.image_format}", image, options)
-        if not done:
-            raise ValueError(f"{place}: an image of {image.shape} could not be encoded")
-        with write_whole(folder / place, overwrite=self.overwrite) as stream:
-            stream.write(bytes(encoded))
+        content = encoded(image, f".{self.image_format}", self.quality)
+        write_bytes(folder / place, content, overwrite=self.overwrite)
         return place
 
     def times(self, folder: Path, plan: SessionPlan, seen: Sequence[SeenFrame]) -> None:
@@ -443,7 +432,8 @@ class SessionWriter:
         for name in plan.network.names:
             own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
             rows = [f"# {NOTE}", "# image seconds", *(f"{s.prefix} {s.time_s:.6f}" for s in own)]
-            self.text(folder / name / f"{name}.times", "\n".join(rows) + "\n")
+            text = "\n".join([*rows, ""]).encode()
+            write_bytes(folder / name / f"{name}.times", text, overwrite=self.overwrite)
 
     def poses(self, path: Path, times_s: FloatArray, poses: FloatArray) -> None:
         """Write rows t, x, y, theta as RAWSEEDS' streams have them."""
@@ -473,24 +463,16 @@ class SessionWriter:
             },
             **(extra or {}),
         }
-        frames = ",\n".join(
-            json.dumps(
-                {"camera": s.camera, "image": s.prefix, "t": s.time_s,
-                 "markers": [_marker_json(m) for m in s.markers]},
-                separators=(",", ":"),
-            )
+        frames = [
+            {"camera": s.camera, "image": s.prefix, "t": s.time_s,
+             "markers": [_marker_json(m) for m in s.markers]}
             for s in seen
-        )  # fmt: skip
-        self.text(path, json.dumps(head, indent=1)[:-2] + f',\n "frames": [\n{frames}\n ]\n}}\n')
+        ]  # fmt: skip
+        write_truth(path, head, {"frames": frames}, overwrite=self.overwrite)
 
 
 def write_session(
-    settings: SessionSettings,
-    folder: Path,
-    writer: SessionWriter | None = None,
-    *,
-    jobs: int = 1,
-    on_frame: Callable[[], None] | None = None,
+    settings: SessionSettings, folder: Path, writer: SessionWriter | None = None, jobs: int = 1
 ) -> int:
     """Render a session and write its folder."""
     plan, writer = plan_session(settings), writer or SessionWriter()
@@ -502,8 +484,6 @@ def write_session(
         prefix = plan.prefix(frame)
         writer.image(folder, names[camera], prefix, view.image)
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))
-        if on_frame is not None:
-            on_frame()
     writer.times(folder, plan, seen)
     writer.poses(folder / "truth.csv", plan.times_s, plan.poses)
     still = slice(0, plan.references)
@@ -518,7 +498,7 @@ def _view(plan: SessionPlan, work: tuple[int, int]) -> View:
 
 def _rows_of(pose: FloatArray) -> list[list[float]]:
     """A (4, 4) transform's first three rows as plain numbers."""
-    return [[round(float(x), 12) for x in row] for row in pose[:3]]
+    return [rounded(row, 12) for row in pose[:3]]
 
 
 def _marker_json(marker: MarkerTruth) -> dict[str, Any]:

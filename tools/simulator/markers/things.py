@@ -266,7 +266,10 @@ def _fill(image: ByteArray, corners: FloatArray, shade: int) -> None:
 
 def photograph_files(folder: Path) -> tuple[Path, ...]:
     """The photographs below a folder, in an order that does not depend on the file system."""
-    return tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in _PHOTOGRAPHS))
+    files = tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in _PHOTOGRAPHS))
+    if not files:
+        raise ValueError(f"{folder}: holds no photographs (.jpg, .png)")
+    return files
 
 
 def photograph_background(
