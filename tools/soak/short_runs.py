@@ -8,13 +8,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
-from tools.soak.long_run import SoakError, link_run
+from detect.sources.opening import open_run
+from tools.benchmark.material import repeated_run
+from tools.soak.long_run import SoakError
 from tools.soak.processes import marked
 
 _FRAMES = 8
@@ -63,7 +64,7 @@ def repeat_short_runs(
     source: Path, folder: Path, runs: int, jobs: int, *, warm: bool = False
 ) -> ShortRuns:
     """Carry out `detect all` on a few frames again and again."""
-    run = link_run(source, folder / "short", _FRAMES)
+    run = repeated_run(open_run(source), folder / "short", _FRAMES)
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
         path.mkdir()
@@ -73,7 +74,7 @@ def repeat_short_runs(
     first: dict[str, bytes] = {}
     cached = different = 0
     shared = _shared()
-    with _environment(added):
+    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
         if warm:
             _command([*arguments, "1"])  # loads all that is needed
         for number in range(runs):
@@ -94,13 +95,6 @@ def repeat_short_runs(
         caches=len(_names(caches)) - cached,
         different=different,
     )
-
-
-@contextmanager
-def _environment(added: dict[str, str]) -> Iterator[None]:
-    """Variables of the environment for the time of a block."""
-    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
-        yield
 
 
 def _started(arguments: list[str]) -> None:
