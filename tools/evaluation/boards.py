@@ -12,6 +12,8 @@ from camera.calibration.model import cross_matrices, project_points, rotation_of
 from camera.calibration.projection import intrinsics_of, pixel_grid
 from tools.arrays import ByteArray, FloatArray, IntArray
 
+#: Standard deviations of a board's turns about its axes.
+_TILTS_RAD = np.array([0.45, 0.45, 0.3])
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
 # Dots of a ChArUco board's print per square.
 _DOTS = 120
@@ -108,7 +110,6 @@ def board_poses(
     seed: int,
     *,
     distances_m: tuple[float, float],
-    tilt_rad: float = 0.45,
     margin_px: float = 8.0,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Poses `camera_from_board` in which all of a board is seen, spread over the image.
@@ -133,7 +134,7 @@ def board_poses(
             * np.array([-direction[1], direction[0], 0.0])
             / max(np.hypot(*direction[:2]), 1e-12)
         )
-        tilt = rotation_of(rng.normal(size=3) * np.array([tilt_rad, tilt_rad, 0.3]))
+        tilt = rotation_of(rng.normal(size=3) * _TILTS_RAD)
         rotation = towards @ tilt @ facing
         translation = distance * direction
         if rotation[:, 2] @ translation >= 0.0:
@@ -156,14 +157,12 @@ def _corner_distance(pixels: FloatArray, size: IntArray) -> float:
     return float(away.min())
 
 
-def projection_difference(
-    camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
-) -> FloatArray:
-    """How far apart two cameras project the same directions, (rows, columns) pixels.
+def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True) -> FloatArray:
+    """How far apart two cameras project the same directions, (37, 49) pixels over the image.
 
     NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
     """
-    pixels = pixel_grid(camera.width, camera.height, columns, rows)
+    pixels = pixel_grid(camera.width, camera.height, 49, 37)
     rays = camera.unproject(pixels)
     rotation = np.eye(3)
     intrinsics = intrinsics_of(other)
@@ -178,4 +177,4 @@ def projection_difference(
         if np.abs(step).max() < 1e-12:
             break
     found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
-    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(rows, columns))
+    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(37, 49))

@@ -163,9 +163,9 @@ class Consistency:
         return float(np.mean(self.mean))
 
 
-def band(runs: int, numbers: int = POSE_NUMBERS, probability: float = 0.95) -> tuple[float, float]:
-    """Where the mean of `runs` normalised errors squared of `numbers` numbers lies."""
-    low, high = chi2.interval(probability, runs * numbers)
+def band(runs: int) -> tuple[float, float]:
+    """Where 95 % of the means of `runs` normalised errors squared of poses lie."""
+    low, high = chi2.interval(0.95, POSE_NUMBERS * runs)
     return float(low) / runs, float(high) / runs
 
 

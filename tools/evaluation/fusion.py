@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -60,9 +60,7 @@ class FusionStudy:
     ones, and the NEES at one instant of each session.
     """
 
-    seeds: int = 20  # Seeds first, first + 1, ...
-    first: int = 1
-    folder: Path | None = None  # Where sessions are kept; by default they are thrown away.
+    seeds: int = 20  # Sessions, of the seeds from 1 on.
     fault: Fault = "none"
     """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
     a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
@@ -70,11 +68,13 @@ class FusionStudy:
     visits: int = 3
 
     def __call__(self) -> int:
-        def measured(folder: Path, seed: int) -> dict[str, float]:
-            return one_session(folder / f"{self.fault}{self.visits}-{seed}", seed, self)
+        settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
 
-        seeds = range(self.first, self.first + self.seeds)
-        table, rows = table_of_sessions(_COLUMNS, self.folder, seeds, measured)
+        def measured(session: Path, seed: int) -> dict[str, float]:
+            write_session(settings, session, seed=seed)
+            return errors_of_session(session)
+
+        table, rows = table_of_sessions(_COLUMNS, self.seeds, measured)
         table.row("mean", *np.nanmean(rows, axis=0))
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
@@ -82,11 +82,8 @@ class FusionStudy:
         return 0
 
 
-def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float]:
+def errors_of_session(session: Path) -> dict[str, float]:
     """Run the commands on one session and measure their results."""
-    if not (session / "truth.json").exists():
-        settings = replace(LaserSettings(), visits=study.visits, faults=_FAULTS[study.fault])
-        write_session(settings, session, seed=seed)
     at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
     clock = session / "clock.json"
     run_groundtruth("lasers", session)
@@ -151,6 +148,9 @@ def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, floa
 Odometry = Callable[[FloatArray, np.random.Generator], FloatArray]
 
 _ODOMETRY_HZ = 50.0
+#: How long poses are measured before and after a gap, how often, and their errors (m, m, rad).
+_SEEN_S, _SEEN_HZ = 40.0, 25.0
+_SEEN_SIGMAS = np.array([0.001, 0.001, np.radians(0.2)])
 _TRACK_M = 0.4
 _WHEEL_SIGMA_M = 0.0015
 _WHEEL_SCALES = (1.006, 1.009)
@@ -168,10 +168,6 @@ class GapStudy:
 
     seeds: int = 60  # Drives of each kind.
     gaps_s: tuple[float, ...] = (2.0, 10.0, 30.0, 120.0)  # How long nothing is measured.
-    seen_s: float = 40.0  # How long poses are measured before and after.
-    rate_hz: float = 25.0  # Of the measured poses.
-    sigma_m: float = 0.001  # Of the measured poses.
-    sigma_deg: float = 0.2
     learn_noise: bool = True  # Let the fusion find how much odometry errs.
 
     def __call__(self) -> int:
@@ -186,7 +182,10 @@ class GapStudy:
         for name, odometry in _ODOMETRIES.items():
             for path in ("straight", "curved"):
                 for gap_s in self.gaps_s:
-                    rows = [one_drive(self, odometry, path, gap_s, s) for s in range(self.seeds)]
+                    settings = FuseSettings(learn_noise=self.learn_noise)
+                    rows = [
+                        one_drive(settings, odometry, path, gap_s, s) for s in range(self.seeds)
+                    ]
                     means.append(np.mean(rows, axis=0))
                     table.row(name, path, gap_s, *means[-1])
         table.row("all", "", np.nan, *np.mean(means, axis=0))
@@ -194,26 +193,21 @@ class GapStudy:
 
 
 def one_drive(
-    study: GapStudy, odometry: Odometry, path: str, gap_s: float, seed: int
+    settings: FuseSettings, odometry: Odometry, path: str, gap_s: float, seed: int
 ) -> list[float]:
     """Error in the middle (mm); NEES there, by direction, near the end, in the gap, outside."""
     rng = np.random.default_rng([seed, int(10 * gap_s), path == "curved"])
-    route = _route(rng, path, 2.0 * study.seen_s + gap_s)
-    times = np.arange(0.0, 2.0 * study.seen_s + gap_s, 1.0 / _ODOMETRY_HZ)
+    begin, end = _SEEN_S, _SEEN_S + gap_s
+    route = _route(rng, path, end + _SEEN_S)
+    times = np.arange(0.0, end + _SEEN_S, 1.0 / _ODOMETRY_HZ)
     own = odometry(route.poses(times), rng)
-    begin, end = study.seen_s, study.seen_s + gap_s
-    seen = np.arange(0.003, times[-1], 1.0 / study.rate_hz)
+    seen = np.arange(0.003, times[-1], 1.0 / _SEEN_HZ)
     seen = seen[(seen < begin) | (seen > end)]
-    sigmas = np.array([study.sigma_m, study.sigma_m, np.radians(study.sigma_deg)])
-    measured = route.poses(seen) + rng.normal(size=(len(seen), 3)) * sigmas
+    measured = route.poses(seen) + rng.normal(size=(len(seen), 3)) * _SEEN_SIGMAS
     measured[:, 2] = wrap_angle(measured[:, 2])
-    covariances = np.broadcast_to(np.diag(sigmas**2), (len(seen), 3, 3)).copy()
-    fusion = fuse(
-        PlanarPoses(times, own),
-        {"laser": PlanarPoses(seen, measured, covariances)},
-        FuseSettings(learn_noise=study.learn_noise),
-    )
-    return _figures(fusion, route, begin, end)
+    covariances = np.tile(np.diag(_SEEN_SIGMAS**2), (len(seen), 1, 1))
+    laser = PlanarPoses(seen, measured, covariances)
+    return _figures(fuse(PlanarPoses(times, own), {"laser": laser}, settings), route, begin, end)
 
 
 def _figures(fusion: Fusion, route: Route, begin: float, end: float) -> list[float]:
@@ -288,34 +282,28 @@ class FusionSpeed:
     """Fuse a made-up session and print the times."""
 
     hours: float = 1.0
-    odometry_hz: float = 50.0
-    laser_hz: float = 75.0
-    rounds: int = 4  # The least of so many times counts; the first compiles.
-    seed: int = 1
 
     def __call__(self) -> int:
-        rng = np.random.default_rng(self.seed)
-        times = np.arange(0.0, 3600.0 * self.hours, 1.0 / self.odometry_hz)
-        heading = np.cumsum(0.3 * np.sin(0.2 * times)) / self.odometry_hz
-        step = 0.5 / self.odometry_hz
+        rng = np.random.default_rng(1)
+        times = np.arange(0.0, 3600.0 * self.hours, 1.0 / _ODOMETRY_HZ)
+        heading = np.cumsum(0.3 * np.sin(0.2 * times)) / _ODOMETRY_HZ
+        step = 0.5 / _ODOMETRY_HZ
         path = np.column_stack(
             [np.cumsum(np.cos(heading)) * step, np.cumsum(np.sin(heading)) * step, heading]
         )
-        seen = np.arange(0.0, times[-1] - 1.0, 1.0 / self.laser_hz)
+        seen = np.arange(0.0, times[-1] - 1.0, 1.0 / 75.0)
         exact = np.column_stack([np.interp(seen, times, path[:, k]) for k in range(3)])
-        laser = PlanarPoses(
-            seen,
-            exact + rng.normal(0.0, 0.01, exact.shape),
-            np.broadcast_to(1e-4 * np.eye(3), (len(seen), 3, 3)).copy(),
-        )
+        noisy = exact + rng.normal(0.0, 0.01, exact.shape)
+        laser = PlanarPoses(seen, noisy, np.tile(1e-4 * np.eye(3), (len(seen), 1, 1)))
         spent = []
-        for _ in range(self.rounds):
+        for _ in range(4):
             begun = time.process_time()
             fusion = fuse(PlanarPoses(times, path), {"laser": laser})
             spent.append(time.process_time() - begun)
         print(
             f"{self.hours:g} h: {len(times)} steps of odometry, {len(laser)} poses of the laser, "
-            f"{len(fusion.poses)} poses fused: {min(spent[1:] or spent):.2f} s of the processor "
-            f"(median {np.median(spent[1:] or spent):.2f} s)"
+            # The first compiles.
+            f"{len(fusion.poses)} poses fused: {min(spent[1:]):.2f} s of the processor "
+            f"(median {np.median(spent[1:]):.2f} s)"
         )
         return 0

@@ -8,7 +8,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,23 +62,22 @@ def run_groundtruth(*arguments: object) -> None:
 
 
 def table_of_sessions(
-    columns: Mapping[str, str], folder: Path | None, seeds: Iterable[int],
-    measure: Callable[[Path, int], dict[str, float]],
-) -> tuple[Table, FloatArray]:  # fmt: skip
-    """Measure a session for each seed and print a row of it.
+    columns: Mapping[str, str], seeds: int, measure: Callable[[Path, int], dict[str, float]]
+) -> tuple[Table, FloatArray]:
+    """Measure a session, in a folder of its own, for each seed from 1 on, and print a row of it.
 
-    The sessions are kept in the folder, if there is one. Returns the rows (N, columns), too.
+    Returns the rows (N, columns), too.
     """
     table, rows = Table({"seed": "<5", **columns}), []
-    with tempfile.TemporaryDirectory() as temporary:
-        for seed in seeds:
-            try:
-                row = measure(folder or Path(temporary), seed)
-            except GroundTruthError as error:
-                print(f"{seed:4d} left out: {error}")
-                continue
-            rows.append([row[key] for key in columns])
-            table.row(str(seed), *rows[-1])
+    for seed in range(1, seeds + 1):
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                row = measure(Path(folder), seed)
+        except GroundTruthError as error:
+            print(f"{seed:4d} left out: {error}")
+            continue
+        rows.append([row[key] for key in columns])
+        table.row(str(seed), *rows[-1])
     return table, np.array(rows)
 
 
@@ -86,9 +85,7 @@ def table_of_sessions(
 class LaserSessions:
     """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
 
-    seeds: int = 20  # Seeds first, first + 1, ...
-    first: int = 1
-    folder: Path | None = None  # Where sessions are kept; by default they are thrown away.
+    seeds: int = 20  # Sessions, of the seeds from 1 on.
     scanners: Literal["aligned", "true"] = "aligned"
     """`aligned`: by `groundtruth lasers` from poses measured by hand; `true`: the exact ones."""
     fault: Literal["none", "crossing", "moved", "rectangle"] = "none"
@@ -99,16 +96,24 @@ class LaserSessions:
     average: int = 6  # Sets of scans per pose.
 
     def __call__(self) -> int:
-        seeds = range(self.first, self.first + self.seeds)
-        table, rows = table_of_sessions(_COLUMNS, self.folder, seeds, self._measured)
+        table, rows = table_of_sessions(_COLUMNS, self.seeds, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
         return 0
 
-    def _measured(self, folder: Path, seed: int) -> dict[str, float]:
+    def _measured(self, session: Path, seed: int) -> dict[str, float]:
         """Errors of one session."""
-        session = self._session(folder, seed)
+        faults = Faults(crossing=self.fault == "crossing")
+        if self.fault == "moved":
+            faults = Faults(moved_scanner="fixed2", by=(0.04, -0.03, 0.01))
+        settings = LaserSettings(
+            visits=self.visits, visit_s=self.visit_s, between_s=45.0, references=3 * self.visits,
+            onboard_hz=5.0, faults=faults,
+        )  # fmt: skip
+        if self.fault == "rectangle":
+            settings = replace(settings, front_cut_m=0.0)
+        write_session(settings, session, seed=seed)
         exact, aligned = session / "scanners.truth.json", session / "aligned.json"
         if self.scanners == "aligned":
             run_groundtruth("lasers", session, "-o", aligned)
@@ -133,22 +138,6 @@ class LaserSessions:
             "set_ms": 1e3 * elapsed / len(sets),
             "speed": float(sets.times_s[-1] - sets.times_s[0]) / elapsed,
         }
-
-    def _session(self, folder: Path, seed: int) -> Path:
-        session = folder / f"{self.fault}{seed}"
-        if (session / "truth.json").is_file():
-            return session
-        faults = Faults(crossing=self.fault == "crossing")
-        if self.fault == "moved":
-            faults = Faults(moved_scanner="fixed2", by=(0.04, -0.03, 0.01))
-        settings = LaserSettings(
-            visits=self.visits, visit_s=self.visit_s, between_s=45.0, references=3 * self.visits,
-            onboard_hz=5.0, faults=faults,
-        )  # fmt: skip
-        if self.fault == "rectangle":
-            settings = replace(settings, front_cut_m=0.0)
-        write_session(settings, session, seed=seed, overwrite=True)
-        return session
 
 
 def errors_in_room(session: Path, track: LaserTrack, sets_per_pose: int) -> dict[str, float]:

@@ -24,6 +24,8 @@ _LEAST_SIGMA_PX = 0.3
 #: tell no tilt, and one mistaken identifier among five would tell any (rad).
 _SPREAD_RAD = np.radians(0.5)
 _UNKNOWNS = 5
+#: Lines and discs that a frame needs, and how many of the frames that differ most are listed.
+_LEAST, _WORST = 5, 10
 #: A frame whose two tilts differ by more than this many standard deviations is listed.
 _FAR_SIGMAS = 4.0
 
@@ -87,9 +89,7 @@ def compare_tilts(
     tilts: Path,
     map_path: Path,
     path_path: Path,
-    *,
     raised_m: float = 0.0,
-    least: int = 5,
 ) -> TiltComparison:
     """Hold the tilts of a `.tilt` file against those of the discs of a map."""
     discs = read_map(map_path).discs
@@ -106,7 +106,7 @@ def compare_tilts(
             for row in frame.circles
             if row.ids and row.ids[0] in place
         ]
-        if tilt is None or pose is None or tilt.lines < least or len(known) < least:
+        if tilt is None or pose is None or tilt.lines < _LEAST or len(known) < _LEAST:
             continue
         rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
         prefixes.append(name)
@@ -131,7 +131,7 @@ def compare_tilts(
     )
 
 
-def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
+def report_of(result: TiltComparison) -> list[str]:
     """The comparison in lines: medians, means, spread, and the frames that differ most."""
     off = np.degrees(result.by_lines - result.by_discs)
     lines = [f"{len(off)} frames; pitch and roll in degrees, verticals and discs of the map"]
@@ -153,7 +153,7 @@ def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
         f"median {np.median(result.squared) / (2.0 * np.log(2.0)):.2f} of the expected; "
         f"{far.sum()} frames beyond {_FAR_SIGMAS:g} sigma"
     )
-    for k in np.argsort(-result.squared)[:worst]:
+    for k in np.argsort(-result.squared)[:_WORST]:
         lines.append(
             f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, "
             f"{np.sqrt(result.squared[k]):.1f} sigma"
@@ -175,8 +175,6 @@ class TiltOfDiscs:
 
     def __call__(self) -> int:
         camera = read_camera(self.camera)
-        compared = compare_tilts(
-            camera, self.rows, self.tilts, self.map, self.path, raised_m=self.raised_m
-        )
-        print("\n".join(report_of(compared)))
+        files = self.rows, self.tilts, self.map, self.path
+        print("\n".join(report_of(compare_tilts(camera, *files, self.raised_m))))
         return 0

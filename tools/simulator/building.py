@@ -96,8 +96,8 @@ def plan_rooms(rng: np.random.Generator) -> list[Room]:
         """Split a row of rooms along the corridor on which their doors are."""
         along_x = wall in ("south", "north")
         for a, b in pairwise(_split(*(x if along_x else y), rng)):
-            place = (a, y[0], b, y[1]) if along_x else (x[0], a, x[1], b)
-            rooms.append(Room(*place, wall, windows))
+            across, up = ((a, b), y) if along_x else (x, (a, b))
+            rooms.append(Room(across[0], up[0], across[1], up[1], wall, windows))
 
     row((0.0, WIDTH_M), (0.0, low - half), "north", "south")
     row((0.0, WIDTH_M), (high + half, DEPTH_M), "south", "north")

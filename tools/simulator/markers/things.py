@@ -24,12 +24,12 @@ from tools.simulator.markers.surface import (
 _TRIES = 32
 
 
-def checkerboard(columns: int, rows: int, black: float = BLACK, white: float = WHITE) -> Texture:
+def checkerboard(columns: int, rows: int) -> Texture:
     """A board of columns x rows squares, the upper left one black, with a white rim."""
     r, c = np.mgrid[0 : rows + 2, 0 : columns + 2]
-    values = np.where((r + c) % 2 == 0, black, white).astype(np.float32)
-    values[[0, -1], :] = white
-    values[:, [0, -1]] = white
+    values = np.where((r + c) % 2 == 0, BLACK, WHITE).astype(np.float32)
+    values[[0, -1], :] = WHITE
+    values[:, [0, -1]] = WHITE
     return Texture(values)
 
 
