@@ -17,7 +17,7 @@ from tools.simulator.laser.settings import LaserSettings
 from tools.simulator.markers.samples import SampleSettings
 from tools.simulator.markers.session import CalibrationErrors, ImageFormat, SessionSettings
 from tools.simulator.renderer import Sensor
-from tools.simulator.runs import PUBLISHED_CAMERA, RunSettings
+from tools.simulator.runs import RunSettings
 
 # A run of the data set has so many frames, discs and things that look like discs.
 _FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
@@ -56,14 +56,14 @@ class _Drive:
         """What the run is to be like, without things that look like discs."""
         from camera import format_camera, read_camera
 
-        camera = PUBLISHED_CAMERA
-        if self.camera is not None:
-            camera = format_camera(read_camera(self.camera))
-        return RunSettings(
+        settings = RunSettings(
             name=self.output.resolve().name, frames=self.frames, seed=self.seed, lookalikes=0,
             discs=self.by_length(self.discs, _FULL_DISCS), visits=self.visits,
-            unlabelled=self.unlabelled, camera_text=camera, style=self.style,
+            unlabelled=self.unlabelled, style=self.style,
         )  # fmt: skip
+        if self.camera is None:
+            return settings
+        return replace(settings, camera_text=format_camera(read_camera(self.camera)))
 
     def by_length(self, given: int | None, full: int) -> int:
         """What was asked for, or as many things as the length of a run allows."""

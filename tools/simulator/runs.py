@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from camera import Camera, parse_camera, write_camera
 from camera.uncertainty import exact
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from tools.published_camera import PUBLISHED_CAMERA
 from tools.simulator.building import EXTENT
 from tools.simulator.driving import (
     DriveStyle,
@@ -36,21 +37,6 @@ from tools.simulator.office import build_office, is_outside, office_route
 from tools.simulator.parallel import in_order
 from tools.simulator.renderer import Sensor, grey_values, render_light, smeared
 from tools.simulator.scene import Scene, UprightEdge, make_scene
-
-#: The published calibration of run e of the DLR Spatial Cognition data set.
-PUBLISHED_CAMERA = """\
-{ SmRadialDistortedCamera
-sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
-[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
-[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
-sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
-[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
-[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
-mountIndex: 0
-width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
-coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
-}
-"""
 
 _SUN = (0.30, -0.70, 0.50, 3.0)
 _SKY = 3.0
@@ -104,9 +90,7 @@ class RunPlan:
 
 
 Purpose = Literal["building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows"]
-_PURPOSES: tuple[Purpose, ...] = (
-    "building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows",
-)  # fmt: skip
+_PURPOSES = get_args(Purpose)
 
 
 def random_for(seed: int, purpose: Purpose) -> np.random.Generator:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -206,21 +207,13 @@ def _measured_by_hand(plan: SessionPlan) -> list[Scanner]:
     return scanners
 
 
-def _no_legs(times_s: FloatArray) -> FloatArray:
-    return np.zeros((len(times_s), 0, 3))
-
-
 def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     """The scanner looking at the room before anybody comes."""
     settings, rng = plan.settings, plan.random(f"empty {scanner.name}")
     count = max(1, round(settings.empty_s * settings.rate_hz))
-    phase = float(rng.random())
-    times = (
-        plan.route.start_s
-        - _EMPTY_BEFORE_S
-        + (phase + np.arange(count, dtype=np.float64)) / settings.rate_hz
-    )
-    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), _no_legs)
+    ticks = float(rng.random()) + np.arange(count, dtype=np.float64)
+    times = plan.route.start_s - _EMPTY_BEFORE_S + ticks / settings.rate_hz
+    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), partial(legs_of, ()))
     ranges = true_ranges(scanner, None, times, scene)
     return measured(times, ranges, scanner, settings.reading, rng)
 
@@ -228,15 +221,13 @@ def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
 def _fixed_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     settings, rng = plan.settings, plan.random(f"scans {scanner.name}")
     phase, period = float(rng.random()), 1.0 / settings.rate_hz
-    first, last = plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
+    first, last = _logged_span(plan)
     times = np.arange(first + phase * period, last, period)
     times = times[in_visits(plan, times, SCAN_MARGIN_S)]
     lost_s = times - plan.visits[0][0] - settings.faults.lost_laser_at_s
     times = times[~((lost_s >= 0.0) & (lost_s < settings.faults.lost_laser_s))]
-    scene = Scene(
-        plan.site.solid, plan.route.poses, sides_of(plan.robot.outline),
-        lambda t: legs_of(list(plan.passers), t),
-    )  # fmt: skip
+    sides = sides_of(plan.robot.outline)
+    scene = Scene(plan.site.solid, plan.route.poses, sides, partial(legs_of, plan.passers))
     ranges = true_ranges(scanner, None, times, scene, settings.reading.sweep_s)
     return measured(times, ranges, scanner, settings.reading, rng)
 
@@ -244,12 +235,16 @@ def _fixed_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
 def _onboard_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     """By the robot's clock."""
     settings, rng = plan.settings, plan.random(f"scans {scanner.name}")
-    first, last = plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
-    times = plan.clock.ticks(first, last, 1.0 / settings.onboard_hz, float(rng.random()))
+    span = _logged_span(plan)
+    times = plan.clock.ticks(*span, 1.0 / settings.onboard_hz, float(rng.random()))
     times = times[in_visits(plan, times, SCAN_MARGIN_S)]
-    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), lambda t: legs_of(list(plan.passers), t))
+    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), partial(legs_of, plan.passers))
     ranges = true_ranges(scanner, plan.route.poses, times, scene, settings.reading.sweep_s)
     return measured(plan.clock.robot_times(times), ranges, scanner, settings.reading, rng)
+
+
+def _logged_span(plan: SessionPlan) -> tuple[float, float]:
+    return plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
 
 
 def _write_truth(plan: SessionPlan, folder: Path, overwrite: bool) -> None:

@@ -196,16 +196,8 @@ def obstacles(rng: np.random.Generator, area_m: tuple[float, float]) -> list[Sur
         (0.15 * width, depth + 0.65, (0.5, 0.3, 0.75)),
     ):
         shade = rng.uniform(0.1, 0.7)
-        textures = {
-            side: plain(float(shade * factor))
-            for side, factor in (
-                ("front", 1.0),
-                ("rear", 0.8),
-                ("left", 0.9),
-                ("right", 0.7),
-                ("top", 1.1),
-            )
-        }
+        factors = {"front": 1.0, "rear": 0.8, "left": 0.9, "right": 0.7, "top": 1.1}
+        textures = {side: plain(float(shade * factor)) for side, factor in factors.items()}
         turn = rng.uniform(0.0, np.pi)
         result += box_sides(size, textures, planar_transform(x, y, turn))
     return result

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -126,9 +126,7 @@ class SessionSettings:
 
 
 Purpose = Literal["rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame"]
-_PURPOSES: tuple[Purpose, ...] = (
-    "rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame",
-)  # fmt: skip
+_PURPOSES = get_args(Purpose)
 
 
 def random_for(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
@@ -195,30 +193,21 @@ def plan_session(settings: SessionSettings) -> SessionPlan:
     seed = settings.seed
     if not 1 <= settings.cameras <= len(CAMERA_NAMES):
         raise ValueError(f"{settings.cameras} cameras: expected 1 to {len(CAMERA_NAMES)}")
-    names = tuple(CAMERA_NAMES[: settings.cameras])
+    area_m, dictionary, count = settings.area_m, settings.dictionary, settings.cameras
+    names = tuple(CAMERA_NAMES[:count])
     cameras, world_from_camera = room_cameras(
-        random_for(seed, "cameras"), settings.cameras, settings.area_m, settings.width,
-        settings.height,
-    )  # fmt: skip
-    count = len(names)
-    network = Network(
-        names, cameras, tuple(f"{name}/{name}.cam" for name in names), world_from_camera,
-        np.zeros((6 * count, 6 * count)),
-    )  # fmt: skip
-    rig = robot_rig(random_for(seed, "rig"), settings.dictionary, settings.marker_m)
-    times_s, poses, speeds = _drive(settings, random_for(seed, "drive"))
-    room = room_surfaces(random_for(seed, "room"), settings.area_m, settings.dictionary)
-    return SessionPlan(
-        settings=settings,
-        rig=rig,
-        network=network,
-        times_s=times_s,
-        poses=poses,
-        speeds=speeds,
-        robot=tuple(robot_surfaces(rig, random_for(seed, "robot"))),
-        things=tuple(obstacles(random_for(seed, "room", 1), settings.area_m)),
-        room=tuple(room),
+        random_for(seed, "cameras"), count, area_m, settings.width, settings.height
     )
+    files = tuple(f"{name}/{name}.cam" for name in names)
+    known = np.zeros((6 * count, 6 * count))
+    network = Network(names, cameras, files, world_from_camera, known)
+    rig = robot_rig(random_for(seed, "rig"), dictionary, settings.marker_m)
+    return SessionPlan(
+        settings, rig, network, *_drive(settings, random_for(seed, "drive")),
+        robot=tuple(robot_surfaces(rig, random_for(seed, "robot"))),
+        things=tuple(obstacles(random_for(seed, "room", 1), area_m)),
+        room=tuple(room_surfaces(random_for(seed, "room"), area_m, dictionary)),
+    )  # fmt: skip
 
 
 def _drive(
@@ -227,11 +216,9 @@ def _drive(
     """Times, poses and speeds: standing at random places, then a figure of eight."""
     area = np.array(settings.area_m)
     half = 0.5 * area - 0.55
+    still = settings.references
     standing = np.column_stack(
-        [
-            0.5 * area + half * rng.uniform(-1.0, 1.0, (settings.references, 2)),
-            rng.uniform(-np.pi, np.pi, settings.references),
-        ]
+        [0.5 * area + half * rng.uniform(-1.0, 1.0, (still, 2)), rng.uniform(-np.pi, np.pi, still)]
     )
     # A figure of eight whose loops slowly turn, so that no two rounds are the same.
     length = 2.0 * np.pi * np.hypot(0.75 * half[0], 1.1 * half[1])
@@ -252,13 +239,8 @@ def _drive(
     poses, later = pose(t), pose(t + 1e-3)
     change = later - poses
     change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
-    times = np.concatenate(
-        [
-            _FIRST_S + _STANDING_S * np.arange(settings.references),
-            _FIRST_S + _STANDING_S * settings.references + t,
-        ]
-    )
-    speeds = np.concatenate([np.zeros((settings.references, 3)), change / 1e-3])
+    times = _FIRST_S + np.concatenate([_STANDING_S * np.arange(still), _STANDING_S * still + t])
+    speeds = np.concatenate([np.zeros((still, 3)), change / 1e-3])
     return times, np.concatenate([standing, poses]), speeds
 
 
@@ -275,7 +257,7 @@ def view_robot(
     camera_from_world = plan.camera_from_world[camera]
     exposures = [
         _surfaces(plan, camera_from_world, pose + offset * settings.exposure_s * speed)
-        for offset in _instants(plan, camera_from_world, model, pose, speed)
+        for offset in _instants(plan, camera, pose, speed)
     ]
     imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
     background = _shadowed(plan, camera, pose)
@@ -289,25 +271,20 @@ def view_robot(
 
 def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray) -> list[Surface]:
     """Robot and obstacles in the camera frame, first the rig's boards."""
-    world_from_robot = planar_transform(*(float(x) for x in pose))
+    world_from_robot = planar_transform(*pose.tolist())
     robot = [lit(surface.moved(world_from_robot)) for surface in plan.robot]
     return [surface.moved(camera_from_world) for surface in [*robot, *plan.things]]
 
 
-def _instants(
-    plan: SessionPlan,
-    camera_from_world: FloatArray,
-    model: Camera,
-    pose: FloatArray,
-    speed: FloatArray,
-) -> FloatArray:
+def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray) -> FloatArray:
     """When the robot is looked at, in shares of the exposure from its middle: every pixel."""
     points = plan.rig.robot_from_marker[:, :3, 3]
     ends = []
     for offset in (-0.5, 0.5):
         moved = pose + offset * plan.settings.exposure_s * speed
-        world = apply(planar_transform(*(float(x) for x in moved)), points)
-        ends.append(model.project(apply(camera_from_world, world)))
+        world = apply(planar_transform(*moved.tolist()), points)
+        seen = apply(plan.camera_from_world[camera], world)
+        ends.append(plan.network.cameras[camera].project(seen))
     way = np.nan_to_num(np.linalg.norm(ends[1] - ends[0], axis=1)).max()
     count = int(np.clip(np.ceil(way), 1, _MOST_EXPOSURES))
     return (np.arange(count) + 0.5) / count - 0.5
@@ -318,7 +295,7 @@ def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     background, model = plan.background(camera), plan.network.cameras[camera]
     x, y = 1.15 * np.array(FOOTPRINT_M)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    world = apply(planar_transform(*(float(p) for p in pose)), corners)
+    world = apply(planar_transform(*pose.tolist()), corners)
     pixels = model.project(apply(plan.camera_from_world[camera], world))
     if np.isnan(pixels).any():
         return background
