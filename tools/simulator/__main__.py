@@ -108,10 +108,7 @@ class Rows(_Drive):
 
 @dataclass(frozen=True)
 class Reenact:
-    """Render what the camera of a recorded run would have seen.
-
-    Prints the discs' quality by distance, shipped and rendered.
-    """
+    """Render what the camera of a recorded run would have seen."""
 
     landmarks: Positional[Path]  # The recorded run's .circles file.
     output: Positional[Path]  # Folder of the run; its name is the run's.
@@ -123,14 +120,13 @@ class Reenact:
     force: bool = False  # Replace files that exist.
 
     def __call__(self) -> str:
-        from tools.simulator.reenact import prepare, quality_table, write_reenactment
+        from tools.simulator.reenact import prepare, write_reenactment
 
         run = prepare(self.landmarks, self.camera, self.world, self.seed)
-        qualities = write_reenactment(
+        frames = write_reenactment(
             run, self.output, self.every, jobs=self.jobs, overwrite=self.force
         )
-        print("\n".join(quality_table(qualities)))
-        return f"{len(range(0, len(run.frames), self.every))} frames"
+        return f"{frames} frames"
 
 
 @dataclass(frozen=True)
@@ -206,16 +202,13 @@ class LaserSession:
 
     output: Positional[Path]  # Folder of the session.
     seed: int = 1  # Everything about it follows from it and the settings.
-    picture: bool = False  # Also draw map, way, scanners and one set of scans: session.png.
     force: bool = False  # Replace files that exist.
     session: Annotated[LaserSettings, arg(name="")] = field(default_factory=LaserSettings)
 
     def __call__(self) -> str:
-        from tools.simulator.laser.session_files import draw_session, write_session
+        from tools.simulator.laser.session_files import write_session
 
         plan = write_session(self.session, self.output, seed=self.seed, overwrite=self.force)
-        if self.picture:
-            draw_session(self.output, self.output / "session.png", overwrite=self.force)
         inside = sum(end - begin for begin, end in plan.visits)
         away = plan.route.end_s - plan.route.start_s - inside
         return f"{len(plan.visits)} visits, {inside:.0f} s in the room and {away:.0f} s outside"

@@ -18,10 +18,6 @@ from tools.simulator.scene import Scene, UprightEdge
 INNER_M, OUTER_M = 0.06, 0.14
 SAMPLES = 16
 
-#: Borders of forward distance (m), and the shipped rows' median quality between them.
-DISTANCE_BORDERS_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-SHIPPED_MEDIANS = (0.987, 0.973, 0.924, 0.836, 0.781, 0.703)
-
 
 def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
     """Otsu quality of a disc whose centre is seen at a pixel. `grey` (H, W); `pixel` (2,)."""
@@ -40,20 +36,6 @@ def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
         return 0.0
     difference = values[0].mean() - values[1].mean()
     return float(0.25 * difference * difference / total)
-
-
-def best_quality_near(
-    grey: ByteArray, camera: Camera, pixel: ArrayLike, reach: int = 2
-) -> tuple[float, tuple[int, int]]:
-    """The best quality within `reach` pixels of a place, and its pixel (u, v): a detector's row."""
-    u0, v0 = np.rint(np.asarray(pixel, dtype=np.float64)).astype(int)
-    best, where = -1.0, (int(u0), int(v0))
-    for v in range(max(v0 - reach, 0), min(v0 + reach, grey.shape[0] - 1) + 1):
-        for u in range(max(u0 - reach, 0), min(u0 + reach, grey.shape[1] - 1) + 1):
-            found = disc_quality(grey, camera, (u, v))
-            if found > best:
-                best, where = found, (int(u), int(v))
-    return best, where
 
 
 #: A row's centre lies at least so many pixels inside the image, as in the data set.

@@ -8,9 +8,7 @@ shipped rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +18,11 @@ from camera import Camera, read_camera, write_camera
 from camera.uncertainty import exact
 from redetect.landmarks import Frame, read_frames, wrap_angle, write_frames
 from redetect.slam.recording import recording_of_frames
-from tools.arrays import BoolArray, ByteArray, FloatArray
+from tools.arrays import BoolArray, ByteArray
 from tools.reenactment.world import World, read_world
 from tools.simulator.driving import joined_steps, with_mounting
 from tools.simulator.files import encoded, rounded, write_bytes, write_truth
-from tools.simulator.observation import DISTANCE_BORDERS_M, SeenDisc, best_quality_near, see_discs
+from tools.simulator.observation import SeenDisc, see_discs
 from tools.simulator.parallel import in_order
 from tools.simulator.renderer import Sensor, grey_values, render_light, smeared
 from tools.simulator.runs import SIMULATED
@@ -42,7 +40,7 @@ from tools.simulator.scene import (
     raster_shape,
 )
 
-#: Tuned on the shipped rows' median quality by distance (see `quality_table`): no other figure than
+#: Tuned on the shipped rows' median quality by distance (`detect compare`): no other figure than
 #: the blur makes quality fall with distance as it does, and this one fits all distances at once.
 REENACTED_SENSOR = Sensor(
     blur_px=6.3,
@@ -76,13 +74,11 @@ class Reenactment:
 
 @dataclass(frozen=True)
 class ReenactedFrame:
-    """A rendered frame, what is truly in view, and the quality at each shipped row."""
+    """A rendered frame, and what is truly in view."""
 
     index: int
     grey: ByteArray
     discs: tuple[SeenDisc, ...]
-    qualities: tuple[tuple[float, float, float], ...]
-    """Forward distance (m), shipped quality and rendered quality of shipped rows with an ID."""
 
 
 def prepare(landmarks: Path, camera: Path, world: Path, seed: int) -> Reenactment:
@@ -107,7 +103,7 @@ def reenacted_frame(run: Reenactment, index: int, sensor: Sensor) -> ReenactedFr
     grey = grey_values(smeared(light, camera, pose, onward), sensor, rng)
     ids, xy = run.world.disc_ids[shown], run.world.disc_xy[shown]
     discs = see_discs(run.scene, run.camera, camera, pose, ids, xy, _DISC_RADIUS_M)
-    return ReenactedFrame(index, grey, tuple(discs), _qualities(run, index, grey, discs))
+    return ReenactedFrame(index, grey, tuple(discs))
 
 
 def true_camera(run: Reenactment, index: int) -> Camera:
@@ -122,25 +118,23 @@ def true_camera(run: Reenactment, index: int) -> Camera:
 
 def write_reenactment(
     run: Reenactment, folder: Path, every: int, *, jobs: int = 1, overwrite: bool = False
-) -> FloatArray:
+) -> int:
     """Render every `every`-th frame of a recorded run and write a run folder.
 
     Its ``map.circles`` holds the shipped rows of the rendered frames, so that what is detected
     again can be compared with them; odometry between them is joined.
 
-    Returns (K, 3).
+    Returns the number of frames.
     """
     name, sensor = folder.resolve().name, REENACTED_SENSOR
     (folder / "images").mkdir(parents=True, exist_ok=True)
     write_camera(exact(run.camera), folder / f"{name}.cam", overwrite=overwrite)
     indices = range(0, len(run.frames), every)
     truth: list[dict[str, Any]] = []
-    qualities: list[tuple[float, float, float]] = []
     for frame in in_order(_rendered, (run, sensor), indices, jobs):
         image = folder / "images" / f"{run.frames[frame.index].step.prefix}.jpg"
         jpeg = encoded(frame.grey, quality=sensor.jpeg_quality)
         write_bytes(image, jpeg, overwrite=overwrite)
-        qualities += frame.qualities
         truth.append(_truth_json(run, frame))
     recording = recording_of_frames(run.frames, name)
     steps = joined_steps(recording, indices)
@@ -153,25 +147,7 @@ def write_reenactment(
     write_frames(folder / f"{name}.txt", steps_alone, head=head, overwrite=overwrite)
     note = {"note": head.split("\n")}
     write_truth(folder / "truth.json", note, {"frames": truth}, overwrite=overwrite)
-    return np.array(qualities).reshape(-1, 3)
-
-
-def quality_table(qualities: FloatArray) -> Iterator[str]:
-    """Lines of a table: median quality of shipped and rendered rows by forward distance.
-    `qualities` (K, 3).
-    """
-    yield f"{'distance / m':>14}{'rows':>8}{'shipped':>10}{'rendered':>10}{'difference':>12}"
-    borders = DISTANCE_BORDERS_M
-    for low, high in pairwise(borders):
-        rows = qualities[(qualities[:, 0] >= low) & (qualities[:, 0] < high)]
-        if not len(rows):
-            yield f"{low:7.1f} - {high:4.1f}{0:8d}"
-            continue
-        shipped, rendered = np.median(rows[:, 1]), np.median(rows[:, 2])
-        yield (
-            f"{low:7.1f} - {high:4.1f}{len(rows):8d}{shipped:10.3f}{rendered:10.3f}"
-            f"{rendered - shipped:+12.3f}"
-        )
+    return len(indices)
 
 
 def _rendered(state: tuple[Reenactment, Sensor], index: int) -> ReenactedFrame:
@@ -225,23 +201,6 @@ def _showing(scene: Scene, shown: BoolArray) -> Scene:
     return scene._replace(
         mark_items=scene.mark_items[keep], mark_start=counted[scene.mark_start].astype(np.int64)
     )
-
-
-def _qualities(
-    run: Reenactment, index: int, grey: ByteArray, discs: list[SeenDisc]
-) -> tuple[tuple[float, float, float], ...]:
-    """Distance, shipped and rendered quality of shipped rows whose disc is in view."""
-    found = []
-    for row in run.frames[index].circles:
-        ids = {i for i in row.ids if i >= 0}
-        candidates = [d for d in discs if d.disc_id in ids]
-        if not candidates:
-            continue
-        place = run.camera.project_floor(np.array([row.px, row.py]))
-        disc = min(candidates, key=lambda d: float(np.hypot(*(d.pixel - place))))
-        rendered, _ = best_quality_near(grey, run.camera, disc.pixel)
-        found.append((-row.py, row.quality, rendered))
-    return tuple(found)
 
 
 def _truth_json(run: Reenactment, frame: ReenactedFrame) -> dict[str, Any]:

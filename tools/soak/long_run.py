@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-
-from tools.soak.processes import family
+import psutil  # type: ignore[import-untyped,unused-ignore]
 
 #: Throughput is compared between these shares of the run: before and after them, processes start
 #: and files take their places.
@@ -31,6 +30,28 @@ MOST_SLOWER = 0.05
 
 class SoakError(ValueError):
     """A run that did not end well, or too short a one."""
+
+
+class ProcessState(NamedTuple):
+    """A process at a moment."""
+
+    pid: int
+    resident_bytes: int  # Memory of its own and shared that is in use.
+    descriptors: int  # Open files, pipes and the like.
+    processor_s: float  # What it has computed so far.
+
+
+def family(pid: int) -> list[ProcessState]:
+    """A process and all that descend from it, itself first, but for those that have just ended."""
+    found = []
+    with suppress(psutil.Error):
+        first = psutil.Process(pid)
+        for process in [first, *first.children(recursive=True)]:
+            with suppress(psutil.Error), process.oneshot():
+                times = process.cpu_times()
+                state = process.memory_info().rss, process.num_fds(), times.user + times.system
+                found.append(ProcessState(process.pid, *state))
+    return found
 
 
 class _Look(NamedTuple):

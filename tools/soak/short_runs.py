@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
+import psutil  # type: ignore[import-untyped,unused-ignore]
+
 from detect.sources.opening import open_run
 from tools.benchmark.material import repeated_run
 from tools.soak.long_run import SoakError
-from tools.soak.processes import marked
 
 _FRAMES = 8
 _SHARED_MEMORY = Path("/dev/shm")
@@ -95,6 +96,17 @@ def repeat_short_runs(
         caches=len(_names(caches)) - cached,
         different=different,
     )
+
+
+def marked(variable: str) -> list[int]:
+    """Processes with a ``NAME=value`` in their environment, but for this one."""
+    name, _, value = variable.partition("=")
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if process.pid != os.getpid() and process.environ().get(name) == value:
+                found.append(process.pid)
+    return found
 
 
 def _started(arguments: list[str]) -> None:

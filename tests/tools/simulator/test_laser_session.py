@@ -352,18 +352,6 @@ def test_the_command_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.long
-def test_the_picture_shows_the_session(tmp_path: Path) -> None:
-    import cv2
-
-    assert main(["laser-session", str(tmp_path / "s"), "--picture", *QUICK]) == 0
-    picture = cv2.imread(str(tmp_path / "s" / "session.png"))
-    assert picture is not None
-    for bgr in ((180, 119, 31), (14, 127, 255), (40, 39, 214), (0, 0, 0)):
-        drawn = np.all(np.abs(picture.astype(int) - bgr) < 12, axis=2)
-        assert drawn.sum() > 50, bgr  # two scanners, the robot, walls
-
-
-@pytest.mark.long
 def test_a_session_of_three_visits_has_what_the_methods_need(tmp_path: Path) -> None:
     plan = write_session(LaserSettings(), tmp_path / "s", seed=11)
     lengths = [end - begin for begin, end in plan.visits]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from tools.simulator.files import encoded
-from tools.simulator.observation import best_quality_near, disc_quality
+from tools.simulator.observation import disc_quality
 from tools.simulator.renderer import Sensor, grey_values
 from tools.simulator.single_disc import render_disc
 
@@ -100,9 +100,6 @@ def test_quality_of_a_clean_disc_is_one(published_camera: Camera) -> None:
     grey, pixel = _image(published_camera)
     assert disc_quality(grey, published_camera, pixel) == pytest.approx(1.0)
     assert disc_quality(255 - grey, published_camera, pixel) == pytest.approx(1.0)
-    best, where = best_quality_near(grey, published_camera, np.array(pixel) + 0.4)
-    assert best == pytest.approx(1.0)
-    assert np.hypot(*(np.array(where) - pixel)) <= 3.0
 
 
 def test_quality_falls_with_noise_as_variances_say(published_camera: Camera) -> None:

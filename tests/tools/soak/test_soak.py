@@ -18,9 +18,8 @@ from detect.sources.opening import open_run
 from tools.benchmark.material import repeated_run
 from tools.soak import short_runs
 from tools.soak.__main__ import main
-from tools.soak.long_run import MOST_GROWTH_MIB, SoakResult
-from tools.soak.processes import family, marked
-from tools.soak.short_runs import ShortRuns
+from tools.soak.long_run import MOST_GROWTH_MIB, SoakResult, family
+from tools.soak.short_runs import ShortRuns, marked
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads Linux's /proc")
 

@@ -1,4 +1,4 @@
-"""A simulated laser session as a folder (docs/groundtruth/sessions.md), its truth, a picture."""
+"""A simulated laser session as a folder (docs/groundtruth/sessions.md), and its truth."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.files import read_json, write_json
-from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners, write_scanners
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
-from redetect.groundtruth.trajectories.plane import apply
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.lasers.scanners import Scanner, write_scanners
+from redetect.groundtruth.lasers.scans import Scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
-    read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import Distance, Survey, read_survey
+from redetect.groundtruth.validation.fiducials import Distance, Survey
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray
-from tools.evaluation.tables import picture
 from tools.simulator.files import write_bytes
 from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
@@ -294,60 +290,3 @@ def _nearest_m(plan: SessionPlan, passer: Passer) -> float:
     times = np.arange(passer.from_s, passer.to_s, 0.02)
     gaps = passer.places(times)[0] - plan.route.poses(times)[:, :2]
     return round(float(np.nanmin(np.linalg.norm(gaps, axis=1))), 3)
-
-
-_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple")
-
-
-def draw_session(
-    folder: Path, path: Path, *, at_s: float | None = None, overwrite: bool = False
-) -> None:
-    """Draw a session from its files: map, way, scanners, and what they saw at a time."""
-
-    def draw(figure: Any) -> None:
-        axes = figure.add_subplot(aspect="equal")
-        truth, camera = (read_planar_poses(folder / f"{n}.csv") for n in ("truth", "camera"))
-        time_s = float(camera.times_s[len(camera) // 2]) if at_s is None else at_s
-        walls = read_building(folder / "building.csv")
-        axes.plot(walls[:, ::2].T, walls[:, 1::2].T, color="black", linewidth=1.2)
-        axes.plot(*truth.poses[:, :2].T, color="0.6", linewidth=0.8, label="way")
-        axes.plot(*camera.poses[:, :2].T, ".", color="tab:red", markersize=2, label="marker poses")
-        if (folder / "reference.csv").stat().st_size > 0:
-            stands = read_planar_poses(folder / "reference.csv").poses
-            axes.plot(*stands[:, :2].T, "k+", markersize=9, label="reference poses")
-        fiducials = read_survey(folder / "fiducials.json").fiducials
-        axes.plot(*np.stack(list(fiducials.values())).T, "k*", label="fiducials")
-        for scanner, colour in zip(read_scanners(folder / "scanners.truth.json"), _COLOURS):
-            points = _points_at(folder, scanner, scanner.pose, time_s)
-            axes.plot(*points.T, ".", color=colour, markersize=3, label=scanner.name)
-            middle_beam = apply(scanner.pose, [[0.0, 0.0], [0.5, 0.0]])
-            axes.plot(*middle_beam.T, color=colour, linewidth=2.5)
-        robot = read_robot(folder / "robot.json")
-        pose = truth.poses[np.argmin(np.abs(truth.times_s - time_s))]
-        for scanner, colour in zip(robot.scanners, ("0.3", "tab:cyan")):
-            mounted = compose(pose[None], scanner.pose[None])[0]
-            points = _points_at(folder, scanner, mounted, _robot_time(folder, time_s))
-            label = f"{scanner.name} (on board)"
-            axes.plot(*points.T, "x", color=colour, markersize=3, label=label)
-        outline = np.vstack([robot.outline, robot.outline[:1]])
-        axes.plot(*apply(pose, outline).T, color="tab:red", linewidth=1.5)
-        axes.set(xlabel="x / m", ylabel="y / m", title=f"t = {time_s:.2f} s")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-
-    write_bytes(path, picture((12.0, 10.0), draw, dpi=100), overwrite=overwrite)
-
-
-def _robot_time(folder: Path, at_s: float) -> float:
-    """What the robot's clock showed, by the truth."""
-    time = at_s
-    for piece in read_json(folder / "truth.json")["clock"]["pieces"]:
-        if piece["from_s"] is None or at_s >= piece["from_s"]:
-            time = at_s + piece["offset_s"] + piece["drift"] * (at_s - piece["reference_s"])
-    return time
-
-
-def _points_at(folder: Path, scanner: Scanner, pose: FloatArray, at_s: float) -> FloatArray:
-    """(M, 2) points in the world of the scan nearest in time."""
-    scans = read_scans(find_scans(folder, scanner.name), scanner.readings)
-    points = scanner.points(scans.ranges_mm[np.argmin(np.abs(scans.times_s - at_s))])
-    return apply(pose, points[np.isfinite(points[:, 0])])

@@ -18,6 +18,7 @@ from tools.arrays import FloatArray
 from tools.simulator.markers.surface import (
     Surface,
     Texture,
+    box_against,
     box_sides,
     marker_surface,
     plain,
@@ -262,10 +263,7 @@ def _before_the_wall(
         }
         if rng.random() < 0.5:
             _, textures["front"] = thing(rng, known)
-        # The wall's x is the box's y, its z the box's x.
-        wall_from_box = np.eye(4)
-        wall_from_box[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-        wall_from_box[:3, 3] = [x + 0.5 * size[1], -0.5 * _HEIGHT_M, 0.5 * size[0] + 0.02]
-        result += box_sides(size, textures, wall @ wall_from_box)
+        foot = x + 0.5 * size[1], -0.5 * _HEIGHT_M, 0.5 * size[0] + 0.02
+        result += box_sides(size, textures, wall @ box_against(foot))
         x += size[1] + rng.uniform(0.3, 1.8)
     return result

@@ -28,6 +28,7 @@ from tools.simulator.markers.surface import (
     WHITE,
     Surface,
     Texture,
+    box_against,
     box_sides,
     cross,
     marker_surface,
@@ -129,10 +130,7 @@ def backing_box(rng: np.random.Generator, card: Surface) -> list[Surface]:
     depth = rng.uniform(0.3, 1.2) * card.width_m
     slack = 0.5 * (np.array([across, upward]) - [card.width_m, card.height_m])
     shift = slack * rng.uniform(-1.0, 1.0, 2)
-    # The box's own frame has its front at +x and stands on z = 0.
-    card_from_box = np.eye(4)
-    card_from_box[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-    card_from_box[:3, 3] = [shift[0], shift[1] - 0.5 * upward, -0.5 * depth - _BEHIND_M]
+    foot = shift[0], shift[1] - 0.5 * upward, -0.5 * depth - _BEHIND_M
     shade = rng.uniform(0.08, 0.85)
     textures: dict[str, Texture] = {
         side: plain(float(np.clip(shade * rng.uniform(0.5, 1.2), 0.03, 0.95)))
@@ -141,7 +139,7 @@ def backing_box(rng: np.random.Generator, card: Surface) -> list[Surface]:
     if rng.random() < 0.4:
         pattern = shade + 0.25 * (blotches(rng, (48, 64), octaves=3) - np.float32(0.5))
         textures["front"] = Texture(np.clip(pattern, 0.03, 0.95).astype(np.float32), smooth=True)
-    return box_sides((depth, across, upward), textures, card.pose @ card_from_box)
+    return box_sides((depth, across, upward), textures, card.pose @ box_against(foot))
 
 
 _NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -286,12 +284,10 @@ class _Scene:
         if placed is None:
             return
         pose = random_pose(rng, self.camera, placed.pixel, width_px, slant, _MARKER_M)
-        self.taken.append(placed)
-        self.cards.append((len(self.surfaces), marker_id))
         card = marker_surface(self.dictionary, marker_id, _MARKER_M, pose, quiet_cells=quiet)
-        self.surfaces.append(card)
+        self.cards.append((len(self.surfaces), marker_id))
+        self._put(card, placed, boxed)
         if boxed:
-            self.surfaces += backing_box(rng, card)
             self.things.append("box")
         if occluded:
             self.surfaces.append(_occluder(rng, card))
@@ -301,8 +297,7 @@ class _Scene:
         rng, settings = self.rng, self.settings
         width_px = _log_uniform(rng, (16.0, 260.0))
         placed = place(rng, self.camera, self.taken, width_px, inside=rng.random() < 0.6)
-        near = rng.random() < settings.near
-        if near:
+        if rng.random() < settings.near:
             name, texture = "near_marker", near_marker(rng, self.dictionary)
         else:
             name, texture = thing(rng, self.dictionary)
@@ -313,12 +308,14 @@ class _Scene:
             return
         pose = random_pose(rng, self.camera, placed.pixel, width_px, slant, width_m)
         rows, columns = texture.values.shape
-        surface = Surface(pose, width_m, width_m * rows / columns, texture, 0.4)
+        self._put(Surface(pose, width_m, width_m * rows / columns, texture, 0.4), placed, boxed)
+        self.things.append(name)
+
+    def _put(self, surface: Surface, placed: Placed, boxed: bool) -> None:
         self.taken.append(placed)
         self.surfaces.append(surface)
-        self.things.append(name)
         if boxed:
-            self.surfaces += backing_box(rng, surface)
+            self.surfaces += backing_box(self.rng, surface)
 
 
 def _camera(settings: SampleSettings, rng: np.random.Generator) -> Camera:
@@ -397,12 +394,9 @@ def _truth(
     camera = scene.camera
     visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M, arrays)
     corners = marker_corners(camera, pose, _MARKER_M)
-    u, v = np.rint(camera.project(pose[:3, 3])).astype(int)
-    light = 1.0
-    if np.ndim(illumination) == 2:
-        light = float(
-            illumination[np.clip(v, 0, camera.height - 1), np.clip(u, 0, camera.width - 1)]
-        )
+    middle = np.rint(camera.project(pose[:3, 3])).astype(int)
+    u, v = np.clip(middle, 0, [camera.width - 1, camera.height - 1])
+    light = float(illumination[v, u]) if np.ndim(illumination) == 2 else 1.0
     return MarkerTruth(
         dictionary, marker_id, corners, pose, _MARKER_M, mean_side_px(corners), slant_deg(pose),
         gain * light * (WHITE - BLACK), visible, rim,
