@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from camera.calibration.floor import with_pose
+from redetect.groundtruth.trajectories.transforms import transform
 from redetect.landmarks import Step
 from redetect.slam.models.motion import move, move_jacobians, relative_pose
 from redetect.slam.recording import Recording
 from tools.arrays import FloatArray
-
-
-def world_from_robot(pose: ArrayLike) -> FloatArray:
-    """(4, 4) transform of a robot at (x, y, heading): metres, radians; level."""
-    x, y, heading = np.asarray(pose, dtype=np.float64)
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
@@ -27,24 +22,13 @@ def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
     p, q = np.asarray(tilt_rad, dtype=np.float64)
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_rotvec([p, q, 0.0]).as_matrix()
-    return transform
+    return transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
 
 
 def tilted_camera(camera: Camera, tilt_rad: ArrayLike) -> Camera:
     """The camera of a tilted robot, its pose relative to the level robot frame."""
     pose = np.vstack([np.array(camera.robot_from_camera), [0.0, 0.0, 0.0, 1.0]])
-    return with_mounting(camera, (level_from_tilted(tilt_rad) @ pose)[:3])
-
-
-def with_mounting(camera: Camera, robot_from_camera: ArrayLike) -> Camera:
-    """The same camera mounted elsewhere: (3, 4) transform camera -> robot."""
-    rows = tuple(
-        (float(a), float(b), float(c), float(d))
-        for a, b, c, d in np.asarray(robot_from_camera, dtype=np.float64)
-    )
-    return replace(camera, robot_from_camera=rows)
+    return with_pose(camera, (level_from_tilted(tilt_rad) @ pose)[:3])
 
 
 _DENSE_M = 0.01

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.landmarks import CircleLandmark, LineLandmark
 from redetect.slam.models.measurement import disc_in_robot
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from tools.simulator.driving import world_from_robot
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 
@@ -183,7 +183,7 @@ def see_edges(
     world[..., :2] = place[near, None]
     share = np.linspace(1.0, 0.0, _EDGE_POINTS)
     world[..., 2] = heights[near, :1] + share * (heights[near, 1:] - heights[near, :1])
-    world_to_level = np.linalg.inv(world_from_robot(pose))
+    world_to_level = np.linalg.inv(planar_transform(*pose))
     level = world @ world_to_level[:3, :3].T + world_to_level[:3, 3]
     uv = true.project_robot(level)
     visible = (

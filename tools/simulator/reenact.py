@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from camera import Camera, read_camera, write_camera
+from camera.calibration.floor import with_pose
 from camera.uncertainty import exact
 from redetect.landmarks import Frame, read_frames, wrap_angle, write_frames
 from redetect.slam.recording import recording_of_frames
 from tools.arrays import BoolArray, ByteArray
 from tools.reenactment.world import World, read_world
-from tools.simulator.driving import joined_steps, with_mounting
+from tools.simulator.driving import joined_steps
 from tools.simulator.files import encoded, rounded, write_bytes, write_truth
 from tools.simulator.observation import SeenDisc, see_discs
 from tools.simulator.parallel import in_order
@@ -113,7 +114,7 @@ def true_camera(run: Reenactment, index: int) -> Camera:
     mounting = run.world.robot_from_camera
     p, q = run.world.tilt[index]
     turn = Rotation.from_rotvec([p, q, 0.0]).as_matrix()
-    return with_mounting(run.camera, np.column_stack([turn @ mounting[:, :3], mounting[:, 3]]))
+    return with_pose(run.camera, np.column_stack([turn @ mounting[:, :3], mounting[:, 3]]))
 
 
 def write_reenactment(

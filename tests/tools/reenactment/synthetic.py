@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from camera.calibration.floor import with_pose
 from redetect.landmarks import Frame, Step, circle_landmarks
 from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording
 from redetect.slam.models.motion import relative_pose
@@ -72,8 +73,7 @@ def camera_at(camera: Camera, truth: Estimate, pose: int) -> Camera:
     assert truth.mounting is not None
     assert truth.tilt is not None
     turn = Rotation.from_rotvec([*truth.tilt[pose], 0.0]).as_matrix() @ truth.mounting[:, :3]
-    mounting = np.column_stack([turn, truth.mounting[:, 3]])
-    return replace(camera, robot_from_camera=tuple(map(tuple, mounting.tolist())))
+    return with_pose(camera, np.column_stack([turn, truth.mounting[:, 3]]))
 
 
 def rows_of_pose(

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.trajectories.plane import compose
 from tools.simulator.laser.measuring import (
     Scene,
     cast_on_discs,
     cast_on_robot,
     cast_on_walls,
-    compose,
     measured,
     true_ranges,
 )

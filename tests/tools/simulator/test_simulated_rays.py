@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.slam.models.measurement import disc_in_robot
-from tools.simulator.driving import tilted_camera, world_from_robot
+from tools.simulator.driving import tilted_camera
 from tools.simulator.frame_kernels import camera_ray
 from tools.simulator.ray_kernels import nearest_quad, points_visible
 from tools.simulator.renderer import Light, optics_of, render_light, smeared
@@ -72,7 +73,7 @@ def test_disc_is_rendered_where_the_camera_projects_it(
 ) -> None:
     camera = tilted_camera(published_camera, tilt)
     robot_xy = np.array([0.35, -1.6])
-    world_xy = (world_from_robot(pose) @ [*robot_xy, 0.0, 1.0])[:2]
+    world_xy = (planar_transform(*pose) @ [*robot_xy, 0.0, 1.0])[:2]
     np.testing.assert_allclose(disc_in_robot(pose, world_xy), robot_xy, atol=1e-12)
     light = render_light(_scene(_with_disc(*world_xy)), camera, np.array(pose, dtype=np.float64))
     expected = render_disc(camera, robot_xy, 0.1, 1.0, 0.0, row_aperture=0.5, rounded=False)

@@ -11,11 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera, write_camera
+from camera.calibration.floor import with_pose
 from redetect.landmarks import CircleLandmark, Frame, read_frames, write_frames
 from redetect.slam.models.measurement import disc_in_robot
 from redetect.slam.models.motion import relative_pose
 from tools.reenactment.world import World, write_world
-from tools.simulator.driving import step_record, with_mounting
+from tools.simulator.driving import step_record
 from tools.simulator.reenact import (
     REENACTED_SENSOR,
     prepare,
@@ -79,7 +80,7 @@ def test_discs_are_rendered_through_the_true_camera(recorded: tuple[Path, Path, 
             turn = cv2.Rodrigues(np.array([p, q, 0.0]))[0]
             mounting = run.world.robot_from_camera
             pose = np.column_stack([turn @ mounting[:, :3], mounting[:, 3]])
-            expected = with_mounting(run.camera, pose).project_floor(robot_xy)
+            expected = with_pose(run.camera, pose).project_floor(robot_xy)
             np.testing.assert_allclose(disc.pixel, expected, atol=1e-9)
             assert np.abs(_brightest(frame.grey, expected) - expected).max() < 1.0
             nominal = run.camera.project_floor(robot_xy)

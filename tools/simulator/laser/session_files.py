@@ -12,6 +12,7 @@ import numpy as np
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.scanners import Scanner, write_scanners
 from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.trajectories.plane import apply
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     write_planar_poses,
@@ -20,7 +21,7 @@ from redetect.groundtruth.validation.fiducials import Distance, Survey
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray
 from tools.simulator.files import write_bytes
-from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
+from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
 from tools.simulator.laser.settings import LaserSettings
@@ -134,10 +135,10 @@ def measured_distances(plan: SessionPlan) -> list[Distance]:
     places = np.stack([survey.fiducials[name] for name in names])
     rows = []
     for pose, time in enumerate(reference_times(plan)):
-        robot = plan.route.poses(np.array([time]))
-        near = np.argsort(np.linalg.norm(places - robot[0, :2], axis=1))[:_NEAREST_FIDUCIALS]
+        robot = plan.route.poses(np.array([time]))[0]
+        near = np.argsort(np.linalg.norm(places - robot[:2], axis=1))[:_NEAREST_FIDUCIALS]
         for point, offset in survey.robot_points.items():
-            world = compose(robot, np.array([[*offset, 0.0]]))[0, :2]
+            world = apply(robot, offset)
             for i in sorted(near):
                 far = float(np.linalg.norm(places[i] - world)) + rng.normal(0.0, survey.sigma_m)
                 rows.append(Distance(pose, float(time), point, names[i], max(float(far), 0.0)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from camera import Camera, format_camera, write_camera
 from detect.markers.dictionaries import marker_dictionary
+from redetect.groundtruth.trajectories.transforms import transform
 from tools.arrays import ByteArray, Float32Array, FloatArray
 from tools.simulator.files import encoded, write_bytes, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
@@ -360,13 +361,9 @@ def _motion(
     # Steps of a pixel: the pixel's own width fills the gaps.
     count = int(np.clip(np.ceil(length), 2, _MOST_EXPOSURES))
     axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
-    moves = []
-    for k in range(count):
-        angle = length / camera.scale_x * ((k + 0.5) / count - 0.5)
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-        moves.append(move)
-    return moves, length
+    angles = [length / camera.scale_x * ((k + 0.5) / count - 0.5) for k in range(count)]
+    turns = (Rotation.from_rotvec(angle * axis).as_matrix() for angle in angles)
+    return [transform(turn, np.zeros(3)) for turn in turns], length
 
 
 def _occluder(rng: np.random.Generator, card: Surface) -> Surface:
