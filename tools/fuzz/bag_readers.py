@@ -167,7 +167,7 @@ BAG_READERS: tuple[Reader, ...] = (
     _reader("ros1 bag", "b.bag", "ros1"),
     _reader("sqlite bag", "b.db3", "sqlite"),
     replace(
-        _reader("sqlite cells", "b.db3", "sqlite"), seeds=(b"",), made_seeds=None, files=12,
+        _reader("sqlite cells", "b.db3", "sqlite"), seeds=(b"",), made_seeds=tuple, files=12,
         content=lambda recipe: bag_with_edits(_recorded("sqlite"), recipe),
     ),
 )  # fmt: skip

@@ -35,22 +35,18 @@ class Reader:
     words: tuple[bytes, ...] = ()  # Words of its language, for those who put files together.
     beside: Mapping[str, bytes] = field(default_factory=dict)
     """Other files that it needs in the same folder."""
-    made_seeds: Callable[[], tuple[bytes, ...]] | None = None
+    made_seeds: Callable[[], tuple[bytes, ...]] = tuple
     """Makes further files that it accepts, where that takes a while."""
     files: int = 150
     """So many damaged files are read by the tests: fewer where each takes milliseconds."""
     needed: bool = True  # Whether it is an error that there is no file.
-    content: Callable[[bytes], bytes] | None = None
+    content: Callable[[bytes], bytes] = bytes
     """Makes a file's content of bytes, where damage to the file's own would not lead far; seeds are
     then such bytes."""
 
     def all_seeds(self) -> tuple[bytes, ...]:
         """All files that it accepts."""
-        return self.seeds if self.made_seeds is None else (*self.seeds, *self.made_seeds())
-
-    def content_of(self, data: bytes) -> bytes:
-        """What stands in the file: these bytes, or what they say of it."""
-        return data if self.content is None else self.content(data)
+        return (*self.seeds, *self.made_seeds())
 
     def prepare(self, folder: Path) -> Path:
         """Put what stands beside its file into a folder; gives back the file's place."""

@@ -98,11 +98,6 @@ def random_for(seed: int, purpose: Purpose) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([seed, _PURPOSES.index(purpose)]))
 
 
-def random_for_frame(seed: int, frame: int) -> np.random.Generator:
-    """The random numbers of one frame, whatever was rendered before it."""
-    return np.random.default_rng(np.random.SeedSequence([seed, len(_PURPOSES), frame]))
-
-
 def plan_run(settings: RunSettings, *, lit: bool = True) -> RunPlan:
     """Build the office, lay the discs and drive through it."""
     seed, frames = settings.seed, settings.frames
@@ -221,7 +216,9 @@ def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
     """Render one frame of a run and say what is in it."""
     import cv2
 
-    rng = random_for_frame(plan.settings.seed, frame)
+    # Its own random numbers, whatever was rendered before it.
+    seed = np.random.SeedSequence([plan.settings.seed, len(_PURPOSES), frame])
+    rng = np.random.default_rng(seed)
     camera = plan.true_camera(frame)
     pose = plan.poses[frame + 1]
     light = render_light(plan.scene, camera, pose)

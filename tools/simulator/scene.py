@@ -349,7 +349,7 @@ def make_scene(
         side_light=np.zeros((*floor_kind.shape, 3)),
         raster_m=_RASTER_M,
         ceiling_m=CEILING_M,
-        sun=np.array([*_unit(np.array(sun[:3])), sun[3]]),
+        sun=np.array([*(np.array(sun[:3]) / np.linalg.norm(sun[:3])), sun[3]]),
         sky=sky,
         photographs=_photographs(),
     )
@@ -449,7 +449,3 @@ def _photographs() -> Float32Array:
                 grey, (small, small), interpolation=cv2.INTER_AREA
             )
     return pyramid
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector))

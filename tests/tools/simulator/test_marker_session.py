@@ -161,7 +161,7 @@ def test_markers_are_in_the_image_where_the_truth_says(folder: Path) -> None:
 
 def test_published_like_session(full_plan: SessionPlan) -> None:
     assert len(full_plan.network.names) == 4
-    assert full_plan.references == 23
+    assert full_plan.settings.references == 23
     assert len(full_plan.rig.ids) == 6
     times, poses = full_plan.times_s, full_plan.poses
     drive = slice(23, None)

@@ -82,11 +82,6 @@ def first_from_second(rng: np.random.Generator) -> FloatArray:
     return np.asarray(transform)
 
 
-def world_board_pose(plan: SessionPlan) -> FloatArray:
-    """(4, 4) world_from_board of the board on the floor, before the first camera."""
-    return _world_view(plan).pose
-
-
 def _world_view(plan: SessionPlan) -> BoardView:
     """The board on the floor as near to the first camera as it is seen whole."""
     middle = 0.5 * np.array(plan.settings.area_m)
@@ -223,7 +218,8 @@ def _write_rig_images(plan: SessionPlan, folder: Path, writer: SessionWriter) ->
             poses.append(pose)
             seen.append(SeenFrame(name, prefix, _RIG_S + _PAUSE_S * number, view.markers))
     writer.times(folder, plan, seen)
-    writer.poses(folder / "truth.csv", np.array([s.time_s for s in seen]), np.stack(poses))
+    times_s = np.array([s.time_s for s in seen])
+    writer.poses(folder / "truth.csv", times_s, np.stack(poses))
     writer.truth(folder / "truth.json", plan, seen)
     return len(seen)
 
@@ -260,7 +256,7 @@ def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter
             for name, board in (("first", DOUBLE), ("second", DOUBLE), ("world", WORLD))
         },
         "first_from_second": _pose_json(offset),
-        "world_from_board": _pose_json(world_board_pose(plan)),
+        "world_from_board": _pose_json(_world_view(plan).pose),
         "images": rows,
     }
     write_json(folder / "boards.json", content, overwrite=writer.overwrite)

@@ -150,11 +150,6 @@ class SessionPlan:
     room: tuple[Surface, ...]  # What is behind all that, world frame.
     _backgrounds: dict[int, Float32Array] = field(default_factory=dict)
 
-    @property
-    def references(self) -> int:
-        """How many of the images are of the robot standing still."""
-        return self.settings.references
-
     @cached_property
     def camera_from_world(self) -> FloatArray:
         """(C, 4, 4) inverses of the cameras' poses."""
@@ -427,7 +422,7 @@ class SessionWriter:
             "conventions": _CONVENTIONS,
             "settings": asdict(plan.settings),
             "errors": asdict(self.errors),
-            "references": plan.references,
+            "references": plan.settings.references,
             "cameras": {
                 name: {"calibration": format_camera(camera), "world_from_camera": _rows_of(pose)}
                 for name, camera, pose in zip(
@@ -463,7 +458,7 @@ def write_session(
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))
     writer.times(folder, plan, seen)
     writer.poses(folder / "truth.csv", plan.times_s, plan.poses)
-    still = slice(0, plan.references)
+    still = slice(0, plan.settings.references)
     writer.poses(folder / "reference.csv", plan.times_s[still], plan.poses[still])
     writer.truth(folder / "truth.json", plan, seen)
     return len(work)
