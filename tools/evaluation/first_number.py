@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -19,6 +20,7 @@ from redetect.landmarks import read_frames, squared_mahalanobis
 from redetect.storage import write_whole
 from tools.evaluation.real_run import compare_rows, run_program
 from tools.evaluation.tables import markdown_table
+from tools.fuzz.bag_readers import Ros
 
 #: The table's place in a document, by comments.
 BEGIN, END = "<!-- first numbers -->", "<!-- end of first numbers -->"
@@ -102,24 +104,16 @@ def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]
 
 def write_bag(images: Path, place: Path) -> Path:
     """An MCAP file of the images of a folder, as ROS 2 writes them."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+    ros = Ros("mcap")
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    names = (
-        "sensor_msgs/msg/CompressedImage",
-        "std_msgs/msg/Header",
-        "builtin_interfaces/msg/Time",
-    )
-    image, header, time = (store.types[name] for name in names)
-    with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        topic = bag.add_connection("/image", image.__msgtype__, typestore=store)
+    def recorded() -> Iterator[tuple[str, int, Any]]:
         for number, path in enumerate(sorted(images.iterdir())):
             nanoseconds = round(1e9 * (1.0 + number / _FRAMES_PER_SECOND))
-            stamp = time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-            data = np.frombuffer(path.read_bytes(), np.uint8)
-            message = image(header(stamp=stamp, frame_id="camera"), "jpeg", data)
-            bag.write(topic, nanoseconds, store.serialize_cdr(message, image.__msgtype__))
+            header, data = ros.header(nanoseconds), np.fromfile(path, np.uint8)
+            name = "sensor_msgs/msg/CompressedImage"
+            yield "/image", nanoseconds, ros.make(name, header=header, format="jpeg", data=data)
+
+    ros.write(place, recorded())
     return (place / f"{place.name}.mcap").rename(place.with_suffix(".mcap"))
 
 

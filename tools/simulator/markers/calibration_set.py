@@ -24,7 +24,7 @@ from redetect.groundtruth.trajectories.transforms import (
     quaternion_xyzw,
 )
 from tools.arrays import ByteArray, FloatArray
-from tools.simulator.markers.rendering import Imaging, grey_image, render_light
+from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (
     NOTE,
@@ -165,7 +165,7 @@ def _seen(
 
 def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> ByteArray:
     settings, model = plan.settings, plan.network.cameras[view.camera]
-    imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
+    imaging = settings.imaging
     seen = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
     background = plan.background(view.camera)
     light = render_light(model, [seen], background, fine=imaging.fine, samples=settings.samples)

@@ -124,6 +124,11 @@ class SessionSettings:
     noise_grey: float = 2.0  # Standard deviation of the noise (grey levels).
     samples: int = 16  # Rays in each quarter of a pixel that an edge crosses.
 
+    @property
+    def imaging(self) -> Imaging:
+        """How light becomes grey values."""
+        return Imaging(self.blur_px, 6.0, 280.0, self.noise_grey)
+
 
 Purpose = Literal["rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame"]
 _PURPOSES = get_args(Purpose)
@@ -254,7 +259,7 @@ def view_robot(
         _surfaces(plan, camera_from_world, pose + offset * settings.exposure_s * speed)
         for offset in _instants(plan, camera, pose, speed)
     ]
-    imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
+    imaging = settings.imaging
     background = _shadowed(plan, camera, pose)
     light = render_light(model, exposures, background, fine=imaging.fine, samples=settings.samples)
     illumination = plan.illumination(camera)
