@@ -36,8 +36,6 @@ DISC_DIAMETER_M = 0.2
 # How far apart a disc's places may come out in the map when it is seen from some metres away.
 _AGREEMENT_M = 0.4
 
-# Odometry alone leads some 50 m astray: a wide bound lets the discs pull the path together.
-_PULL_TOGETHER = Weighting("geman-mcclure", 10.0)
 _LEAST_SQUARES = Weighting(calibrate=True, row_errors="recorded")
 _ROBUST = replace(_LEAST_SQUARES, loss="geman-mcclure", loss_scale=4.0)
 # What is rendered has to look right in every frame, near discs (whose published covariance is
@@ -45,7 +43,7 @@ _ROBUST = replace(_LEAST_SQUARES, loss="geman-mcclure", loss_scale=4.0)
 # has a tilt. The figures were chosen for the share of rows that come out inside the image's tables.
 _AS_SEEN = replace(_ROBUST, loss_scale=6.0, tilt_sigma_rad=float(np.radians(0.5)))
 _PIXEL_SIGMA, _ODOMETRY_FACTOR = 2.0, 8.0
-_COARSE, _FINE, _FINEST = 1e-4, 1e-6, 1e-9
+_FINE, _FINEST = 1e-6, 1e-9
 _MOST_STEPS = 300
 _MOST_MENDINGS = 10
 
@@ -170,19 +168,14 @@ def _as_seen(graph: Graph) -> Graph:
     )  # fmt: skip
 
 
-def stages(graph: Graph, start: Estimate | None = None) -> Iterator[Stage]:
-    """Fit a world to a recording, better with each stage; by default odometry is the start."""
+def stages(graph: Graph) -> Iterator[Stage]:
+    """Fit a world to a recording, better with each stage: the map of `slam map` is the first."""
     assert graph.camera is not None
-    if start is None:
-        first = first_sight(graph)
-        at = nominal(graph.camera, first.poses, first.disc_xy)
-        yield Stage("odometry", graph, at)
-        at = refit(graph, at, _PULL_TOGETHER, _COARSE)
-        yield Stage("robust, nominal mounting", graph, at)
-    else:
-        yield Stage("given path and map", graph, start)
-        at = refit(graph, start, _LEAST_SQUARES)
-        yield Stage("least squares, true mounting", graph, at)
+    plain = solve(graph, first_sight(graph), Weighting()).estimate
+    at = nominal(graph.camera, plain.poses, plain.disc_xy)
+    yield Stage("least squares, nominal mounting", graph, at)
+    at = refit(graph, at, _LEAST_SQUARES)
+    yield Stage("least squares, true mounting", graph, at)
     at = refit(graph, at, _ROBUST, _FINE)
     yield Stage("robust, true mounting", graph, at)
     at = refit(_as_seen(graph), at, _AS_SEEN, _FINE)

@@ -13,7 +13,7 @@ from redetect.landmarks import read_frames, write_frames
 from redetect.slam.mapping.graph import Estimate, graph_of_recording
 from redetect.slam.recording import read_recording
 from tests.tools.reenactment.synthetic import make_run, rows_of_pose
-from tools.reenactment.__main__ import main, read_start
+from tools.reenactment.__main__ import main
 from tools.reenactment.prepare import assess, stages
 from tools.reenactment.world import WorldError, read_world
 
@@ -76,19 +76,6 @@ def test_same_bytes_again(
 
 
 def test_errors_are_one_line(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run_folder / "path.csv").write_text("0,0,0\n")
-    path = str(run_folder / "path.csv")
-    assert main(arguments(run_folder, "--path", path)) == 1
-    assert "--path and --map belong together" in capsys.readouterr().err
-    for text, message in (
-        ("0,0,0\n", "path.csv: 1 poses: expected 121, the first 0, 0, 0"),
-        ("0,0,0\n1,2\n", "expected 3 numbers a row"),
-        ("0,0,nan\n", "path.csv: expected 3 numbers a row"),
-        ("0,0,0\n" * 121, "path.csv: no disc with ID 5"),
-    ):
-        (run_folder / "path.csv").write_text(text)
-        assert main(arguments(run_folder, "--path", path, "--map", path)) == 1
-        assert message in capsys.readouterr().err
     rows = (run_folder / "map.circles").read_text()
     steps = [line for line in rows.splitlines() if "LANDMARK" not in line]
     for text, message in (
@@ -121,17 +108,13 @@ def test_run_e(shared_data: Path, published_camera: Camera) -> None:
     graph = graph_of_recording(read_recording(folder / "map.circles"), published_camera)
     counts = len(graph.steps), len(graph.disc_pose), len(graph.disc_ids)
     assert counts == (3297, 14_309, 576)
-    path, disc_map = (folder / f"least_squares_{name}.csv" for name in ("path", "map"))
-    by_least_squares = stages(graph, read_start(path, disc_map, published_camera, graph))
-    published, corrected = (assess(*next(by_least_squares)[1:]) for _ in range(2))
+    every = [assess(*stage[1:]) for stage in stages(graph)]
+    published, corrected, world = every[0], every[1], every[-1]
     assert published.chi_squared == pytest.approx(56_871.4, abs=0.15)
     assert corrected.chi_squared == pytest.approx(37_450.2, abs=1.0)
     expected = [-0.0366, 0.0099, 0.0024, -0.0111]
     np.testing.assert_allclose(corrected.mounting, expected, atol=5e-4)
     assert published.share_whole_pixel < corrected.share_whole_pixel < 0.999
-    # Odometry alone as a start leads to a world, too.
-    *_, (_, mended, world) = stages(graph)
-    quality = assess(mended, world)
-    assert quality.share_whole_pixel >= 0.999
-    assert quality.median_px < 0.8
-    assert quality.out_of_sight <= 3
+    assert world.share_whole_pixel >= 0.999
+    assert world.median_px < 0.8
+    assert world.out_of_sight <= 3
