@@ -60,7 +60,8 @@ class FusionStudy:
     ones, and the NEES at one instant of each session.
     """
 
-    seeds: int = 20  # Sessions, of the seeds from 1 on.
+    seeds: int = 20  # Seeds first, first + 1, ...
+    first: int = 1
     fault: Fault = "none"
     """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
     a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
@@ -74,7 +75,8 @@ class FusionStudy:
             write_session(settings, session, seed=seed)
             return errors_of_session(session)
 
-        table, rows = table_of_sessions(_COLUMNS, self.seeds, measured)
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_COLUMNS, seeds, measured)
         table.row("mean", *np.nanmean(rows, axis=0))
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))

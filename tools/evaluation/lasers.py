@@ -62,14 +62,14 @@ def run_groundtruth(*arguments: object) -> None:
 
 
 def table_of_sessions(
-    columns: Mapping[str, str], seeds: int, measure: Callable[[Path, int], dict[str, float]]
+    columns: Mapping[str, str], seeds: range, measure: Callable[[Path, int], dict[str, float]]
 ) -> tuple[Table, FloatArray]:
-    """Measure a session, in a folder of its own, for each seed from 1 on, and print a row of it.
+    """Measure a session, in a folder of its own, for each seed, and print a row of it.
 
     Returns the rows (N, columns), too.
     """
     table, rows = Table({"seed": "<5", **columns}), []
-    for seed in range(1, seeds + 1):
+    for seed in seeds:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 row = measure(Path(folder), seed)
@@ -85,7 +85,8 @@ def table_of_sessions(
 class LaserSessions:
     """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
 
-    seeds: int = 20  # Sessions, of the seeds from 1 on.
+    seeds: int = 20  # Seeds first, first + 1, ...
+    first: int = 1
     scanners: Literal["aligned", "true"] = "aligned"
     """`aligned`: by `groundtruth lasers` from poses measured by hand; `true`: the exact ones."""
     fault: Literal["none", "crossing", "moved", "rectangle"] = "none"
@@ -96,7 +97,8 @@ class LaserSessions:
     average: int = 6  # Sets of scans per pose.
 
     def __call__(self) -> int:
-        table, rows = table_of_sessions(_COLUMNS, self.seeds, self._measured)
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_COLUMNS, seeds, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
