@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from detect.run import Run
 from detect.sources.opening import open_run
 from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
+from tools.arrays import ByteArray
 from tools.benchmark import functions as f
 from tools.benchmark.material import (
     Picture,
@@ -161,10 +162,11 @@ def _timed(
     """Times of functions, in turn with decoding."""
     print(f"{part} {case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
     decoding: dict[str, f.Function] = {f.DECODING: lambda picture: decode(picture.encoded)}
-    bound = {
-        name: partial(lambda function, number: function(pictures[number]), function)
-        for name, function in {**decoding, **functions}.items()
-    }
+
+    def of_pictures(function: f.Function) -> Callable[[int], object]:
+        return lambda number: function(pictures[number])
+
+    bound = {name: of_pictures(each) for name, each in {**decoding, **functions}.items()}
     seconds = measure_in_turn(bound, len(pictures), settings.rounds, settings.budget_s)
     return times_of(part, case, seconds, f.DECODING)
 
@@ -192,12 +194,16 @@ def measure_runs(
     paths = [frame.image for frame in open_run(run).frames if frame.image is not None]
     files = contents_of(paths)
 
+    def decode_all(contents: Iterable[ByteArray]) -> None:
+        for content in contents:
+            decode(content)
+
     def perform(name: str, jobs: int, _: int) -> None:
         f.perform(f.commands(run, folder, jobs)[name])
 
     functions: dict[str, Callable[[int], object]] = {
-        "decoding": lambda _: [decode(content) for content in files],
-        "reading": lambda _: [decode(np.fromfile(path, np.uint8)) for path in paths],
+        "decoding": lambda _: decode_all(files),
+        "reading": lambda _: decode_all(np.fromfile(path, np.uint8) for path in paths),
         **{f"{name} {jobs}": partial(perform, name, jobs) for name, jobs in chosen},
     }
     # By the clock on the wall, since jobs are processes of their own.
