@@ -73,7 +73,7 @@ def fuzz(name: str, seconds: int, corpora: Path | None) -> None:
     longest = max(map(len, reader.all_seeds()), default=0)
 
     def one_input(data: bytes) -> None:
-        path.write_bytes(reader.content_of(data))
+        path.write_bytes(reader.content(data))
         attempt(reader, path)
 
     flags = [

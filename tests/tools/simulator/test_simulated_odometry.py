@@ -9,13 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.landmarks import Step, parse_record
+from redetect.landmarks import Frame, Step, parse_record
+from redetect.slam.models.motion import relative_pose
+from redetect.slam.recording import recording_of_frames
 from tools.simulator.driving import (
     DriveStyle,
     drive,
     joined_steps,
     measured_steps,
-    relative_pose,
     robot_tilt,
     step_covariance,
     step_record,
@@ -94,7 +95,7 @@ def test_joined_steps_are_the_way_between_frames() -> None:
     true = relative_pose(poses[:-1], poses[1:])
     rows = [step_record(f"s.{k}", step) for k, step in enumerate(true)]
     kept = [0, 7, 19, 39]
-    joined = joined_steps(rows, kept)
+    joined = joined_steps(recording_of_frames([Frame(row) for row in rows], "s"), kept)
     assert [s.prefix for s in joined] == ["s.0", "s.7", "s.19", "s.39"]
     ends = poses[[0, *(k + 1 for k in kept)]]
     found = np.array([[s.dx, s.dy, s.dphi] for s in joined])
