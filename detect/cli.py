@@ -13,14 +13,17 @@ import atexit
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from tyro import MISSING
 
+from detect.errors import DetectError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
 from detect.settings import MARKER_PRESETS, CircleSettings, MarkerSettings
 from detect.settings import PRESETS as CIRCLE_PRESETS
+from detect.settings_files import read_settings
 from detect.terminal import interrupts_noted, show_announcements
 from detect.viewing_options import (
     Compare,
@@ -103,17 +106,23 @@ def carry_out(command: Command) -> int:
 def parsed(arguments: Sequence[str]) -> Command:
     """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
-    preset = _preset(arguments)
+    preset, file = _value_of("--preset", arguments), _value_of("--settings", arguments)
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MARKER_PRESETS.get(preset, MarkerSettings())
+    if file and not {"-h", "--help", "--help-all"} & set(arguments):
+        if preset:
+            raise DetectError("--preset and --settings: expected one of them")
+        read = read_settings(Path(file))
+        circles, lines, markers = read.circles, read.lines, read.markers
     command: Command = PROGRAM.parsed(
         arguments,
         (
-            Circles(run=MISSING, settings=circles),
-            Lines(run=MISSING, settings=lines),
-            Markers(run=MISSING, settings=markers),
+            Circles(run=MISSING, parameters=circles),
+            Lines(run=MISSING, parameters=lines),
+            Markers(run=MISSING, parameters=markers),
             All(run=MISSING, circles=circles, lines=lines),
+            Explain(image=MISSING, parameters=circles),
         ),
     )
     return command
@@ -134,11 +143,11 @@ def _with_radius_found(arguments: Sequence[str]) -> list[str]:
     return found
 
 
-def _preset(arguments: Sequence[str]) -> str:
-    """The preset that a command line names: it decides the other flags' defaults."""
+def _value_of(flag: str, arguments: Sequence[str]) -> str:
+    """The value of a flag that decides the other flags' defaults; empty if it is not there."""
     for word, following in zip(arguments, [*arguments[1:], ""]):
-        if word == "--preset":
+        if word == flag:
             return following
-        if word.startswith("--preset="):
+        if word.startswith(f"{flag}="):
             return word.partition("=")[2]
-    return "default"
+    return ""

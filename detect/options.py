@@ -104,6 +104,9 @@ class DetectorFlags(RunFlags):
     """
 
     preset: Preset = "default"  #: Values that the other flags start from.
+    #: JSON file with the values that the other flags start from: that of `detect tune --serve`, or
+    #: a result's .log.json, to detect with the same ones again.
+    settings: MaybePath = None
     #: How lines end in files of landmarks; the data set's own end with CR and LF.
     line_ends: LineEnds = "lf"
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
@@ -156,8 +159,9 @@ class Circles(DetectorFlags):
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     draw: MaybePath = None  #: Folder for images with the outlines and qualities drawn in.
-    json: MaybePath = None  #: Write the rows with their pixels and evidence as JSON as well.
-    settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+    #: Write the rows with their pixels and evidence as JSON as well; -: to standard output, alone.
+    json: MaybePath = None
+    parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +189,7 @@ class Lines(DetectorFlags):
     draw: MaybePath = None
     rejected: bool = False  #: Draw all tracks instead, the rejected ones with the reason.
     response: bool = False  #: Draw the filter's response as well, into files of their own.
-    settings: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
+    parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +212,7 @@ class Markers(DetectorFlags):
 
     #: Folder for images with the markers drawn in, and with what was rejected.
     draw: MaybePath = None
-    settings: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
+    parameters: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

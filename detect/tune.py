@@ -27,6 +27,7 @@ from detect.report.figures import draw_rates, f1_score, knee, pareto_front
 from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import PUBLISHED, CircleSettings, parameter_value
+from detect.settings_files import read_settings
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
@@ -45,9 +46,9 @@ from redetect.storage import OutputExistsError, write_bytes
 
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
-    base: Settings = PUBLISHED if options.preset == "published" else CircleSettings()
-    if options.verticals:
-        base = PRESETS[options.preset]
+    base = _base(options)
+    if options.serve:
+        return _serve(options, base)
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
     grid = combinations(type(base), varied, options.most)
     settings = [replace(base, **combination) for combination in grid]
@@ -118,6 +119,29 @@ def perform(options: Tune) -> int:
     failures = sorted({failure for trial in trials for failure in trial.failures})
     print_failures(len(failures), failures)
     return EXIT_FRAMES_FAILED if failures else 0
+
+
+def _base(options: Tune) -> Settings:
+    """The values of what is not varied."""
+    if options.settings is not None:
+        read = read_settings(options.settings)
+        return read.lines if options.verticals else read.circles
+    if options.verticals:
+        return PRESETS[options.preset]
+    return PUBLISHED if options.preset == "published" else CircleSettings()
+
+
+def _serve(options: Tune, base: Settings) -> int:
+    from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
+
+    if not isinstance(base, CircleSettings):
+        raise DetectError("--serve and --verticals: the page is for discs")
+    demand_recording(options.run)
+    run = open_run(options.run, options.camera, options.source)
+    _, selection = select_frames(run.frames, options.frames, options.every)
+    frames = [frame for _, frame in selection]
+    output = run.output("tune") if options.output is None else options.output
+    return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
 
 def _plain(value: Any) -> Any:

@@ -24,7 +24,7 @@ from detect.options import (
     SourceOptions,
 )
 from detect.settings import CircleSettings
-from redetect.storage.bounds import ABOVE_0, NotNegative, Positive, demand_fields
+from redetect.storage.bounds import ABOVE_0, NotNegative, Positive, demand_fields, whole
 
 ErrorCovariance = Literal["detected", "reference", "sum"]
 
@@ -92,7 +92,7 @@ class Compare:
     camera: MaybePath = None
     min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
     min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
-    json: MaybePath = None  #: Write the result as JSON.
+    json: MaybePath = None  #: Write the result as JSON; -: to standard output, alone.
     force: bool = False  #: Replace an existing JSON file.
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
@@ -198,9 +198,10 @@ class Explain:
     camera: MaybePath = None
     #: PNG file for a picture of the candidates, numbered as in the table.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    json: MaybePath = None  #: Write the candidates as JSON.
+    json: MaybePath = None  #: Write the candidates as JSON; -: to standard output.
     force: bool = False  #: Replace existing files.
-    settings: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+    settings: MaybePath = None  #: JSON file with the values that the other flags start from.
+    parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,15 +253,19 @@ class Tune(PickedFrames, RowsFlags):
 
     Any parameter of `detect circles` (with --verticals: of `detect lines`) can be varied: by
     FROM:TO:STEP, both ends included, or by values with commas between them. All combinations are
-    tried.
+    tried. With --serve, the settings of discs are turned by hand on a page instead, which needs no
+    reference rows, and labels discs.
 
     Parameters
     ----------
     output : Path
-        Folder for table.csv, table.json and curve.png; by default `detected.tune` in the run
-        folder.
+        Folder for table.csv, table.json and curve.png, or for what the page saves: tuned.json
+        (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
+    serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
+    port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
+    settings: MaybePath = None  #: JSON file with the values that are not varied.
     verticals: bool = False  #: Tune the detector of verticals instead of that of discs.
     #: `default` or `published`: the values of all parameters that are not varied.
     preset: Preset = "default"

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from importlib import import_module
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
+from redetect.cli import main
 from redetect.programs import PROGRAMS
 
 
@@ -93,3 +96,13 @@ def test_every_flag_has_help(program: str, capsys: pytest.CaptureFixture[str]) -
             words = re.split(r"\s{2,}", line, maxsplit=1)[1:] or [following]
             if flag and len(line) < 100:
                 assert not re.match(r"\((default|required)", words[0]), f"{command} {flag[1]}"
+
+
+def test_json_alone_on_standard_output(
+    project_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = project_root / "images" / "e"
+    shipped = str(run / "map.circles")
+    assert main(["detect", "compare", str(run), "--detected", shipped, "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["missed"] == 0
+    assert not Path("-").exists()

@@ -71,7 +71,7 @@ def _circles(command: Circles, run: Run) -> Job:
     places = {"circles": _output(command, run, "circles")}
     if command.json is not None:
         places["json"] = command.json
-    settings = _with_radius(command.settings, run) if command.find_radius else command.settings
+    settings = _with_radius(command.parameters, run) if command.find_radius else command.parameters
     plan = FramePlan(run.camera, circles=settings, drawing="discs")
     tilts = None if command.tilt is None else read_tilts(command.tilt)
     known = replace(_known_discs(command.ids), tilts=tilts)
@@ -80,7 +80,7 @@ def _circles(command: Circles, run: Run) -> Job:
 
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
-    settings = command.settings
+    settings = command.parameters
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
@@ -94,7 +94,7 @@ def _lines(command: Lines, run: Run) -> Job:
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
     camera = run.camera if isinstance(run, Run) else None
-    plan = FramePlan(camera, markers=command.settings, drawing="markers")
+    plan = FramePlan(camera, markers=command.parameters, drawing="markers")
     return Job(run, plan, {"markers": _output(command, run, "markers")}, pictures=command.draw)
 
 

@@ -14,9 +14,10 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
@@ -114,6 +115,10 @@ def _is_of_cache(error: Exception) -> bool:
     return _NUMBAS_CACHING in "".join(traceback.format_exception(error))
 
 
+#: As the name of a JSON file: standard output, and nothing else there.
+_STANDARD_OUTPUT = Path("-")
+
+
 @dataclass(frozen=True)
 class Program:
     """A program with its commands."""
@@ -146,6 +151,8 @@ class Program:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         words = [word for word in arguments if word not in _QUIET]
         command = parse(words)
+        if getattr(command, "json", None) == _STANDARD_OUTPUT:
+            return _with_json_alone(command, carry_out)
         if len(words) == len(arguments):
             return carry_out(command)
         with _quietly():
@@ -239,6 +246,17 @@ def _quietly() -> Iterator[None]:
             yield
     finally:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
+
+
+def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
+    """Carry out a command, with what goes into its JSON file alone on standard output."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "result.json"
+        with _quietly():
+            code = carry_out(replace(command, json=path))
+        if path.exists():
+            sys.stdout.write(path.read_text("utf-8"))
+    return code
 
 
 def flags_of(kind: type, prefix: str = "") -> Iterator[str]:

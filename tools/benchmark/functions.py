@@ -112,7 +112,11 @@ def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
     """The commands that are measured on a run, by name; their files go into a folder."""
     return {
         "detect circles --preset published": Circles(
-            run=run, output=output / "published.circles", force=True, jobs=jobs, settings=PUBLISHED
+            run=run,
+            output=output / "published.circles",
+            force=True,
+            jobs=jobs,
+            parameters=PUBLISHED,
         ),
         "detect circles": Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs),
         "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),

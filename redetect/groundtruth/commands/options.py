@@ -105,7 +105,7 @@ class Score:
     rpe_step: MaybeInt = None  # Relative errors are between poses this many compared poses apart.
     # Such steps that take longer, as across a gap, do not count (s).
     rpe_longest_s: float = float("inf")
-    json: MaybePath = None  # Write the figures as JSON.
+    json: MaybePath = None  # Write the figures as JSON; -: to standard output, alone.
     force: bool = False  # Replace an existing file.
 
 

@@ -1,0 +1,302 @@
+"""A page to turn knobs: an image of a run, its discs under the settings of the moment, and why.
+
+``detect tune RUN --serve`` starts a server of the standard library for one person's browser on the
+same machine. It listens on the loopback alone, and answers only who knows the token in the page's
+address and asks for this machine by name: no other user, and no other page in the browser, gets
+anything. What is detected is what every other command would detect (`detect.discs.unfound`).
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import math
+import secrets
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.circles import detect_circles, disc_shape
+from detect.discs.unfound import explain_discs
+from detect.drawing.frame import png_of
+from detect.errors import DetectError
+from detect.seen import circle_on_floor
+from detect.settings import CircleSettings
+from detect.settings_files import checked_settings, settings_text
+from detect.sources.interface import Run, RunFrame, read_image
+from lut import cached_disc_table
+from redetect.landmarks import CircleLandmark, Frame
+from redetect.landmarks.writing import format_frame, format_head
+from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage.messages import OneLineError
+
+SETTINGS_NAME, LABELS_NAME = "tuned.json", "labels.circles"
+#: Longest request: some hundred settings, and labels of every frame.
+_LONGEST_BYTES = 1 << 22
+#: Points of an outline, and half axes of an ellipse in standard deviations.
+_OUTLINE, _SIGMAS = 32, 3.0
+_LABELS_HEAD = "Discs with identifiers given by hand, on the page of `detect tune --serve`."
+
+
+@dataclass(frozen=True)
+class Label:
+    """A disc with an identifier that a person gave it."""
+
+    px: float
+    py: float
+    quality: float
+    cxx: float
+    cxy: float
+    cyy: float
+    id: int
+
+
+@dataclass
+class TuningSession:
+    """What the page shows and saves; its methods may be called by several threads."""
+
+    run: Run
+    frames: Sequence[RunFrame]
+    settings: CircleSettings  # that the page begins with
+    output: Path  # the folder that settings and labels are saved in
+    force: bool = False  #: Replace files that were there before the session.
+    _saved: set[Path] = field(default_factory=set)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        self.image = lru_cache(maxsize=16)(self._image)
+
+    def _image(self, number: int) -> NDArray[np.uint8]:
+        return read_image(self.frames[number], self.run.camera)
+
+    def described(self) -> dict[str, Any]:
+        """What the page has to know of the run."""
+        camera = self.run.camera
+        return {
+            "name": self.run.name,
+            "frames": [frame.step.prefix for frame in self.frames],
+            "settings": asdict(self.settings),
+            "width": camera.width,
+            "height": camera.height,
+            # Pixels need not be square: single fields of interlaced frames are half as high.
+            "aspect": camera.scale_x / camera.scale_y,
+        }
+
+    def detect(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The discs of a frame under some settings, and the candidates that are none."""
+        settings = checked_settings("circles", values, CircleSettings)
+        image, camera = self.image(number), self.run.camera
+        table = cached_disc_table(camera, disc_shape(settings))
+        found = detect_circles(image, camera, table, settings)
+        told = explain_discs(image, camera, settings)
+        discs = [
+            {
+                "x": float(xy[0]),
+                "y": float(xy[1]),
+                "covariance": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
+                "quality": float(quality),
+                "evidence": _finite(evidence),
+                "outline": self._outline(xy, settings.radius_m),
+                "ellipse": _ellipse(xy, c),
+            }
+            for xy, c, quality, evidence in zip(
+                found.floor_xy, found.covariance, found.quality, found.evidence, strict=True
+            )
+        ]
+        rejected = [
+            {
+                "u": candidate.u,
+                "v": candidate.v,
+                "stage": candidate.stage,
+                "reason": candidate.reason(),
+                "quality": candidate.quality,
+                "outline": self._outline((candidate.x_m, candidate.y_m), settings.radius_m),
+            }
+            for candidate in told.candidates
+            if not candidate.is_disc
+        ]
+        return {"discs": discs, "rejected": rejected, "suggestions": list(told.suggestions)}
+
+    def _outline(self, centre_xy: Any, radius_m: float) -> list[list[float]]:
+        places = self.run.camera.project_floor(circle_on_floor(centre_xy, radius_m, _OUTLINE))
+        return [[float(u), float(v)] for u, v in places if math.isfinite(u)]
+
+    def save(self, values: Mapping[str, Any], labels: Mapping[str, Any]) -> list[str]:
+        """Write the settings, and the labels of frames by their numbers; what was written."""
+        settings = checked_settings("circles", values, CircleSettings)
+        contents = {SETTINGS_NAME: settings_text(circles=settings).encode()}
+        labelled = {int(number): [_label(one) for one in some] for number, some in labels.items()}
+        if any(labelled.values()):
+            contents[LABELS_NAME] = format_head(_LABELS_HEAD) + b"".join(
+                format_frame(Frame(frame.step, _rows(labelled.get(number, []))))
+                for number, frame in enumerate(self.frames)
+            )
+        with self._lock:
+            self.output.mkdir(parents=True, exist_ok=True)
+            for name, content in contents.items():
+                path = self.output / name
+                # What the page itself wrote it writes again as often as it is asked to.
+                if path.exists() and path not in self._saved and not self.force:
+                    raise OutputExistsError(path)
+                write_bytes(path, content, overwrite=True)
+                self._saved.add(path)
+        return [str(self.output / name) for name in contents]
+
+
+def _label(values: Mapping[str, Any]) -> Label:
+    try:
+        label = Label(**{name: float(value) for name, value in values.items()})  # type: ignore[arg-type]
+        return replace(label, id=int(label.id))
+    except (TypeError, ValueError, OverflowError):
+        raise DetectError(
+            "a label: expected a position, its covariance and an identifier"
+        ) from None
+
+
+def _rows(labels: Sequence[Label]) -> tuple[CircleLandmark, ...]:
+    return tuple(
+        CircleLandmark(one.px, one.py, one.quality, one.cxx, one.cxy, one.cyy, (one.id,))
+        for one in labels
+    )
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _ellipse(centre_xy: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[list[float]]:
+    """Where the disc is within three standard deviations, on the floor."""
+    values, axes = np.linalg.eigh(covariance)
+    half = _SIGMAS * np.sqrt(np.maximum(values, 0.0))
+    points = circle_on_floor((0.0, 0.0), 1.0, _OUTLINE) * half @ axes.T + centre_xy
+    return [[float(x), float(y)] for x, y in points]
+
+
+class TuningServer(ThreadingHTTPServer):
+    """Serves the page of a session on the loopback; `address` is what to open."""
+
+    daemon_threads = True
+
+    def __init__(self, session: TuningSession, port: int = 0) -> None:
+        self.session, self.token = session, secrets.token_urlsafe(24)
+        super().__init__(("127.0.0.1", port), _Handler)
+
+    @property
+    def address(self) -> str:
+        """The page's address, with the token."""
+        return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: TuningServer
+    protocol_version = "HTTP/1.1"
+    timeout = 60  # of a connection on which nothing comes
+
+    def log_message(self, *_: Any) -> None:
+        """The terminal is for what the person has to know."""
+
+    def do_GET(self) -> None:
+        """The page, or the image of a frame."""
+        if not self._allowed(parse_qs(urlsplit(self.path).query).get("token", [""])[0]):
+            return
+        path = urlsplit(self.path).path
+        session = self.server.session
+        if path == "/":
+            page = files("detect").joinpath("tuning_page.html").read_text("utf-8")
+            described = {**session.described(), "token": self.server.token}
+            content = json.dumps(described).replace("<", "\\u003c")
+            self._answer("text/html; charset=utf-8", page.replace("@RUN@", content).encode())
+        elif path.startswith("/frame/"):
+            self._try(lambda: ("image/png", png_of(session.image(self._number(path[7:])))))
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+
+    def do_POST(self) -> None:
+        """Detect, or save."""
+        if not self._allowed(self.headers.get("X-Token", "")):
+            return
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > _LONGEST_BYTES:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request is too long")
+            return
+        body = self.rfile.read(int(length))
+        self._try(lambda: ("application/json", json.dumps(self._carried_out(body)).encode()))
+
+    def _carried_out(self, body: bytes) -> dict[str, Any]:
+        request = json.loads(body)
+        session = self.server.session
+        if self.path == "/detect":
+            return session.detect(self._number(request["frame"]), request["settings"])
+        if self.path == "/save":
+            return {"saved": session.save(request["settings"], request["labels"])}
+        raise DetectError("no such request")
+
+    def _number(self, word: Any) -> int:
+        number = int(word)
+        if not 0 <= number < len(self.server.session.frames):
+            raise DetectError(
+                f"{number} is no frame: expected 0 to {len(self.server.session.frames) - 1}"
+            )
+        return number
+
+    def _allowed(self, token: str) -> bool:
+        """Whether the request has the token, and asks for this machine by its own name.
+
+        Another page can make a name of its own point here; then the browser says that name.
+        """
+        host = self.headers.get("Host", "").rpartition(":")[0]
+        known = hmac.compare_digest(token.encode(), self.server.token.encode())
+        if known and host in ("127.0.0.1", "localhost"):
+            return True
+        self._refuse(HTTPStatus.FORBIDDEN, "open the address that the terminal shows")
+        return False
+
+    def _try(self, work: Any) -> None:
+        try:
+            kind, content = work()
+        except (OneLineError, OSError) as error:
+            self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+        except (ValueError, KeyError, TypeError, AttributeError):
+            self._refuse(HTTPStatus.BAD_REQUEST, "not understood")
+        else:
+            self._answer(kind, content)
+
+    def _refuse(self, status: HTTPStatus, words: str) -> None:
+        self.close_connection = True
+        self._answer("application/json", json.dumps({"error": words}).encode(), status)
+
+    def _answer(self, kind: str, content: bytes, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header(
+            "Content-Security-Policy",
+            "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+            "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'",
+        )
+        self.end_headers()
+        self.wfile.write(content)
+
+
+def serve(session: TuningSession, port: int = 0) -> int:
+    """Serve the page until an interrupt; returns the exit code."""
+    with TuningServer(session, port) as server:
+        print(f"{server.address}\nCtrl-C ends it.", flush=True)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print()
+    return 0
