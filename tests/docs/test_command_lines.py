@@ -65,8 +65,13 @@ def start(words: list[str]) -> None:
 
 
 def test_every_command_line_is_accepted(
-    project_root: Path, accepts: Callable[[list[str]], bool], capsys: pytest.CaptureFixture[str]
-) -> None:
+    project_root: Path, accepts: Callable[[list[str]], bool], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:  # fmt: skip
+    # A file of settings decides what flags begin with: it has to be there.
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "tuned.json").write_text('{"settings": {}}')
+    monkeypatch.chdir(tmp_path)
     shown: dict[tuple[str, ...], str] = {}
     for document in documents(project_root):
         for block in blocks_of(document):
