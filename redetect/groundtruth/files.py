@@ -8,14 +8,12 @@ from collections.abc import Mapping
 from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_FILE_BYTES = 1 << 26
 _LARGEST_NUMBER = 1e100

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.errors import LandmarkError
 from redetect.landmarks.records import CircleLandmark
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +32,7 @@ class CircleArrays:
     xy: FloatArray
     quality: FloatArray
     covariance: FloatArray
-    ids: NDArray[np.int64]
+    ids: IntArray
 
 
 def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
@@ -92,7 +91,7 @@ def circle_landmarks(
     )
 
 
-def is_positive_definite(covariance: ArrayLike) -> NDArray[np.bool_]:
+def is_positive_definite(covariance: ArrayLike) -> BoolArray:
     """Which covariance matrices are positive definite, that is, can be inverted and used.
 
     Covariances are read from files unchecked; callers that need valid ones check them here.

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray
+
 IndexArray = NDArray[np.intp]
 
 

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.errors import LandmarkFileError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.array_types import FloatArray, IntArray
+
 LossKind = Literal["none", "huber", "cauchy", "geman-mcclure"]
 X = TypeVar("X")
 

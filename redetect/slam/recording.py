@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, read_frames
 from redetect.slam.errors import SlamError
 from redetect.slam.models.odometry_noise import OdometryNoise
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 UNKNOWN_ID = -1
 

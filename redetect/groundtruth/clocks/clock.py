@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_json_value
-
-FloatArray = NDArray[np.float64]
-
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
 

@@ -15,12 +15,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import StreamError
 from redetect.storage.bounded import read_bounded
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_FILE_BYTES = 1 << 28
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"

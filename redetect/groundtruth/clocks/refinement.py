@@ -13,17 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, minimize
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.learning import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-
-FloatArray = NDArray[np.float64]
 
 _MARGIN_S = 2.0
 _LEAST_WAY_M = 1.0

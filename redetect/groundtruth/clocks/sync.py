@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, direct, minimize
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
 from redetect.groundtruth.clocks.headings import (
     HeadingPair,
@@ -31,8 +31,6 @@ from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering,
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
@@ -278,7 +276,7 @@ def _simplex(start: FloatArray) -> FloatArray:
     return np.asarray(start + np.vstack([np.zeros(len(start)), np.diag(inward)]))
 
 
-def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> NDArray[np.bool_]:
+def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> BoolArray:
     """Which samples are no gross errors of one of the streams."""
     level = without_turns(pair.differences(offset_s, drift))
     centre = float(np.median(level))

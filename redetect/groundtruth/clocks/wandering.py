@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar, nnls
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.headings import HeadingPair, without_turns
 from redetect.groundtruth.errors import GroundTruthError
-
-FloatArray = NDArray[np.float64]
-
 
 LAGS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 # The median of a chi-squared variable with one degree of freedom.

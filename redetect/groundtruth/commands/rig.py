@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.commands.outputs import (
     check_outputs,
@@ -33,8 +33,6 @@ from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, rea
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_whole
-
-FloatArray = NDArray[np.float64]
 
 
 def perform(command: RigCommand) -> int:

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.inputs import FuseSettings, pauses_of
 from redetect.groundtruth.fusion.learning import (
@@ -35,9 +35,6 @@ from redetect.groundtruth.trajectories.matching import (
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
-
 
 __all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
 
@@ -280,7 +277,7 @@ def _left_out(
     )
 
 
-def _during(poses: PlanarPoses, from_s: float, to_s: float) -> NDArray[np.bool_]:
+def _during(poses: PlanarPoses, from_s: float, to_s: float) -> BoolArray:
     return np.asarray((poses.times_s >= from_s) & (poses.times_s <= to_s))
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.fusion.kernels import (
     AFTER_REJECTIONS,
     POSE,
@@ -30,8 +31,6 @@ from redetect.groundtruth.fusion.kernels import (
     smooth_backward,
 )
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 #: Least time without measurements that is a gap: rejections after it are attributed to it.
 UNMEASURED_S = 1.0
@@ -56,7 +55,7 @@ class Bridge:
 
 
 def gaps_where_lost(
-    nodes: NDArray[np.int64], accepted: NDArray[np.bool_], restarted: NDArray[np.int8]
+    nodes: IntArray, accepted: BoolArray, restarted: NDArray[np.int8]
 ) -> list[tuple[int, int]]:
     """Nodes of the last measurement before, and the first one after, each gap that is too long."""
     good = nodes[accepted]
@@ -68,8 +67,8 @@ def gaps_where_lost(
 
 def ends_that_did_not_fit(
     times_s: FloatArray,
-    nodes: NDArray[np.int64],
-    accepted: NDArray[np.bool_],
+    nodes: IntArray,
+    accepted: BoolArray,
     restarted: NDArray[np.int8],
 ) -> list[int]:
     """Nodes after gaps where those rejections began that made the filter restart."""

@@ -7,14 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.plane import between, log_motion
 from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
-
-FloatArray = NDArray[np.float64]
-
 
 _DEVIATIONS = (
     "distance_sigma",
@@ -76,7 +73,7 @@ class FuseSettings:
             [self.turn_scale_sigma, self.turn_bias_per_metre_sigma, self.distance_scale_sigma]
         )
 
-    def with_terms(self, kept: NDArray[np.bool_]) -> FuseSettings:
+    def with_terms(self, kept: BoolArray) -> FuseSettings:
         """With some of these three alone; the others are taken to be 0."""
         turn, bend, way = np.where(kept, self.systematic_sigmas(), 0.0).tolist()
         return replace(
@@ -111,7 +108,7 @@ def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
 
 
-def _paused(times_s: FloatArray) -> NDArray[np.bool_]:
+def _paused(times_s: FloatArray) -> BoolArray:
     interval = np.diff(times_s)
     if len(interval) == 0:
         return np.zeros(0, dtype=np.bool_)
@@ -149,7 +146,7 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
 
 def _distinct(
     times_s: FloatArray, way: FloatArray, turn: FloatArray, settings: FuseSettings
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Between which samples the robot turned by more than odometry's random errors explain.
 
     Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
@@ -261,14 +258,14 @@ def gather(
     )
 
 
-def _repeats(stream: PlanarPoses, covariances: FloatArray) -> NDArray[np.bool_]:
+def _repeats(stream: PlanarPoses, covariances: FloatArray) -> BoolArray:
     """(N,) which rows are those before them."""
     rows = np.column_stack([stream.times_s, stream.poses, covariances.reshape(len(stream), 9)])
     same = np.all(rows[1:] == rows[:-1], axis=1)
     return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
 
 
-def _usable(name: str, covariances: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, int]:
+def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:
     """Covariances of rows made symmetric, and raised where rounding made them singular."""
     symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
     smallest = np.linalg.eigvalsh(symmetric)[:, 0]

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtri
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-
-FloatArray = NDArray[np.float64]
 
 # The factors on odometry's deviations that are tried, and over how many nodes.
 _NOISE_FACTORS = (0.01, 20.0)
@@ -105,7 +103,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
 
 def terms_that_pay(
     problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """(3,) which of odometry's systematic errors, as estimated, make better predictions over
     seconds.
 
@@ -116,7 +114,7 @@ def terms_that_pay(
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0
 
-    def surprise(terms: NDArray[np.bool_]) -> float:
+    def surprise(terms: BoolArray) -> float:
         account = thin.account(noise, (means * terms, deviations * terms))
         return account.surprise + _COST_OF_TERM * np.count_nonzero(terms)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.fusion.gaps import (
     UNMEASURED_S,
     Bridge,
@@ -33,8 +34,6 @@ from redetect.groundtruth.fusion.kernels import (
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 
-FloatArray = NDArray[np.float64]
-
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 # Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
@@ -48,7 +47,7 @@ class MeasurementAccount:
     """How the measurements were used."""
 
     squared: FloatArray  # (M,): squared normalised innovations
-    accepted: NDArray[np.bool_]  # (M,)
+    accepted: BoolArray  # (M,)
     # (N,): whether the filter was restarted at a node, and why (see `kernels`)
     restarted: NDArray[np.int8]
     surprise: float  # Minus twice the logarithm of their likelihood
@@ -72,7 +71,7 @@ class MovementProblem:
     controls: FloatArray
     # (N, 2): way (m) and turn (rad) that it may have made besides, where odometry pauses
     unseen: FloatArray
-    nodes: NDArray[np.int64]  # (M,): at which node each measurement was made, ascending
+    nodes: IntArray  # (M,): at which node each measurement was made, ascending
     # `measured`, `covariances`: (M, 3), (M, 3, 3): the measured poses
     measured: FloatArray
     covariances: FloatArray
@@ -142,7 +141,7 @@ class MovementProblem:
                 last = time
         return self.with_only(kept)
 
-    def with_only(self, kept: NDArray[np.bool_]) -> MovementProblem:
+    def with_only(self, kept: BoolArray) -> MovementProblem:
         """With some of its measurements."""
         return replace(
             self,
@@ -247,7 +246,7 @@ class MovementProblem:
         self,
         variances: FloatArray,
         points: FloatArray,
-        cuts: NDArray[np.bool_],
+        cuts: BoolArray,
         history: FilterHistory | None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:

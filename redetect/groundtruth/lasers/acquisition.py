@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.outline import (
     LaserSettings,
@@ -30,8 +31,6 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 )
 from redetect.groundtruth.trajectories.plane import compose
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 #: A reading within this of where a beam should meet the robot agrees (m).
 AGREES_M = 0.05

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import (
     IcpSettings,
@@ -36,8 +36,6 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
-
-FloatArray = NDArray[np.float64]
 
 #: Steps of the published order, by which results are named.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
@@ -93,7 +91,7 @@ class Alignment:
     steps: dict[str, FloatArray]
     # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
     pairs: dict[tuple[int, int], float]
-    matched: NDArray[np.int64]  # (scanners,): number of beams that hit the map
+    matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
     undetermined: tuple[str, ...]  # Scanners whose view of the map leaves a direction open
     inconsistent: tuple[str, ...]  # Scanners whose place on the map is not that among the others

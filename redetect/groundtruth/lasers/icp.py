@@ -19,17 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.trajectories.plane import apply, invert
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _MOST_STEPS = 500
 # How often the last gate of a match of scans is repeated at most, and its damping: a millimetre's

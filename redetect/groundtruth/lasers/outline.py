@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
 from redetect.groundtruth.trajectories.plane import invert
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

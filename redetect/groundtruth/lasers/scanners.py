@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import covariance_of, numbers, read_json, write_json
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 MOST_READINGS = 4096
 MOST_SCANNERS = 256
@@ -81,7 +80,7 @@ class Scanner:
         """(readings,) directions of the beams in the scanner's frame."""
         return np.asarray(self.first_angle_rad + self.angle_step_rad * np.arange(self.readings))
 
-    def has_return(self, ranges_mm: ArrayLike) -> NDArray[np.bool_]:
+    def has_return(self, ranges_mm: ArrayLike) -> BoolArray:
         """Which of (..., readings) readings in millimetres hit something within range."""
         ranges = np.asarray(ranges_mm)
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))

@@ -23,12 +23,11 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.lasers.scanners import MOST_READINGS
 from redetect.storage.bounded import read_plain_array
 from redetect.storage.messages import excerpt, one_line
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_FILE_BYTES = 1 << 30
 _LONGEST_LINE = 1 << 17

@@ -10,14 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, read_robot, read_scanners
 from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.groundtruth.lasers.tracking_kernels import Beams
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 # A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
 # than the nearest object that the beam saw, which is at this quantile of its readings.

@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine, robot_body
 from redetect.groundtruth.lasers.icp import fit_outline
@@ -23,10 +23,6 @@ from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose
 from redetect.groundtruth.trajectories.plane import compose
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")

@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.array_types import BoolArray, FloatArray, IntArray
 
 
 class Beams(NamedTuple):
@@ -35,7 +34,7 @@ class Seen(NamedTuple):
     direction: FloatArray  # (n, 2): of the beams
     range_m: FloatArray  # (n,)
 
-    def where(self, chosen: NDArray[np.bool_]) -> Seen:
+    def where(self, chosen: BoolArray) -> Seen:
         """Those chosen."""
         return Seen(
             self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]

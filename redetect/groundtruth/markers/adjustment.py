@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 
 from camera import Camera
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.chain import (
     ChainPoints,
@@ -34,9 +34,6 @@ from redetect.groundtruth.markers.least_squares import (
 )
 from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, right_jacobian
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 PoseKind = Literal["camera", "body", "part"]
 
 # Of whitened residuals: where the robust loss of the first pass begins to flatten.

@@ -32,15 +32,13 @@ from camera.boards.board import Board
 from camera.boards.points import find_board
 from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.files import numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
 from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
 from redetect.storage.messages import excerpt, one_line
-
-FloatArray = NDArray[np.float64]
-
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
 #: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.

@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import covariance_of, is_number, numbers, read_json, write_json
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.storage.messages import excerpt, one_line
-
-FloatArray = NDArray[np.float64]
 
 _QUATERNION_TOLERANCE = 1e-3
 

@@ -14,13 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.trajectories.transforms import apply, hat, inverse
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +35,7 @@ class ChainPoints:
     def __len__(self) -> int:
         return len(self.camera)
 
-    def only(self, chosen: NDArray[np.bool_] | IntArray) -> ChainPoints:
+    def only(self, chosen: BoolArray | IntArray) -> ChainPoints:
         """The chosen ones."""
         return ChainPoints(
             self.camera[chosen],

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import diags_array, issparse
 from scipy.sparse.linalg import splu
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError
 
-FloatArray = NDArray[np.float64]
 Poses = TypeVar("Poses")
 
 UNDETERMINED = "the points do not determine all poses"

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
 from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
@@ -20,8 +20,6 @@ from redetect.groundtruth.markers.chain import ChainPoints
 from redetect.groundtruth.markers.pnp import solve_camera
 from redetect.groundtruth.markers.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
@@ -21,9 +21,6 @@ from redetect.groundtruth.trajectories.transforms import (
     log_se3,
     mean_pose,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Squared normalised distance (6 dof) above which an estimate does not agree.
 _AGREES = 30.0
@@ -49,9 +46,9 @@ class PairConsensus:
     a_from_b: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
-    agrees: NDArray[np.bool_]  # (T,): which of them agree with it
+    agrees: BoolArray  # (T,): which of them agree with it
     # (T,): whether that is the combination of solutions that fit the image best
-    first: NDArray[np.bool_]
+    first: BoolArray
 
     @property
     def support(self) -> int:

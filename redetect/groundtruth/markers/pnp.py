@@ -8,16 +8,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.settings import Solver
 from redetect.groundtruth.trajectories.transforms import apply, inverse, transform
-
-FloatArray = NDArray[np.float64]
 
 SOLVERS: tuple[Solver, ...] = ("sqpnp", "epnp", "iterative", "ippe", "pycolmap")
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.pnp import robot_rms_px, solve_robot, view_poses
 from redetect.groundtruth.markers.refinement import (
@@ -24,9 +24,6 @@ from redetect.groundtruth.markers.refinement import (
 )
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, rotation_angle
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
 _SAME_ANGLE_RAD = 0.01

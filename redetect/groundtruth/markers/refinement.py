@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.chain import (
     ChainPoints,
@@ -29,11 +29,6 @@ from redetect.groundtruth.markers.chain import (
 from redetect.groundtruth.markers.least_squares import Linearised, inverted_information, minimised
 from redetect.groundtruth.markers.settings import Loss
 from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
-
 
 #: Residuals of a view: two of each corner.
 _ROWS = 8

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
 from redetect.groundtruth.markers.calibration import Rig
@@ -32,9 +32,6 @@ from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points
 from redetect.groundtruth.markers.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
-
-FloatArray = NDArray[np.float64]
-
 
 # Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
 _WRONG_PX = 20.0

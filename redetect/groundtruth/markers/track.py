@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.calibration import Network, Rig
 from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
@@ -23,10 +23,6 @@ from redetect.groundtruth.markers.session import (
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_json_value
@@ -21,7 +21,6 @@ from redetect.groundtruth.trajectories.matching import align_poses, matched_stre
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.storage.bounded import read_bounded
 
-FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Streams in the order of the page, with what they are called there.

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.lasers.alignment import Alignment, StillScan
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.calibration import Rig, marker_corners
@@ -21,8 +21,6 @@ from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-FloatArray = NDArray[np.float64]
 
 
 _PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from the front"))

@@ -7,11 +7,10 @@ shape. Covariances are those of (x, y, theta) themselves, as in the streams of p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 
 def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import read_text
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
 RAWSEEDS_ROUNDING = 5e-7
@@ -93,7 +92,7 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     return poses if np.all(last) else poses.only(last)
 
 
-def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> NDArray[np.bool_]:
+def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> BoolArray:
     """Which of (..., d, d) covariances can be inverted in earnest.
 
     `covariances` (..., d, d). `rounding`: by how much each entry may be off; an eigenvalue must be

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import is_number, read_json, read_text
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
 _NAME = re.compile(r"[^\s,#\"]{1,64}")

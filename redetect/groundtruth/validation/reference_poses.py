@@ -13,16 +13,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.trajectories.plane import apply
 from redetect.groundtruth.validation.fiducials import Distance, Survey
 from redetect.landmarks import wrap_angle
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
 _HEADINGS = 24

@@ -6,8 +6,8 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.matching import (
     interpolate_poses,
@@ -20,9 +20,6 @@ from redetect.groundtruth.trajectories.streams import (
     is_positive_definite,
     read_rows_of_numbers,
 )
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.trajectories.matching import pose_differences, squared_lengths
 from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
-
-FloatArray = NDArray[np.float64]
 
 _BAND = 0.95
 
@@ -241,7 +239,7 @@ def pose_errors(
 
 def _nearest(
     poses: PlanarPoses, times_s: FloatArray, farthest_s: float
-) -> tuple[PlanarPoses, NDArray[np.bool_]]:
+) -> tuple[PlanarPoses, BoolArray]:
     """The poses nearest to times, and which times have one."""
     after = np.clip(np.searchsorted(poses.times_s, times_s), 0, len(poses) - 1)
     before = np.maximum(after - 1, 0)

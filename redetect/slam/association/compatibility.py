@@ -17,13 +17,11 @@ from functools import cache
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DEFAULT_GATE_PROBABILITY = 0.999
 MOST_NODES = 20_000

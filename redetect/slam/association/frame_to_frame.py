@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.compatibility import Pairing, joint_compatible, nearest_compatible
 from redetect.slam.association.local_map import LocalMap, kept, line_places, moved, tilt_jacobian
@@ -24,8 +24,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage.bounds import ABOVE_0, LIMIT, PROBABILITY, Bounds, demand, whole
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Method = Literal["nearest", "joint"]
 
 # Of the first sight of a line: half a metre to infinity within two standard deviations.

@@ -20,8 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.line_points_kernels import Rays, Search, crossings, take_points
 from redetect.slam.association.loop_path import intersect_bearings, solve_path
@@ -29,9 +29,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import ABOVE_0, PROBABILITY, demand, whole
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # How far beyond the field of view a bearing may be.
 _WIDER_RAD = 0.005

@@ -13,13 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.models.motion import rotation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Up to this distance discs have to be equally certain.
 _NEAR_M = 4.0
@@ -34,7 +31,7 @@ class LocalMap:
     # (m, 2): Discs: x, y (m). Lines: bearing (rad) and inverse distance (1/m) from the camera.
     mean: FloatArray
     covariance: FloatArray  # (2 m, 2 m)
-    is_line: NDArray[np.bool_]  # (m,)
+    is_line: BoolArray  # (m,)
     number: IntArray  # (m,): number of the landmark; discs and lines are counted separately
     last_frame: IntArray  # (m,): when it was seen last
 

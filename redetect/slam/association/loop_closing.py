@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     Match,
@@ -19,9 +19,6 @@ from redetect.slam.association.loops import (
     sightings,
 )
 from redetect.slam.models.motion import relative_pose, rotation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)

@@ -10,17 +10,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.mapping.graph import Estimate, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.solve import solve
 from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.models.motion import chain_steps
 from redetect.slam.recording import Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 class LabelledMap(NamedTuple):

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.stats import binom
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.slam.association.loops_kernels import best_motion
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
@@ -26,9 +26,6 @@ from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6

@@ -6,10 +6,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.array_types import FloatArray, IntArray
 
 # Width of the cells in which the nearest landmark is looked up.
 _CELL_M = 0.05

@@ -16,9 +16,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally
 from redetect.slam.association.line_points import PointSettings, lines_by_points
@@ -38,8 +38,6 @@ from redetect.slam.models.motion import chain_steps, rotation
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import PROBABILITY, demand, whole
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
 # Share of the labels of one landmark that are compatible by position.

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 
-IntArray = NDArray[np.int64]
+from redetect.array_types import IntArray
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import Path2D, read_path
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.models.odometry_noise import OdometryNoise
 from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, read_recording
-
-FloatArray = NDArray[np.float64]
 
 
 def recording_of(flags: RunFlags) -> Recording:

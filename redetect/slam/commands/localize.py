@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from redetect import slam
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
 from redetect.slam.commands.inputs import (
     camera_xy_of,
@@ -31,8 +31,6 @@ from redetect.slam.mapping.covariance_file import covariance_file, read_joint_co
 from redetect.slam.options import Localize
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
-
-FloatArray = NDArray[np.float64]
 
 JSON_NAME = "localize.json"
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.association.compatibility import (
@@ -26,9 +26,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import Filter, FilterRun, FrameRows, frames_of
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.recording import UNKNOWN_ID, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 Association = Literal["known", "nearest", "joint"]
 

@@ -17,12 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map, disc_in_robot
-
-FloatArray = NDArray[np.float64]
 
 _MOST_ITERATIONS = 10
 _CONVERGED_M = 1e-6

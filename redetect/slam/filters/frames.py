@@ -8,14 +8,11 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.recording import Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NO_CAMERA = np.zeros(2)
 

@@ -15,17 +15,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dtrtrs
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 POSE_SIZE = 3
 

@@ -15,8 +15,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.association import Associator, run_filter
@@ -28,9 +29,6 @@ from redetect.slam.filters.frames import (
 )
 from redetect.slam.models.motion import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MapErrors = Literal["considered", "white", "ignored"]
 

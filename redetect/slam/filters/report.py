@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from redetect import slam
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Path2D
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import FilterRun
-
-FloatArray = NDArray[np.float64]
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:

@@ -19,19 +19,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Step
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.axes import to_dataset
 from redetect.slam.formats.text import finite, text_rows
 from redetect.slam.models.motion import chain_steps, relative_pose
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"

@@ -20,8 +20,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.axes import (
     MEANING,
@@ -33,9 +33,6 @@ from redetect.slam.formats.axes import (
 from redetect.slam.formats.text import AXES_COMMENT, LARGEST_NUMBER, write_text
 from redetect.slam.models.motion import rotation
 from redetect.slam.recording import CircleRows
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Begins the comment with a frame's name and the qualities of its rows.
 FRAME_COMMENT = "# FRAME"

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -24,8 +24,6 @@ from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.models.motion import chain_steps
 from redetect.slam.models.odometry_noise import OdometryNoise
 from redetect.slam.recording import ASSUMED, CircleRows, Recording, recording_of_frames
-
-FloatArray = NDArray[np.float64]
 
 # Smaller values are rounded to 0 in a row of a landmark file.
 _LEAST_STEP_COVARIANCE = 0.5e-12
@@ -129,7 +127,7 @@ def poses_of_run(recording: Recording, solution: Path | None) -> Path2D:
     return path
 
 
-def _places(file: Path, disc_ids: NDArray[np.int64]) -> FloatArray:
+def _places(file: Path, disc_ids: IntArray) -> FloatArray:
     """Where a map has these discs."""
     discs = read_map(file).discs
     place = dict(zip(discs.ids.tolist(), discs.xy))

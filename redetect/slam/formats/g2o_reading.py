@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.axes import Axes, to_dataset
@@ -21,8 +21,6 @@ from redetect.slam.formats.g2o import (
 )
 from redetect.slam.formats.text import demand_axes, finite, text_rows, whole
 from redetect.slam.recording import CircleRows
-
-FloatArray = NDArray[np.float64]
 
 _TRIANGLE_3 = ("I11", "I12", "I13", "I22", "I23", "I33")
 # Of each kind of row: how many vertices it names, and its numbers.

@@ -14,14 +14,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import BoolArray
 from redetect.slam.formats.axes import Axes, covariance_from_dataset, from_dataset
 from redetect.slam.formats.g2o import end_covariance
 from redetect.slam.formats.text import write_text
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
-
-FloatArray = NDArray[np.float64]
 
 _TRIANGLE_3 = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi_rad2")
 ODOMETRY_COLUMNS = (
@@ -107,12 +106,12 @@ def write_bearings(
     _write(path, BEARING_COLUMNS, rows, comments, overwrite)
 
 
-def identified_discs(some: CircleRows) -> NDArray[np.bool_]:
+def identified_discs(some: CircleRows) -> BoolArray:
     """Which rows say what disc they show."""
     return np.asarray(some.ids != UNKNOWN_ID)
 
 
-def identified_lines(some: LineRows) -> NDArray[np.bool_]:
+def identified_lines(some: LineRows) -> BoolArray:
     """Which rows say what lines they show."""
     return np.array([len(ids) > 0 for ids in some.ids], dtype=np.bool_)
 

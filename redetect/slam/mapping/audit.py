@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU
 from scipy.stats import chi2
 
 from camera import Camera
+from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import factor
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
@@ -29,8 +29,6 @@ from redetect.slam.mapping.solve import equations_at, solve
 from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Kind = Literal["exchange", "split", "drop"]
 
 # Standard deviations from which on rows pull less.

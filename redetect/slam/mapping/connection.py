@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Beyond these standard deviations a step gives no information about the robot's motion.
 MOST_STEP_SIGMA_M = 100.0

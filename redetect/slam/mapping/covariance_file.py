@@ -11,8 +11,8 @@ import io
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.least_squares.covariance import chosen_covariance
 from redetect.slam.errors import SlamError
@@ -21,8 +21,6 @@ from redetect.slam.mapping.graph_terms import Weighting, layout_of
 from redetect.slam.mapping.solve import equations_at
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_plain_array
-
-FloatArray = NDArray[np.float64]
 
 # Both files are written in full precision; sums may be in another order.
 _SMALL_BYTES = 1 << 20

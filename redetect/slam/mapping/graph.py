@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera import Camera
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.models.motion import chain_steps
 from redetect.slam.recording import LineRows, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

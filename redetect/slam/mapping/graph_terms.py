@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.slam.errors import SlamError
@@ -30,8 +30,6 @@ from redetect.slam.models.mounting import (
 )
 from redetect.storage.bounds import ABOVE_0, Bounds, demand
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 RowErrors = Literal["corrected", "recorded"]
 
 #: Rotation about robot x, y, z, and height.

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.models.measurement import bearing_jacobians, disc_in_robot
 from redetect.slam.recording import LineRows
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Rays to a line have to cross under at least this angle somewhere.
 LEAST_PARALLAX_RAD = float(np.radians(5.0))
@@ -80,7 +77,7 @@ def place_lines(
     )
 
 
-def well_placed(graph: Graph, estimate: Estimate) -> NDArray[np.bool_]:
+def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
     """Which lines of an estimate the bearings of its poses place.
 
     Returns (K,).

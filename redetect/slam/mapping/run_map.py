@@ -8,9 +8,9 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.least_squares.solver import LossKind
 from redetect.slam.errors import SlamError
@@ -24,8 +24,6 @@ from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Solver = Literal["separable", "gtsam"]
 
 # Near enough to the minimum for the final optimisation.

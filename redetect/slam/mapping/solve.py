@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import (
     Linear,
@@ -27,8 +27,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
 from redetect.slam.models.mounting import nominal_mounting
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

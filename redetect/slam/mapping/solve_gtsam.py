@@ -16,8 +16,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
@@ -25,9 +25,6 @@ from redetect.slam.mapping.graph_terms import Weighting, cost
 from redetect.slam.mapping.solve import Solution
 from redetect.slam.models.measurement import bearing_jacobians, bearing_of_vertical
 from redetect.slam.models.motion import rotation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Called with factor, values and, where derivatives are wanted, a list for them.
 ErrorFunction = Callable[[Any, Any, list[FloatArray] | None], FloatArray]

@@ -7,9 +7,9 @@ Everything is vectorised over leading axes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray
 
 
 def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:

@@ -8,11 +8,10 @@ robot frame before it. Everything is vectorised over leading axes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 
 def rotation(theta_rad: ArrayLike) -> FloatArray:

@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.model import cross_matrices
+from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
-
-FloatArray = NDArray[np.float64]
 
 
 def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
