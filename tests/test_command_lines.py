@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-from redetect.programs import PROGRAMS
+from redetect.cli import PROGRAMS
 
 
 def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

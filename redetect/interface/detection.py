@@ -23,7 +23,7 @@ from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import CircleLandmark, Frame, FrameTilt, Step
-from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
+from redetect.slam.formats.text import MEANING, Axes, covariance_from_dataset, from_dataset
 
 FloatArray = NDArray[np.float64]
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]

@@ -19,19 +19,26 @@ from redetect.landmarks.association import (
     squared_mahalanobis,
     wrap_angle,
 )
-from redetect.landmarks.errors import LandmarkError, LandmarkFileError
-from redetect.landmarks.reading import (
+from redetect.landmarks.files import (
+    format_frame,
+    format_head,
+    format_levelling,
+    format_record,
     frames_of_rows,
     parse_record,
     parse_rows,
     read_frames,
     read_rows,
     read_steps,
+    write_frames,
+    write_rows,
 )
 from redetect.landmarks.records import (
     CircleLandmark,
     Frame,
     Landmark,
+    LandmarkError,
+    LandmarkFileError,
     LineLandmark,
     MarkerCorner,
     MarkerLandmark,
@@ -46,14 +53,6 @@ from redetect.landmarks.tilts import (
     format_tilt,
     read_tilts,
     tilt_as_written,
-)
-from redetect.landmarks.writing import (
-    format_frame,
-    format_head,
-    format_levelling,
-    format_record,
-    write_frames,
-    write_rows,
 )
 
 __all__ = [

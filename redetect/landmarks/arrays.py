@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks.errors import LandmarkError
-from redetect.landmarks.records import CircleLandmark
+from redetect.landmarks.records import CircleLandmark, LandmarkError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks.errors import LandmarkFileError
+from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 

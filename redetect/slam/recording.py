@@ -12,7 +12,7 @@ import numpy as np
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, read_frames
 from redetect.slam.errors import SlamError
-from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.models import OdometryNoise
 
 UNKNOWN_ID = -1
 

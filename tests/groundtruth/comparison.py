@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, align_poses, matched_streams
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 
 

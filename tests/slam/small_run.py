@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, relative_pose
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

@@ -11,25 +11,31 @@ from numpy.typing import NDArray
 from redetect.slam.association.loop_closing import (
     closed_path,
     in_order,
+    intersect_bearings,
     merge_labels,
     pairs_by_votes,
     pairs_in_place,
     seen_together,
+    solve_path,
 )
-from redetect.slam.association.loop_path import intersect_bearings, solve_path
 from redetect.slam.association.loops import (
     LoopSettings,
     Match,
     Stretch,
+    best_motion,
     find_matches,
     fit_motion,
     log10_false_alarms,
     mutual_pairs,
     stretches_of,
 )
-from redetect.slam.association.loops_kernels import best_motion
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.slam.models import (
+    bearing_of_vertical,
+    chain_steps,
+    disc_in_robot,
+    relative_pose,
+    rotation,
+)
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
-from redetect.slam.association.frame_to_frame import LocalSettings, Method, associate_locally
-from redetect.slam.association.local_map import LocalMap, moved, tilt_jacobian
+from redetect.slam.association.frame_to_frame import (
+    LocalMap,
+    LocalSettings,
+    Method,
+    associate_locally,
+    moved,
+    tilt_jacobian,
+)
 from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.association.score import score_association
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, relative_pose
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

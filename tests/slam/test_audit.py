@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from redetect.landmarks import read_frames
 from redetect.slam.cli import main
 from redetect.slam.mapping.audit import audit_run
-from redetect.slam.models.measurement import disc_in_map, disc_in_robot
+from redetect.slam.models import disc_in_map, disc_in_robot
 from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.small_run import SmallRun, small_run
 

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.filters.joint_covariance import JointCovariance
-from redetect.slam.models.measurement import (
+from redetect.slam.models import (
     disc_in_map,
     disc_in_robot,
     disc_jacobians,
+    move,
+    move_jacobians,
 )
-from redetect.slam.models.motion import move, move_jacobians
 from redetect.slam.recording import CircleRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
 
@@ -121,7 +121,7 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
 def batch_solution(recording: Recording, size: int) -> tuple[FloatArray, FloatArray]:
     """Last pose and discs by Gauss-Newton on all poses and discs, and their covariance."""
     steps, circles = len(recording), recording.circles
-    from redetect.slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from redetect.slam.models import chain_steps, relative_pose, relative_pose_jacobians
 
     poses = chain_steps(recording.steps)
     discs = np.zeros((size, 2))

@@ -7,17 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.models.measurement import (
+from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_map,
     disc_jacobians,
+    move,
 )
-from redetect.slam.models.motion import move
 from redetect.slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NO_DISCS, bearings_of, spd
 
@@ -142,7 +141,7 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
     assert run.count.lines == len(rows)
     # Pose and two lines come before the last, and several kept poses.
     assert max(ekf.line_slots.values()) >= 3 + 4 + 9
-    from redetect.slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from redetect.slam.models import chain_steps, relative_pose, relative_pose_jacobians
 
     poses, places = chain_steps(recording.steps), lines.copy()
     unknowns = 3 * steps + 6

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.slam.formats.axes import (
+from redetect.slam.formats.text import (
     Axes,
     covariance_from_dataset,
     covariance_to_dataset,
     from_dataset,
     to_dataset,
 )
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import move
+from redetect.slam.models import bearing_of_vertical, disc_in_robot, move
 
 FloatArray = NDArray[np.float64]
 

@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 
 from camera import read_camera
 from redetect.landmarks import wrap_angle
-from redetect.slam.formats.axes import Axes, from_dataset
 from redetect.slam.formats.tables import write_bearings, write_discs, write_odometry
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.slam.formats.text import Axes, from_dataset
+from redetect.slam.models import (
+    bearing_of_vertical,
+    chain_steps,
+    disc_in_robot,
+    relative_pose,
+    rotation,
+)
 from redetect.slam.recording import Recording, read_recording
 
 FloatArray = NDArray[np.float64]

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from redetect.landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes
 from redetect.slam.formats.g2o import (
     RunGraph,
     end_covariance,
     first_disc_vertex,
+    frames_of_graph,
+    graph_of_frames,
     start_covariance,
     write_g2o,
 )
-from redetect.slam.formats.g2o_frames import frames_of_graph, graph_of_frames
 from redetect.slam.formats.g2o_reading import read_g2o
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose, rotation
+from redetect.slam.formats.text import Axes
+from redetect.slam.models import disc_in_robot, relative_pose, rotation
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"

@@ -10,12 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import read_frames, wrap_angle
-from redetect.slam.formats.axes import from_dataset
-from redetect.slam.formats.g2o import RunGraph, write_g2o
-from redetect.slam.formats.g2o_frames import graph_of_frames
+from redetect.slam.formats.g2o import RunGraph, graph_of_frames, write_g2o
 from redetect.slam.formats.tables import write_odometry
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
+from redetect.slam.formats.text import from_dataset
+from redetect.slam.models import disc_in_robot, relative_pose
 from redetect.slam.recording import read_recording
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")

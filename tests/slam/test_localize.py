@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
-from redetect.slam.filters.frames import frames_of
+from redetect.slam.filters.frames import Associator, frames_of
 from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
-from redetect.slam.models.measurement import (
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_robot,
     disc_jacobians,
+    move,
+    move_jacobians,
 )
-from redetect.slam.models.motion import move, move_jacobians
 from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
 
 FloatArray = NDArray[np.float64]
@@ -309,9 +309,9 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
-    from redetect.slam.commands.inputs import camera_xy_of
+    from redetect.slam.commands.files import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-    from redetect.slam.models.motion import relative_pose
+    from redetect.slam.models import relative_pose
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)

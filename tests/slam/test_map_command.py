@@ -12,8 +12,7 @@ import pytest
 
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.cli import main
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
+from redetect.slam.models import disc_in_robot, relative_pose
 
 
 @pytest.fixture(scope="module")

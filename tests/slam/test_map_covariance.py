@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from redetect.slam.commands.inputs import camera_of_run
+from redetect.slam.commands.files import camera_of_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.covariance_file import (
     covariance_file,

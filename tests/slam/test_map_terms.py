@@ -18,8 +18,8 @@ from redetect.slam.mapping.graph_terms import (
     linearise,
 )
 from redetect.slam.mapping.solve import marginals, moved, solve
-from redetect.slam.models.measurement import bearing_of_vertical
-from redetect.slam.models.mounting import mounting_change, rotation_exp
+from redetect.slam.models import bearing_of_vertical
+from redetect.slam.mounting import mounting_change, rotation_exp
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, small_run
 

@@ -9,15 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
-from redetect.slam.models.measurement import (
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
+    chain_steps,
     disc_in_map,
     disc_in_robot,
     disc_jacobians,
-)
-from redetect.slam.models.motion import (
-    chain_steps,
     move,
     move_jacobians,
     relative_pose,

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from detect.cli import main as detect
 from redetect.landmarks.map_file import read_path
 from redetect.slam.cli import main as slam
-from redetect.slam.formats.axes import from_dataset
-from redetect.slam.models.motion import chain_steps, relative_pose
-from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.formats.text import from_dataset
+from redetect.slam.models import OdometryNoise, chain_steps, relative_pose
 from tests.detect.recordings import Ros, Said
 
 FloatArray = NDArray[np.float64]

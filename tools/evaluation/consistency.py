@@ -12,8 +12,7 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import FilterRun
 from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from tools.arrays import FloatArray
 from tools.evaluation.tables import Table

@@ -19,8 +19,11 @@ from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
 from redetect.groundtruth.fusion.inputs import FuseSettings
-from redetect.groundtruth.trajectories.matching import matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    matched_streams,
+    read_planar_poses,
+)
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import wrap_angle
 from tools.arrays import BoolArray, FloatArray

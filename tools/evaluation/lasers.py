@@ -28,9 +28,9 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import between
 from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table

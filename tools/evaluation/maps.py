@@ -15,16 +15,15 @@ from tyro.conf import Positional
 
 from camera import Camera
 from redetect.landmarks import squared_mahalanobis
-from redetect.slam.commands.inputs import camera_of_run
+from redetect.slam.commands.files import camera_of_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import RowErrors, Weighting, cost, errors
 from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
-from redetect.slam.models.mounting import rotation_exp, rows_through_mounting
+from redetect.slam.models import disc_in_robot, relative_pose
+from redetect.slam.mounting import rotation_exp, rows_through_mounting
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
 from tools.arrays import BoolArray, FloatArray, IntArray
 from tools.evaluation.tables import Table

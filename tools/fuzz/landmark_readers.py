@@ -20,7 +20,7 @@ from tools.fuzz.reader import NUMBERS, Reader
 def _landmarks(path: Path) -> object:
     """Frames of a file; what was accepted is given back byte by byte, and its records too."""
     from redetect.landmarks import parse_rows
-    from redetect.landmarks.writing import format_record
+    from redetect.landmarks.files import format_record
 
     rows = list(read_rows(path))
     assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from camera import Camera
-from redetect.slam.models.mounting import rotation_exp
+from redetect.slam.mounting import rotation_exp
 from tools.arrays import FloatArray, IntArray
 from tools.reenactment.fitting import mahalanobis, row_distances
 from tools.reenactment.mounted_discs import Geometry, predict_pixels

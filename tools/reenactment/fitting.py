@@ -17,7 +17,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph, whitening
 from redetect.slam.mapping.graph_terms import Weighting as SlamWeighting
 from redetect.slam.mapping.solve import solve
-from redetect.slam.models.motion import relative_pose
+from redetect.slam.models import relative_pose
 from tools.arrays import BoolArray, FloatArray, IntArray
 from tools.reenactment.mounted_discs import Geometry, predict_pixels
 from tools.reenactment.recording import Recording

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.calibration.model import cross_matrices
-from redetect.slam.models.mounting import rotation_exp
+from redetect.slam.mounting import rotation_exp
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

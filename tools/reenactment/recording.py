@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.models import chain_steps
 from tools.arrays import BoolArray, FloatArray, IntArray
 
 

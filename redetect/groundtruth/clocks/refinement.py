@@ -18,8 +18,8 @@ from scipy.optimize import Bounds, minimize
 from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.inputs import FuseSettings
-from redetect.groundtruth.fusion.learning import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 

@@ -21,13 +21,15 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
 from redetect.groundtruth.clocks.headings import (
     HeadingPair,
+    Wandering,
     continuous_headings,
+    estimate_wandering,
+    find_jump,
     pair_headings,
     segments_between_gaps,
     without_turns,
 )
 from redetect.groundtruth.clocks.refinement import refine_by_movement
-from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering, find_jump
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle

@@ -11,7 +11,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
-from redetect.groundtruth.lasers.outline import LaserSettings
+from redetect.groundtruth.lasers.acquisition import LaserSettings
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (

@@ -17,12 +17,14 @@ from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.lasers.scanners import read_robot
-from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
-from redetect.groundtruth.validation.fiducials import read_distances, read_survey
-from redetect.groundtruth.validation.reference_poses import poses_from_distances
+from redetect.groundtruth.validation.reference_poses import (
+    poses_from_distances,
+    read_distances,
+    read_survey,
+)
 from redetect.groundtruth.validation.reference_poses_scans import Onboard
 from redetect.groundtruth.validation.validate import (
     PUBLISHED,

@@ -10,8 +10,8 @@ import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.plane import between, log_motion
 from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+from redetect.plane import between, log_motion
 
 _DEVIATIONS = (
     "distance_sigma",
@@ -195,7 +195,7 @@ def variances_of(
     known, and what a wrong heading leads aside is taken to be that of a way out and back.
 
     `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
-    `redetect.groundtruth.fusion.learning.noise_of`.
+    `redetect.groundtruth.fusion.fuse.noise_of`.
     """
     along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])

@@ -156,7 +156,7 @@ class MovementProblem:
     ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
         """Smoothed states, their covariances, and what became of the measurements.
 
-        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.learning.noise_of`.
+        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.fuse.noise_of`.
         `looser_in_gaps`: factor on the variances they make where nothing is measured. Returns
         `states`, `covariances` (N, 6), (N, 6, 6).
         """

@@ -25,16 +25,15 @@ from redetect.groundtruth.lasers.icp import (
     rigid_fit,
     scan_normals,
 )
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.tracking_kernels import (
     OutlineFit,
     OutlinePose,
     Seen,
     refine_outline,
 )
-from redetect.groundtruth.trajectories.plane import apply, between, compose, invert
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply, between, compose, invert
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 #: Steps of the published order, by which results are named.

@@ -25,7 +25,7 @@ from scipy.special import ndtri
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.trajectories.plane import apply, invert
+from redetect.plane import apply, invert
 from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
 
 _MOST_STEPS = 500

@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, read_robot, read_scanners
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import (
+    Robot,
+    Scanner,
+    Scans,
+    find_scans,
+    read_robot,
+    read_scanners,
+    read_scans,
+)
 from redetect.groundtruth.lasers.tracking_kernels import Beams
 
 # A beam's readings have at least this deviation (m); one is new if it is this many of them nearer

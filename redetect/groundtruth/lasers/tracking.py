@@ -14,15 +14,21 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import (
+    Body,
+    LaserSettings,
+    acquire,
+    explain,
+    refine,
+    robot_body,
+)
 from redetect.groundtruth.lasers.icp import fit_outline
-from redetect.groundtruth.lasers.outline import LaserSettings
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose, Seen, new_points
-from redetect.groundtruth.trajectories.plane import compose
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")

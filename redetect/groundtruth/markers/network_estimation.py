@@ -14,10 +14,15 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.adjustment import (
+    AdjustedBundle,
+    Bundle,
+    ChainPoints,
+    PosePrior,
+    adjust_bundle,
+)
 from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
-from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.pnp import solve_camera
+from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.markers.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
 

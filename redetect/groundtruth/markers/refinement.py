@@ -21,7 +21,7 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.chain import (
+from redetect.groundtruth.markers.adjustment import (
     ChainPoints,
     project_chain,
     project_chain_with_jacobians,

@@ -15,9 +15,14 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.adjustment import (
+    AdjustedBundle,
+    Bundle,
+    PosePrior,
+    adjust_bundle,
+    project_chain,
+)
 from redetect.groundtruth.markers.calibration import Rig
-from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -26,7 +31,7 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
     spanning_tree,
 )
-from redetect.groundtruth.markers.pnp import view_poses
+from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
 from redetect.groundtruth.markers.settings import RigSettings

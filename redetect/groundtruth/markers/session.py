@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.adjustment import ChainPoints
 from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
-from redetect.groundtruth.markers.chain import ChainPoints
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import read_times

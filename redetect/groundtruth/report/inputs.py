@@ -17,8 +17,12 @@ from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_json_value
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    align_poses,
+    matched_streams,
+    read_planar_poses,
+)
 from redetect.storage.bounded import read_bounded
 
 T = TypeVar("T")

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.report.figures import (
+from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
+from redetect.groundtruth.report.pictures import (
     Series,
     Track,
     ellipse_figure,
     map_figure,
     series_figure,
 )
-from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
-from redetect.groundtruth.trajectories.matching import matched_streams, pose_differences
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 from redetect.groundtruth.validation.validate import PUBLISHED
 from redetect.reporting.page import Part, Section, image_part, page_of

@@ -9,17 +9,15 @@ import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.matching import (
-    interpolate_poses,
-    pose_differences,
-    squared_lengths,
-)
-from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
+    interpolate_poses,
     is_positive_definite,
+    pose_differences,
     read_rows_of_numbers,
+    squared_lengths,
 )
+from redetect.plane import between
 
 
 @dataclass(frozen=True)

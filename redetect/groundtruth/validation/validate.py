@@ -13,8 +13,12 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.trajectories.matching import pose_differences, squared_lengths
-from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    is_positive_definite,
+    pose_differences,
+    squared_lengths,
+)
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 

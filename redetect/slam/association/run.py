@@ -3,7 +3,7 @@
 First, every row is associated with recently seen landmarks
 (`redetect.slam.association.frame_to_frame`). The result is nearly always right, but a landmark that
 is seen again later has several labels. Then loops are detected (`redetect.slam.association.loops`)
-and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_path`) in
+and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_closing`) in
 rounds. The first round searches within the possible drift of the odometry, later rounds everywhere,
 since each closed loop reduces the map's distortion. Verticals, which the local association often
 confuses, are then associated again along the path that the discs give
@@ -20,21 +20,21 @@ from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
-from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally
+from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally, tilt_jacobian
 from redetect.slam.association.line_points import PointSettings, lines_by_points
-from redetect.slam.association.local_map import tilt_jacobian
 from redetect.slam.association.loop_closing import (
+    LabelledMap,
     closed_path,
     in_order,
+    intersect_bearings,
     merge_labels,
     pairs_by_votes,
     pairs_in_place,
+    solve_path,
 )
-from redetect.slam.association.loop_path import LabelledMap, intersect_bearings, solve_path
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, rotation
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, rotation
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import PROBABILITY, demand, whole
 

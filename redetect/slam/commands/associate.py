@@ -18,7 +18,7 @@ from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, wri
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
-from redetect.slam.commands.inputs import read_run_of
+from redetect.slam.commands.files import read_run_of
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate

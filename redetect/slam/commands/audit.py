@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from redetect import slam
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
-from redetect.slam.commands.inputs import camera_of_run, recording_of
+from redetect.slam.commands.files import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options

@@ -6,19 +6,21 @@ from pathlib import Path
 
 from redetect import slam
 from redetect.landmarks.map_file import read_map, write_map, write_path
-from redetect.slam.commands.inputs import default_output, read_reference, read_run_of
-from redetect.slam.commands.outputs import (
+from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,
+    default_output,
     demand_free,
     draw_results,
+    read_reference,
+    read_run_of,
     timed,
     write_json,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.frames import Associator
 from redetect.slam.filters.report import map_distance, path_distance, summary, table
 from redetect.slam.mapping.covariance_file import covariance_file, write_joint_covariance
 from redetect.slam.options import Ekf

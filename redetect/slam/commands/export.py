@@ -17,16 +17,15 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.slam.commands.inputs import camera_of_run, print_assumed, recording_of
+from redetect.slam.commands.files import camera_of_run, print_assumed, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import data_sets
-from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
-from redetect.slam.formats.g2o import write_g2o
-from redetect.slam.formats.g2o_frames import (
+from redetect.slam.formats.g2o import (
     demand_readable,
     frames_of_graph,
     graph_of_frames,
     poses_of_run,
+    write_g2o,
 )
 from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.tables import (
@@ -36,7 +35,13 @@ from redetect.slam.formats.tables import (
     write_discs,
     write_odometry,
 )
-from redetect.slam.formats.text import text_rows
+from redetect.slam.formats.text import (
+    MEANING,
+    Axes,
+    covariance_from_dataset,
+    from_dataset,
+    text_rows,
+)
 from redetect.slam.formats.tum import read_times, read_tum, write_tum
 from redetect.slam.options import Export, Import
 from redetect.slam.recording import demand_landmarks, landmark_file

@@ -7,24 +7,21 @@ import numpy as np
 from redetect import slam
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
-from redetect.slam.commands.inputs import (
-    camera_xy_of,
-    default_output,
-    read_reference,
-    read_run_of,
-)
-from redetect.slam.commands.outputs import (
+from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,
+    camera_xy_of,
+    default_output,
     demand_free,
     draw_results,
+    read_reference,
+    read_run_of,
     timed,
     write_json,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
-from redetect.slam.filters.frames import FilterRun
+from redetect.slam.filters.frames import Associator, FilterRun
 from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
 from redetect.slam.filters.report import path_distance, summary, table
 from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance

@@ -13,9 +13,8 @@ import numpy as np
 
 from redetect import slam
 from redetect.landmarks.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
-from redetect.slam.commands.inputs import camera_of_run, recording_of
+from redetect.slam.commands.files import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.chi_squared import as_json, table_lines
 from redetect.slam.mapping.covariance_file import (
     covariance_file,
     joint_covariance,
@@ -26,9 +25,11 @@ from redetect.slam.mapping.run_map import (
     LeftOut,
     MappedRun,
     Mounting,
+    as_json,
     landmark_map,
     map_run,
     path_of,
+    table_lines,
 )
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map

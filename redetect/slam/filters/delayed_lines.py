@@ -20,7 +20,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map, disc_in_robot
+from redetect.slam.models import bearing_of_vertical, disc_in_map, disc_in_robot
 
 _MOST_ITERATIONS = 10
 _CONVERGED_M = 1e-6

@@ -20,14 +20,15 @@ from numpy.typing import ArrayLike
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator, run_filter
 from redetect.slam.filters.frames import (
     NO_CAMERA,
+    Associator,
     FilterRun,
     FrameRows,
     RowCount,
+    run_filter,
 )
-from redetect.slam.models.motion import move, move_jacobians
+from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 MapErrors = Literal["considered", "white", "ignored"]

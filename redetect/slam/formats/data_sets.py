@@ -27,9 +27,8 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Step
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import to_dataset
-from redetect.slam.formats.text import finite, text_rows
-from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.formats.text import finite, text_rows, to_dataset
+from redetect.slam.models import chain_steps, relative_pose
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"

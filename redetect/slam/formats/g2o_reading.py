@@ -12,14 +12,13 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes, to_dataset
 from redetect.slam.formats.g2o import (
     FRAME_COMMENT,
     RunGraph,
     covariances_of_graph,
     first_disc_vertex,
 )
-from redetect.slam.formats.text import demand_axes, finite, text_rows, whole
+from redetect.slam.formats.text import Axes, demand_axes, finite, text_rows, to_dataset, whole
 from redetect.slam.recording import CircleRows
 
 _TRIANGLE_3 = ("I11", "I12", "I13", "I22", "I23", "I33")

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray
-from redetect.slam.formats.axes import Axes, covariance_from_dataset, from_dataset
 from redetect.slam.formats.g2o import end_covariance
-from redetect.slam.formats.text import write_text
+from redetect.slam.formats.text import Axes, covariance_from_dataset, from_dataset, write_text
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 _TRIANGLE_3 = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi_rad2")

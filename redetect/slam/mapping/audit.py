@@ -21,12 +21,11 @@ from camera import Camera
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import factor
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
 from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
-from redetect.slam.mapping.run_map import map_run
+from redetect.slam.mapping.run_map import ChiSquared, chi_squared, map_run
 from redetect.slam.mapping.solve import equations_at, solve
-from redetect.slam.models.measurement import disc_in_map
+from redetect.slam.models import disc_in_map
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 Kind = Literal["exchange", "split", "drop"]

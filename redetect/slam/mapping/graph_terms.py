@@ -13,14 +13,15 @@ from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.models.measurement import (
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_robot,
     disc_jacobians,
+    relative_pose,
+    relative_pose_jacobians,
 )
-from redetect.slam.models.motion import relative_pose, relative_pose_jacobians
-from redetect.slam.models.mounting import (
+from redetect.slam.mounting import (
     RecordedJacobians,
     directions_of_rows,
     nominal_mounting,

@@ -8,7 +8,7 @@ import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.models.measurement import bearing_jacobians, disc_in_robot
+from redetect.slam.models import bearing_jacobians, disc_in_robot
 from redetect.slam.recording import LineRows
 
 #: Rays to a line have to cross under at least this angle somewhere.

@@ -26,7 +26,7 @@ from redetect.least_squares.solver import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
-from redetect.slam.models.mounting import nominal_mounting
+from redetect.slam.mounting import nominal_mounting
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
 from redetect.slam.mapping.solve import Solution
-from redetect.slam.models.measurement import bearing_jacobians, bearing_of_vertical
-from redetect.slam.models.motion import rotation
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical, rotation
 
 # Called with factor, values and, where derivatives are wanted, a list for them.
 ErrorFunction = Callable[[Any, Any, list[FloatArray] | None], FloatArray]

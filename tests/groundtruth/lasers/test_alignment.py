@@ -19,10 +19,9 @@ from redetect.groundtruth.lasers.alignment import (
     align_scanners,
     still_scan,
 )
-from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import between
+from redetect.groundtruth.lasers.scanners import Scanner, Scans, read_scanners
 from redetect.landmarks import wrap_angle
+from redetect.plane import between
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     ROOM,

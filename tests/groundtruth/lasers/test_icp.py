@@ -18,14 +18,14 @@ from redetect.groundtruth.lasers.icp import (
     scan_normals,
     trimmed_variance,
 )
-from redetect.groundtruth.trajectories.plane import (
+from redetect.landmarks import wrap_angle
+from redetect.plane import (
     apply,
     between,
     compose,
     composed_covariance,
     invert,
 )
-from redetect.landmarks import wrap_angle
 from tests.groundtruth.lasers.scene import ROOM
 
 FloatArray = NDArray[np.float64]

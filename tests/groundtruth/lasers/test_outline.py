@@ -7,7 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
+from redetect.groundtruth.lasers.acquisition import (
+    outline_faces,
+    outline_radius_m,
+    outline_symmetries,
+)
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,

@@ -20,11 +20,13 @@ from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
+    Scans,
+    find_scans,
     read_robot,
     read_scanners,
+    read_scans,
     write_scanners,
 )
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
 from redetect.storage import OutputExistsError
 from tools.simulator.laser.writers import write_robot, write_scans
 
@@ -378,7 +380,7 @@ def test_archives_that_lie_are_refused(tmp_path: Path) -> None:
 def test_a_packed_giant_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("redetect.groundtruth.lasers.scans._LARGEST_FILE_BYTES", 1 << 16)
+    monkeypatch.setattr("redetect.groundtruth.lasers.scanners._LARGEST_FILE_BYTES", 1 << 16)
     giant = npy(np.zeros((1 << 10, 100), np.uint16))
     path = archive(tmp_path / "a.scans.npz", times_s=npy(np.zeros(1 << 10)), ranges_mm=giant)
     assert path.stat().st_size < 1 << 12

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.sets import (
     ScannerTables,
     learn_background,

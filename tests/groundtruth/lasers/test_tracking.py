@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import (
+    AGREES_M,
+    LaserSettings,
+    acquire,
+    explain,
+    refine,
+    robot_body,
+)
 from redetect.groundtruth.lasers.icp import fit_outline
-from redetect.groundtruth.lasers.outline import LaserSettings
-from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.lasers.sets import (
     ScannerTables,
     ScanSets,
@@ -42,9 +47,9 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     explain_set,
     new_points,
 )
-from redetect.groundtruth.trajectories.plane import compose, invert
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose, invert
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,

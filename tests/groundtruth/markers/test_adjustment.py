@@ -12,12 +12,12 @@ from scipy.optimize import least_squares
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.adjustment import (
     Bundle,
+    ChainPoints,
     PosePrior,
     adjust_bundle,
     whitened_jacobian,
     whitened_residuals,
 )
-from redetect.groundtruth.markers.chain import ChainPoints
 from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3
 from tests.groundtruth.markers.scene import (
     box_rig,

@@ -11,8 +11,12 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.trajectories.matching import matched_streams, planar_alignment
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    matched_streams,
+    planar_alignment,
+    read_planar_poses,
+)
 from redetect.groundtruth.validation.scoring import (
     Relations,
     read_relations,

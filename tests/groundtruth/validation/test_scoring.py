@@ -10,8 +10,12 @@ import pytest
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.matching import align_poses, interpolate_poses
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    align_poses,
+    interpolate_poses,
+    read_planar_poses,
+)
 from redetect.groundtruth.validation.scoring import score_poses
 from tests.groundtruth.comparison import compare_streams
 

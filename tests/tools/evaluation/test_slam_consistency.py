@@ -32,8 +32,7 @@ def test_band_is_that_of_chi_squared() -> None:
 
 
 def test_rows_have_the_errors_that_they_state() -> None:
-    from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-    from redetect.slam.models.motion import relative_pose
+    from redetect.slam.models import bearing_of_vertical, disc_in_robot, relative_pose
 
     run = simulate(Scenario(steps=400, lines=20), 3)
     rows = run.recording.circles

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from redetect.slam.models.motion import chain_steps
-from redetect.slam.models.mounting import rotation_exp, rows_as_recorded
+from redetect.slam.models import chain_steps
+from redetect.slam.mounting import rotation_exp, rows_as_recorded
 from tools.reenactment.fitting import odometry_residuals
 from tools.reenactment.mounted_discs import Geometry, predict_pixels
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 

@@ -12,14 +12,21 @@ import numpy as np
 
 from redetect.groundtruth.files import read_json, write_json
 from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners, write_scanners
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import (
+    Scanner,
+    Scans,
+    find_scans,
+    read_robot,
+    read_scanners,
+    read_scans,
+    write_scanners,
+)
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import Distance, Survey, read_survey
+from redetect.groundtruth.validation.reference_poses import Distance, Survey, read_survey
 from redetect.landmarks import wrap_angle
 from redetect.storage import write_whole
 from tools.arrays import BoolArray, FloatArray
