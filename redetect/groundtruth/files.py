@@ -89,6 +89,25 @@ def covariance_of(place: str, value: Any, size: int) -> FloatArray:
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
+def covariance_entry(
+    place: str, entry: Mapping[str, Any], size: int, sigmas: str = "sigmas"
+) -> FloatArray:
+    """(size, size) covariance of an object with ``covariance`` or standard deviations; else zeros.
+
+    The latter are named by `sigmas`; both are in the order of the covariance's rows.
+    """
+    if "covariance" in entry and sigmas in entry:
+        raise GroundTruthError(f"{place}: has covariance and {sigmas}: expected one of them")
+    if sigmas in entry:
+        values = numbers(f"{place}: {sigmas}", entry[sigmas], size)
+        if np.any(values < 0.0):
+            raise GroundTruthError(f"{place}: {sigmas}: expected 0 or more")
+        return np.diag(values**2)
+    if "covariance" in entry:
+        return covariance_of(f"{place}: covariance", entry["covariance"], size)
+    return np.zeros((size, size))
+
+
 def write_json(
     path: str | os.PathLike[str], content: Mapping[str, Any], *, overwrite: bool = False
 ) -> None:

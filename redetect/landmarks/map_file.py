@@ -113,7 +113,7 @@ def write_map(
         for kind, some in (("disc", landmark_map.discs), ("line", landmark_map.lines))
         for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
     ]
-    _write(path, MAP_COLUMNS, rows, comments, overwrite)
+    write_table(path, MAP_COLUMNS, rows, comments, overwrite=overwrite)
 
 
 def read_map(path: FilePath) -> LandmarkMap:
@@ -160,7 +160,7 @@ def write_path(
         columns = PATH_COLUMNS
         table = np.hstack([table, poses.covariance.reshape(-1, 9)])
     rows = [(prefix, *row) for prefix, row in zip(poses.prefixes, table.tolist())]
-    _write(path, columns, rows, comments, overwrite)
+    write_table(path, columns, rows, comments, overwrite=overwrite)
 
 
 def read_path(path: FilePath) -> Path2D:
@@ -188,13 +188,15 @@ def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
     )
 
 
-def _write(
+def write_table(
     path: FilePath,
     columns: Sequence[str],
     rows: Sequence[Sequence[object]],
-    comments: Sequence[str],
-    overwrite: bool,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
 ) -> None:
+    """Write rows between commas under comments and the columns' names; floats in full precision."""
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])

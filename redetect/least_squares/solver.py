@@ -111,6 +111,11 @@ class NormalEquations:
         return step - eliminated @ shared, shared
 
 
+def whitening(covariance: FloatArray) -> FloatArray:
+    """(..., d, d) lower triangular W with ``W C W^T = I``, of positive definite covariances C."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
 def robust(squared: FloatArray, loss: Loss) -> tuple[FloatArray, FloatArray]:
     """Costs of (n,) squared residuals, and their weights: the costs' derivatives by the squares.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, read_frames
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
@@ -57,6 +57,17 @@ class CircleRows:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def identified(self) -> BoolArray:
+        """(n,) which rows say what disc they show."""
+        return np.asarray(self.ids != UNKNOWN_ID)
+
+    def only(self, chosen: BoolArray) -> CircleRows:
+        """The chosen rows."""
+        return CircleRows(
+            self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
@@ -81,6 +92,11 @@ class LineRows:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def identified(self) -> BoolArray:
+        """(n,) which rows say what lines they show."""
+        return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import read_frames, wrap_angle
+from redetect.landmarks.map_file import write_table
 from redetect.slam.formats.g2o import RunGraph, graph_of_frames, write_g2o
-from redetect.slam.formats.tables import write_odometry
+from redetect.slam.formats.tables import odometry_table
 from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import disc_in_robot, relative_pose
 from redetect.slam.recording import read_recording
@@ -126,9 +127,8 @@ def test_the_documented_way_from_the_tables_to_factors(
     write_g2o(tmp_path / "e.g2o", graph)
     factors, values = gtsam.readG2o(str(tmp_path / "e.g2o"), False)
     (tmp_path / "TABLES").mkdir()
-    write_odometry(
-        tmp_path / "TABLES" / "odometry.csv", read_recording(DEMO), "robotics", ["a comment"]
-    )
+    table = odometry_table(read_recording(DEMO), "robotics")
+    write_table(tmp_path / "TABLES" / "odometry.csv", *table, ["a comment"])
     program = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     made: dict[str, Any] = {}

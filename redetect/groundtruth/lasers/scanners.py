@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import covariance_of, numbers, read_json, write_json
+from redetect.groundtruth.files import covariance_entry, numbers, read_json, write_json
 from redetect.storage.bounded import read_plain_array
 from redetect.storage.messages import excerpt, one_line
 
@@ -216,29 +216,14 @@ def _scanner(place: str, entry: dict[str, Any]) -> Scanner:
         for key in ("first_angle_rad", "angle_step_rad", "max_range_m", "sigma_m")
     )
     try:
-        covariance = _pose_covariance(place, entry)
+        covariance = covariance_entry(place, entry, 3, "pose_sigma")
         return Scanner(name, pose, covariance, first, step, readings, most, sigma)
     except GroundTruthError as error:
         raise GroundTruthError(f"{place}: {error}") from None
 
 
-def _pose_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
-    """The covariance of an entry, from `covariance` or `pose_sigma`; zeros without both."""
-    if "covariance" in entry and "pose_sigma" in entry:
-        raise GroundTruthError(f"{place}: has covariance and pose_sigma: expected one of them")
-    if "pose_sigma" in entry:
-        sigma = numbers(f"{place}: pose_sigma", entry["pose_sigma"], 3)
-        if np.any(sigma < 0.0):
-            raise GroundTruthError(f"{place}: pose_sigma: expected 0 or more")
-        return np.diag(sigma**2)
-    if "covariance" not in entry:
-        return np.zeros((3, 3))
-    return covariance_of(f"{place}: covariance", entry["covariance"], 3)
-
-
 _LARGEST_FILE_BYTES = 1 << 30
 _LONGEST_LINE = 1 << 17
-_MILLIMETRE = 1e-3
 _FARTHEST_M = 1e3
 _ROW = re.compile(r"[-+0-9.eE,\s]+")
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")

@@ -34,8 +34,8 @@ from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.files import numbers, read_json
-from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
+from redetect.groundtruth.files import covariance_entry, numbers, read_json
+from redetect.groundtruth.markers.calibration import parse_pose
 from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
 from redetect.storage.messages import excerpt, one_line
@@ -182,7 +182,7 @@ def read_boards(path: Path) -> BoardsFile:
             FIRST,
             SECOND,
             None if entry is None else parse_pose(place, entry),
-            np.zeros((6, 6)) if entry is None else parse_covariance(place, entry),
+            np.zeros((6, 6)) if entry is None else covariance_entry(place, entry, 6),
         )
     rows = content.get("images")
     if not isinstance(rows, list) or not rows:

@@ -88,11 +88,8 @@ def solve_camera(
         poses = _pycolmap(camera, points, normalised)
     else:
         poses = _opencv(points, normalised, solver)
-    solutions = [PnpSolution(pose, _rms_px(camera, pose, points, pixels)) for pose in poses]
-    solutions = [solution for solution in solutions if np.isfinite(solution.rms_px)]
-    if not solutions:
-        raise GeometryError(f"{solver} found no pose with all points in front of the camera")
-    return sorted(solutions, key=lambda solution: solution.rms_px)
+    found = [PnpSolution(pose, _rms_px(camera, pose, points, pixels)) for pose in poses]
+    return _finite(found, f"{solver} found no pose with all points in front of the camera")
 
 
 def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolution]:
@@ -124,10 +121,15 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
                 continue
             poses += [problem.world_from_camera[index] @ solution.pose for solution in found]
     solutions = [PnpSolution(pose, robot_rms_px(problem, pose)) for pose in poses]
-    solutions = [solution for solution in solutions if np.isfinite(solution.rms_px)]
-    if not solutions:
-        raise GeometryError(f"{solver} found no pose with all corners in front of their cameras")
-    return sorted(solutions, key=lambda solution: solution.rms_px)
+    return _finite(solutions, f"{solver} found no pose with all corners in front of their cameras")
+
+
+def _finite(solutions: list[PnpSolution], problem: str) -> list[PnpSolution]:
+    """The solutions with finite residuals, the best first; none is a problem."""
+    finite = [solution for solution in solutions if np.isfinite(solution.rms_px)]
+    if not finite:
+        raise GeometryError(problem)
+    return sorted(finite, key=lambda solution: solution.rms_px)
 
 
 def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,17 +23,11 @@ from redetect.groundtruth.markers.session import (
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
+from redetect.landmarks import squared_mahalanobis
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
 
-STATUSES: tuple[Status, ...] = (
-    "clear",
-    "resolved",
-    "unresolved",
-    "rejected",
-    "failed",
-    "unseen",
-)
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,15 +214,7 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
         reason = f"{kind}, decided by the neighbours"
     elif choice.status == "unresolved":
         reason = f"{kind}, not decided by the neighbours"
-    return TrackedTime(
-        tracked.time_s,
-        tracked.images,
-        tracked.views,
-        choice.status,
-        estimate,
-        choice,
-        reason,
-    )
+    return replace(tracked, status=choice.status, choice=choice, reason=reason)
 
 
 # In units of negative log-likelihood: leaving a frame out is cheaper than two jumps round it, and a
@@ -370,5 +356,4 @@ def _motion_costs(
     turn = np.radians(settings.turn_deg_s) * seconds
     for axis, sigma in enumerate((reach, reach, heave, wobble, wobble, turn)):
         spread[:, axis, axis] += np.square(sigma)
-    weighted = np.linalg.solve(spread, moved[..., None])[..., 0]
-    return np.asarray(np.minimum(0.5 * np.sum(moved * weighted, axis=1), _JUMP_COST))
+    return np.asarray(np.minimum(0.5 * squared_mahalanobis(moved, spread), _JUMP_COST))

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from redetect import plane
 from redetect.array_types import FloatArray
 from redetect.groundtruth.lasers.alignment import Alignment, StillScan
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.calibration import Rig, marker_corners
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
-from redetect import plane
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.validate import PUBLISHED, Figures, PoseError, ReferencePose

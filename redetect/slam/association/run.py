@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally, tilt_jacobian
 from redetect.slam.association.line_points import PointSettings, lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -35,7 +35,7 @@ from redetect.slam.association.loop_closing import (
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, rotation
-from redetect.slam.recording import Recording
+from redetect.slam.recording import LineRows, Recording
 from redetect.storage.bounds import PROBABILITY, demand, whole
 
 Progress = Callable[[str], None]
@@ -241,11 +241,8 @@ def _solved(
 
 
 def _without_lines(recording: Recording) -> Recording:
-    none = recording.lines
-    empty = replace(
-        none, frame=none.frame[:0], bearing_rad=none.bearing_rad[:0], sigma_rad=none.sigma_rad[:0]
-    )
-    return replace(recording, lines=replace(empty, ids=()))
+    none = np.zeros(0)
+    return replace(recording, lines=LineRows(none.astype(np.int64), none, none, ()))
 
 
 def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
@@ -268,21 +265,13 @@ def _without_clutter(
     # The second time without the rows that the first one found.
     for _ in range(2):
         known, numbers = np.unique(labels[kept], return_inverse=True)
-        fitting = replace(
-            circles,
-            frame=circles.frame[kept],
-            xy=circles.xy[kept],
-            covariance=circles.covariance[kept],
-        )
-        solution = solve_path(
-            _without_lines(replace(recording, circles=fitting)), numbers, none, path
-        )
+        fitting = _without_lines(replace(recording, circles=circles.only(kept)))
+        solution = solve_path(fitting, numbers, none, path)
         path = solution.path
         places = np.full((int(labels.max(initial=-1)) + 1, 2), np.nan)
         places[known] = solution.circle_xy
         off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
-        whitened = np.linalg.solve(circles.covariance, off[..., None])[..., 0]
-        kept = np.sum(off * whitened, axis=1) <= gate
+        kept = squared_mahalanobis(off, circles.covariance) <= gate
         kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= setting.fewest_rows
     return np.where(kept, labels, -1)
 

@@ -33,14 +33,12 @@ from redetect.landmarks import (
 )
 from redetect.landmarks.map_file import Path2D, read_map, read_path
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.tables import identified_discs
 from redetect.slam.formats.text import (
     AXES_COMMENT,
     LARGEST_NUMBER,
     MEANING,
     Axes,
     covariance_from_dataset,
-    covariance_to_dataset,
     from_dataset,
     write_text,
 )
@@ -187,8 +185,10 @@ def covariances_of_graph(
     Takes `steps` (N, 3), `of_steps` (N, 3, 3), `of_rows` (n, 2, 2); returns `step_covariance` (N,
     3, 3), `covariance` (n, 2, 2).
     """
-    spread = covariance_to_dataset(start_covariance(steps, inverse_of_3x3(of_steps)), axes)
-    return spread, covariance_to_dataset(inverse_of_2x2(of_rows), axes)
+    spread = covariance_from_dataset(
+        start_covariance(steps, inverse_of_3x3(of_steps)), axes, back=True
+    )
+    return spread, covariance_from_dataset(inverse_of_2x2(of_rows), axes, back=True)
 
 
 def _number(value: float) -> str:
@@ -215,21 +215,10 @@ def graph_of_frames(
         raise SlamError(
             f"{name}: bearings of verticals have no edge in g2o: expected discs only, or --to csv"
         )
-    keep = identified_discs(recording.circles)
-    rows = CircleRows(
-        frame=recording.circles.frame[keep],
-        xy=recording.circles.xy[keep],
-        covariance=recording.circles.covariance[keep],
-        ids=recording.circles.ids[keep],
-    )
+    keep = recording.circles.identified
+    rows = recording.circles.only(keep)
     quality = np.array(
-        [
-            row.quality
-            for frame in frames
-            for row in frame.landmarks
-            if isinstance(row, CircleLandmark)
-        ],
-        dtype=np.float64,
+        [row.quality for frame in frames for row in frame.circles], dtype=np.float64
     )[keep]
     poses = poses_of_run(recording, solution)
     disc_ids, first = np.unique(rows.ids, return_index=True)

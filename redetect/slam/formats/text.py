@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 from redetect.storage import write_whole
 
@@ -35,13 +35,13 @@ MEANING: dict[str, str] = {
     "dataset": "X left, Y backward",
 }
 
-# Which of the old coordinates becomes the new first, second, third, and with which sign.
+# Which of the old coordinates becomes the new first, second, third, and with which sign; on the way
+# back it is the sign of the first two that differs.
 _ORDER = np.array([1, 0, 2])
-_TO_ROBOTICS = np.array([-1.0, 1.0, 1.0])
-_TO_DATASET = np.array([1.0, -1.0, 1.0])
+_SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
-def from_dataset(values: ArrayLike, axes: Axes) -> FloatArray:
+def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
     """Vectors, poses or steps in the data set's axes, brought into others.
 
     Parameters
@@ -50,56 +50,37 @@ def from_dataset(values: ArrayLike, axes: Axes) -> FloatArray:
         x, y and, of poses and steps, the angle.
     axes : str
         The axes to bring them into.
+    back : bool
+        From those axes into the data set's instead.
 
     Returns
     -------
     float64 of the same shape
     """
-    return _turned(values, axes, _TO_ROBOTICS)
+    old = np.array(values, dtype=np.float64)
+    if axes == "dataset":
+        return old
+    order, sign = _turn(old.shape[-1], back)
+    return np.asarray(old[..., order] * sign)
 
 
 def to_dataset(values: ArrayLike, axes: Axes) -> FloatArray:
     """Undo `from_dataset`."""
-    return _turned(values, axes, _TO_DATASET)
+    return from_dataset(values, axes, back=True)
 
 
-def covariance_from_dataset(covariance: ArrayLike, axes: Axes) -> FloatArray:
-    """Covariances (or information matrices) in the data set's axes, brought into others.
-
-    Parameters
-    ----------
-    covariance : (..., 2, 2) or (..., 3, 3) array_like
-        Of x, y and, of poses and steps, the angle.
-    axes : str
-        The axes to bring them into.
-
-    Returns
-    -------
-    float64 of the same shape
-    """
-    return _turned_covariance(covariance, axes, _TO_ROBOTICS)
-
-
-def covariance_to_dataset(covariance: ArrayLike, axes: Axes) -> FloatArray:
-    """Undo `covariance_from_dataset`."""
-    return _turned_covariance(covariance, axes, _TO_DATASET)
-
-
-def _turned(values: ArrayLike, axes: Axes, sign: FloatArray) -> FloatArray:
-    old = np.array(values, dtype=np.float64)
-    if axes == "dataset":
-        return old
-    size = old.shape[-1]
-    return np.asarray(old[..., _ORDER[:size]] * sign[:size])
-
-
-def _turned_covariance(covariance: ArrayLike, axes: Axes, sign: FloatArray) -> FloatArray:
+def covariance_from_dataset(covariance: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
+    """Covariances (or information matrices) (..., d, d) of what `from_dataset` turns, turned."""
     old = np.array(covariance, dtype=np.float64)
     if axes == "dataset":
         return old
-    size = old.shape[-1]
+    order, sign = _turn(old.shape[-1], back)
+    return np.asarray(old[..., order[:, None], order] * np.outer(sign, sign))
+
+
+def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
     order = _ORDER[:size]
-    return np.asarray(old[..., order[:, None], order] * np.outer(sign[:size], sign[:size]))
+    return order, (_SIGNS[order] if back else _SIGNS[:size])
 
 
 #: Begins the comment that says which axes a file is in.

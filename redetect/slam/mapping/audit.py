@@ -19,9 +19,9 @@ from scipy.stats import chi2
 
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
-from redetect.least_squares.solver import factor
+from redetect.least_squares.solver import factor, whitening
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
+from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
 from redetect.slam.mapping.run_map import ChiSquared, chi_squared, map_run
 from redetect.slam.mapping.solve import equations_at, solve

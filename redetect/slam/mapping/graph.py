@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
+from redetect.least_squares.solver import whitening
 from redetect.slam.errors import SlamError
 from redetect.slam.models import chain_steps, disc_in_map
 from redetect.slam.recording import LineRows, Recording
@@ -104,22 +105,6 @@ class Estimate:
     line_xy: FloatArray
     mounting: FloatArray | None = None
     tilt: FloatArray | None = None
-
-
-def whitening(covariance: FloatArray) -> FloatArray:
-    """Inverse Cholesky roots of covariances.
-
-    Parameters
-    ----------
-    covariance : (..., d, d) float64
-        Positive definite.
-
-    Returns
-    -------
-    (..., d, d) float64
-        Lower triangular W with ``W C W^T = I``.
-    """
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
