@@ -16,29 +16,21 @@ from numpy.typing import ArrayLike
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.errors import SlamError
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, demand
+from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
 
 @dataclass(frozen=True)
 class OdometryNoise:
     """Standard deviations of the steps of odometry that state none."""
 
-    per_metre: float = 0.05  # of the way, as a share of it
-    per_radian: float = 0.05  # of the turn, as a share of it
-    turn_per_metre: float = 0.03  # of the turn by the way, radians per metre
-    least_m: float = 0.005  # of every step's way, metres
-    least_rad: float = 0.002  # of every step's turn, radians
+    per_metre: NotNegative = 0.05  # of the way, as a share of it
+    per_radian: NotNegative = 0.05  # of the turn, as a share of it
+    turn_per_metre: NotNegative = 0.03  # of the turn by the way, radians per metre
+    least_m: Positive = 0.005  # of every step's way, metres
+    least_rad: Positive = 0.002  # of every step's turn, radians
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            per_metre=NOT_NEGATIVE,
-            per_radian=NOT_NEGATIVE,
-            turn_per_metre=NOT_NEGATIVE,
-            least_m=ABOVE_0,
-            least_rad=ABOVE_0,
-        )
+        demand_fields(self, SlamError)
 
     def covariance(self, steps: FloatArray) -> FloatArray:
         """(N, 3, 3) covariances of (N, 3) steps dx, dy (m), dphi (rad)."""

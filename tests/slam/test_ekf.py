@@ -13,13 +13,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.filters.joint_covariance import JointCovariance
-from redetect.slam.models import (
-    disc_in_map,
-    disc_in_robot,
-    disc_jacobians,
-    move,
-    move_jacobians,
-)
+from redetect.slam.models import disc_in_map, disc_in_robot, disc_jacobians, move, move_jacobians
 from redetect.slam.recording import CircleRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
 

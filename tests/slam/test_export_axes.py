@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.slam.formats.text import (
-    Axes,
-    covariance_from_dataset,
-    from_dataset,
-    to_dataset,
-)
+from redetect.slam.formats.text import Axes, covariance_from_dataset, from_dataset, to_dataset
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, move
 
 FloatArray = NDArray[np.float64]

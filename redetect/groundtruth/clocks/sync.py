@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from scipy.optimize import Bounds, direct, minimize
@@ -33,6 +34,7 @@ from redetect.groundtruth.clocks.refinement import refine_by_movement
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
+from redetect.storage.bounds import Positive, demand_fields, inside
 
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
@@ -60,19 +62,15 @@ class SyncSettings:
         If one is not finite or not positive, or the drift is half or more.
     """
 
-    largest_offset_s: float = 1.0  # Of the time offset, either way (s)
-    largest_drift: float = 0.01  # The clocks' rates differ by at most this share
-    segment_gap_s: float = 5.0  # A longer pause in the ground truth begins a new segment (s)
+    largest_offset_s: Positive = 1.0  # Of the time offset, either way (s)
+    # The clocks' rates differ by at most this share
+    largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
+    segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s)
     # Refine the estimate by headings with the whole movement if the ground truth has covariances
     use_movement: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("largest_offset_s", "largest_drift", "segment_gap_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise GroundTruthError(f"{name} is {value}: expected above 0")
-        if self.largest_drift >= 0.5:
-            raise GroundTruthError(f"largest_drift is {self.largest_drift}: expected below 0.5")
+        demand_fields(self, GroundTruthError)
 
 
 def synchronise(

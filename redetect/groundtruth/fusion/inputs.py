@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -12,16 +12,7 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
 from redetect.plane import between, log_motion
-
-_DEVIATIONS = (
-    "distance_sigma",
-    "lateral_sigma",
-    "turn_sigma",
-    "turn_per_metre_sigma",
-    "turn_scale_sigma",
-    "turn_bias_per_metre_sigma",
-    "distance_scale_sigma",
-)
+from redetect.storage.bounds import ABOVE_0, PROBABILITY, NotNegative, demand_fields
 
 
 @dataclass(frozen=True)
@@ -35,36 +26,31 @@ class FuseSettings:
     """
 
     # Standard deviation of odometry's distance after a metre (m); it grows with the root.
-    distance_sigma: float = 0.02
+    distance_sigma: NotNegative = 0.02
     # How far the robot slips sideways within a metre (m), its standard deviation; it grows with the
     # root. The lateral error by a wrong heading is not part of it.
-    lateral_sigma: float = 0.01
-    turn_sigma: float = 0.02  # Standard deviation of its heading after turning a radian (rad)
-    turn_per_metre_sigma: float = 0.01  # The same after a metre driven (rad)
+    lateral_sigma: NotNegative = 0.01
+    # Standard deviation of its heading after turning a radian (rad)
+    turn_sigma: NotNegative = 0.02
+    turn_per_metre_sigma: NotNegative = 0.01  # The same after a metre driven (rad)
     # Scale these deviations (distance's, the sideways one, and both of the heading together) by
     # what makes the measurements likeliest; they only begin the search then.
     learn_noise: bool = True
     # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Standard deviations,
     # before anything was measured, of what odometry is off by: the share of each turn, the turn per
     # metre (rad), the share of each way. Terms that make no better predictions are left out.
-    turn_scale_sigma: float = 0.03
-    turn_bias_per_metre_sigma: float = 0.01
-    distance_scale_sigma: float = 0.03
-    gate_probability: float = 0.9999  # Share of right poses that pass the gate
+    turn_scale_sigma: NotNegative = 0.03
+    turn_bias_per_metre_sigma: NotNegative = 0.01
+    distance_scale_sigma: NotNegative = 0.03
+    # Share of right poses that pass the gate
+    gate_probability: Annotated[float, PROBABILITY] = 0.9999
     # Factors on the measurements' covariances, by the stream's name; others count as 1.
     covariance_scale: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in _DEVIATIONS:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise GroundTruthError(f"{name} is {value}: expected 0 or more")
-        if not 0.0 < self.gate_probability < 1.0:
-            raise GroundTruthError(
-                f"gate_probability is {self.gate_probability}: expected between 0 and 1"
-            )
+        demand_fields(self, GroundTruthError)
         for name, value in (self.covariance_scale or {}).items():
-            if not (math.isfinite(value) and value > 0.0):
+            if not ABOVE_0.hold(value):
                 raise GroundTruthError(f"covariance scale of {name} is {value}: expected above 0")
 
     def systematic_sigmas(self) -> FloatArray:

@@ -27,7 +27,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert
-from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
+from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class LaserSettings:
         If a number is out of range.
     """
 
-    gate_m: float = 0.2  # Farthest that a reading may lie from the robot's outline (m)
-    kept: float = 0.95  # Share of the readings within the gate that the ICP counts: the best
+    gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m)
+    kept: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best
 
     # The ICP ends when its root mean square error changes by less, or after as many steps.
     threshold_m: ClassVar[float] = 1e-5
@@ -77,7 +77,7 @@ class LaserSettings:
     forward_m: ClassVar[float] = 0.3
 
     def __post_init__(self) -> None:
-        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
+        demand_fields(self, GroundTruthError)
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:

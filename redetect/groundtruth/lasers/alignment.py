@@ -34,7 +34,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, between, compose, invert
-from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
+from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 #: Steps of the published order, by which results are named.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
@@ -63,11 +63,12 @@ class AlignmentSettings:
         If a number is out of range.
     """
 
-    gate_m: float = 0.5  # Farthest that a reading may lie from what it is matched with at first (m)
-    kept: float = 0.95  # Share of the matches that counts: the best
+    # Farthest that a reading may lie from what it is matched with at first (m)
+    gate_m: Positive = 0.5
+    kept: ShareAbove0 = 0.95  # Share of the matches that counts: the best
 
     def __post_init__(self) -> None:
-        demand(self, GroundTruthError, gate_m=ABOVE_0, kept=SHARE_ABOVE_0)
+        demand_fields(self, GroundTruthError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from scipy.special import ndtri
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.plane import apply, invert
-from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
+from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 _MOST_STEPS = 500
 # How often the last gate of a match of scans is repeated at most, and its damping: a millimetre's
@@ -44,23 +44,16 @@ class IcpSettings:
         If a number is out of range.
     """
 
-    gate_m: float = 0.2  # Pairs farther apart than this do not count (m)
-    kept: float = 0.95  # Share of the pairs within the gate that counts: the best
+    gate_m: Positive = 0.2  # Pairs farther apart than this do not count (m)
+    kept: ShareAbove0 = 0.95  # Share of the pairs within the gate that counts: the best
     # The ICP ends when the root mean square error changes by less than this (m)
-    threshold_m: float = 1e-7
+    threshold_m: Positive = 1e-7
     # A direction is undetermined if the pose's standard deviation along it is larger than this (m;
     # a rotation counts by what it does to the points, root mean square).
-    weak_sigma_m: float = 0.05
+    weak_sigma_m: Positive = 0.05
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            GroundTruthError,
-            gate_m=ABOVE_0,
-            kept=SHARE_ABOVE_0,
-            threshold_m=ABOVE_0,
-            weak_sigma_m=ABOVE_0,
-        )
+        demand_fields(self, GroundTruthError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from redetect.slam.association.compatibility import Pairing, joint_compatible, n
 from redetect.slam.errors import SlamError
 from redetect.slam.models import rotation
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from redetect.storage.bounds import ABOVE_0, LIMIT, PROBABILITY, Bounds, demand, whole
+from redetect.storage.bounds import PROBABILITY, Bounds, Limit, Positive, demand_fields, whole
 
 # Up to this distance discs have to be equally certain.
 _NEAR_M = 4.0
@@ -201,28 +201,17 @@ class LocalSettings:
     """
 
     method: Method = "joint"
-    gate_probability: float = 0.999
-    sigma_scale: float = 1.4
-    tilt_sigma_rad: float = 0.0035
-    camera_height_m: float = 1.5
-    forget_frames: int = 60
-    forget_sigma_m: float = 0.35
-    most_landmarks: int = 40
-    most_nodes: int = 30_000
+    gate_probability: Annotated[float, PROBABILITY] = 0.999
+    sigma_scale: Positive = 1.4
+    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0035
+    camera_height_m: Positive = 1.5
+    forget_frames: Annotated[int, whole(0)] = 60
+    forget_sigma_m: Limit = 0.35
+    most_landmarks: Annotated[int, whole(1)] = 40
+    most_nodes: Annotated[int, whole(1)] = 30_000
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            gate_probability=PROBABILITY,
-            sigma_scale=ABOVE_0,
-            tilt_sigma_rad=_SWAY_RAD,
-            camera_height_m=ABOVE_0,
-            forget_frames=whole(0),
-            forget_sigma_m=LIMIT,
-            most_landmarks=whole(1),
-            most_nodes=whole(1),
-        )
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)

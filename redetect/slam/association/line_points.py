@@ -20,7 +20,7 @@ from __future__ import annotations
 import heapq
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,7 +31,7 @@ from redetect.slam.association.loop_closing import intersect_bearings, solve_pat
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, disc_in_map
 from redetect.slam.recording import Recording
-from redetect.storage.bounds import ABOVE_0, PROBABILITY, demand, whole
+from redetect.storage.bounds import ABOVE_0, PROBABILITY, Positive, demand_fields, whole
 
 
 class Rays(NamedTuple):
@@ -246,37 +246,25 @@ class PointSettings:
     """Settings of the search for points."""
 
     # Standard deviation of the path's heading in a single frame, for each round (degrees).
-    heading_sigma_deg: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    heading_sigma_deg: Annotated[tuple[float, ...], ABOVE_0] = (0.2, 0.15, 0.1, 0.1)
     # Factor on the rows' standard deviations, which do not include the detector's errors at edges
     # that are close together.
-    sigma_scale: float = 1.5
-    path_sigma_scale: float = 2.0  # the same factor for rows that correct the path
-    detected: float = 0.7  # probability that a vertical in view gives a row
-    gate_sigmas: float = 3.0  # a ray that passes farther from a point does not support it
-    least_score: float = 4.0  # least log likelihood ratio of the rows with a point to those without
+    sigma_scale: Positive = 1.5
+    path_sigma_scale: Positive = 2.0  # the same factor for rows that correct the path
+    detected: Annotated[float, PROBABILITY] = 0.7  # probability that a vertical in view gives a row
+    gate_sigmas: Positive = 3.0  # a ray that passes farther from a point does not support it
+    # Least log likelihood ratio of the rows with a point to those without
+    least_score: Positive = 4.0
     # Numbers of steps between frames whose rays are intersected.
-    gaps: tuple[int, ...] = (2, 4, 7, 11)
-    least_parallax_sigmas: float = 4.0  # least angle between two rays that are intersected
-    farthest_m: float = 14.0  # intersections farther away are ignored
-    window_frames: int = 40  # number of frames before and after an intersection that are scored
-    path_rows: int = 6  # points of fewer rows do not correct the path
+    gaps: Annotated[tuple[int, ...], whole(1)] = (2, 4, 7, 11)
+    least_parallax_sigmas: Positive = 4.0  # least angle between two rays that are intersected
+    farthest_m: Positive = 14.0  # intersections farther away are ignored
+    # Number of frames before and after an intersection that are scored
+    window_frames: Annotated[int, whole(1)] = 40
+    path_rows: Annotated[int, whole(1)] = 6  # points of fewer rows do not correct the path
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            heading_sigma_deg=ABOVE_0,
-            sigma_scale=ABOVE_0,
-            path_sigma_scale=ABOVE_0,
-            detected=PROBABILITY,
-            gate_sigmas=ABOVE_0,
-            least_score=ABOVE_0,
-            gaps=whole(1),
-            least_parallax_sigmas=ABOVE_0,
-            farthest_m=ABOVE_0,
-            window_frames=whole(1),
-            path_rows=whole(1),
-        )
+        demand_fields(self, SlamError)
 
 
 def lines_by_points(

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -22,10 +22,7 @@ from scipy.stats import binom
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.slam.errors import SlamError
-from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+from redetect.storage.bounds import Limit, NotNegative, Positive, demand_fields, whole
 
 # Width of the cells in which the nearest landmark is looked up.
 _CELL_M = 0.05
@@ -153,44 +150,29 @@ SHARED_BY_ONE_PLACE = 3
 class LoopSettings:
     """Settings of the search for loops."""
 
-    stretch_frames: int = 50  # frames whose landmarks form a constellation
-    stride_frames: int = 10  # frames from one constellation to the next
+    stretch_frames: Annotated[int, whole(1)] = 50  # frames whose landmarks form a constellation
+    stride_frames: Annotated[int, whole(1)] = 10  # frames from one constellation to the next
     # By how much the lengths of two pairs of landmarks may differ to vote.
-    length_tolerance_m: float = 0.08
-    least_length_m: float = 0.8  # pairs shorter than this do not vote
-    reach_m: float = 0.12  # largest distance of landmarks that agree
+    length_tolerance_m: Positive = 0.08
+    least_length_m: NotNegative = 0.8  # pairs shorter than this do not vote
+    reach_m: Positive = 0.12  # largest distance of landmarks that agree
     # Largest motion that brings one constellation onto the other.
-    most_turn_rad: float = 0.8
-    most_shift_m: float = 8.0
+    most_turn_rad: Limit = 0.8
+    most_shift_m: Limit = 8.0
     # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: int = 7
+    least_agreeing: Annotated[int, whole(2)] = 7
     # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: float = 1e-3
+    false_alarms: Positive = 1e-3
     # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
     # `earlier_step`-th of these.
-    later_step: int = 1
-    earlier_step: int = 2
+    later_step: Annotated[int, whole(1)] = 1
+    earlier_step: Annotated[int, whole(1)] = 2
     # A stretch that shares landmarks with one at least this many frames earlier is part of the map
     # already and not matched again; 0 to match all.
-    attached_frames: int = 0
+    attached_frames: Annotated[int, whole(0)] = 0
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            stretch_frames=whole(1),
-            stride_frames=whole(1),
-            length_tolerance_m=ABOVE_0,
-            least_length_m=NOT_NEGATIVE,
-            reach_m=ABOVE_0,
-            most_turn_rad=LIMIT,
-            most_shift_m=LIMIT,
-            least_agreeing=whole(2),
-            false_alarms=ABOVE_0,
-            later_step=whole(1),
-            earlier_step=whole(1),
-            attached_frames=whole(0),
-        )
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.stats import chi2
@@ -36,7 +37,7 @@ from redetect.slam.association.loops import LoopSettings, Match, find_matches, s
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, rotation
 from redetect.slam.recording import LineRows, Recording
-from redetect.storage.bounds import PROBABILITY, demand, whole
+from redetect.storage.bounds import PROBABILITY, demand_fields, whole
 
 Progress = Callable[[str], None]
 
@@ -75,18 +76,12 @@ class AssociateSettings:
     map_level: bool = True
     loops: LoopSettings = field(default_factory=LoopSettings)
     points: PointSettings = field(default_factory=PointSettings)
-    most_rounds: int = 6
-    kept_probability: float = 0.99
-    fewest_rows: int = 3
+    most_rounds: Annotated[int, whole(1)] = 6
+    kept_probability: Annotated[float, PROBABILITY] = 0.99
+    fewest_rows: Annotated[int, whole(1)] = 3
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            most_rounds=whole(1),
-            kept_probability=PROBABILITY,
-            fewest_rows=whole(1),
-        )
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from redetect.slam.mounting import (
     rows_through_mounting,
     turn_to_the_left,
 )
-from redetect.storage.bounds import ABOVE_0, Bounds, demand
+from redetect.storage.bounds import Bounds, Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
 
@@ -65,13 +65,13 @@ class Weighting:
     """
 
     loss: LossKind = "none"
-    loss_scale: float = 3.0
+    loss_scale: Positive = 3.0
     calibrate: bool = False
     row_errors: RowErrors = "corrected"
-    tilt_sigma_rad: float = 0.0
+    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0
 
     def __post_init__(self) -> None:
-        demand(self, SlamError, loss_scale=ABOVE_0, tilt_sigma_rad=_SWAY_RAD)
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,7 @@ from redetect.groundtruth.lasers.icp import (
     trimmed_variance,
 )
 from redetect.landmarks import wrap_angle
-from redetect.plane import (
-    apply,
-    between,
-    compose,
-    composed_covariance,
-    invert,
-)
+from redetect.plane import apply, between, compose, composed_covariance, invert
 from tests.groundtruth.lasers.scene import ROOM
 
 FloatArray = NDArray[np.float64]

@@ -12,10 +12,7 @@ from redetect.groundtruth.lasers.acquisition import (
     outline_radius_m,
     outline_symmetries,
 )
-from tests.groundtruth.lasers.scene import (
-    FRONTED,
-    PLAIN,
-)
+from tests.groundtruth.lasers.scene import FRONTED, PLAIN
 
 FloatArray = NDArray[np.float64]
 

@@ -14,10 +14,7 @@ from redetect.groundtruth.lasers.sets import (
     scanner_tables,
     sets_of_scans,
 )
-from tests.groundtruth.lasers.scene import (
-    empty_scans,
-    four_scanners,
-)
+from tests.groundtruth.lasers.scene import empty_scans, four_scanners
 
 FloatArray = NDArray[np.float64]
 

@@ -41,12 +41,7 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.lasers.tracking_kernels import (
-    Beams,
-    Seen,
-    explain_set,
-    new_points,
-)
+from redetect.groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, new_points
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert

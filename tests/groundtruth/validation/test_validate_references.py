@@ -20,11 +20,7 @@ from redetect.groundtruth.validation.reference_poses import (
     distance_residuals,
     poses_from_distances,
 )
-from redetect.groundtruth.validation.reference_poses_scans import (
-    Onboard,
-    refine_pose,
-    still_points,
-)
+from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
