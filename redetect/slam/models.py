@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
-from redetect.landmarks import wrap_angle
+from redetect.plane import between, rotation
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
@@ -47,16 +47,6 @@ class OdometryNoise:
             f"and {self.turn_per_metre:g} rad per metre, at least {self.least_m:g} m and "
             f"{self.least_rad:g} rad"
         )
-
-
-def rotation(theta_rad: ArrayLike) -> FloatArray:
-    """Rotations of the plane, robot axes into the map's.
-
-    Takes `theta_rad` (...); returns (..., 2, 2).
-    """
-    angle = np.asarray(theta_rad, dtype=np.float64)
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 
 
 def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
@@ -97,39 +87,13 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
     return by_pose, by_step
 
 
-def relative_pose(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """The second pose in the frame of the first: the step that leads from one to the other.
-
-    Parameters
-    ----------
-    first, second : (..., 3) array_like
-        Poses in one map.
-
-    Returns
-    -------
-    (..., 3) float64
-        dx, dy (m), dphi (rad, in [-pi, pi)).
-    """
-    before = np.asarray(first, dtype=np.float64)
-    offset = np.asarray(second, dtype=np.float64) - before
-    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
-    return np.stack(
-        [
-            cos * offset[..., 0] + sin * offset[..., 1],
-            -sin * offset[..., 0] + cos * offset[..., 1],
-            wrap_angle(offset[..., 2]),
-        ],
-        axis=-1,
-    )
-
-
-def relative_pose_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `relative_pose` by the first (J3) and by the second pose (J4).
+def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of `between` by the first (J3) and by the second pose (J4).
 
     Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
     """
     before = np.asarray(first, dtype=np.float64)
-    step = relative_pose(first, second)
+    step = between(first, second)
     cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
     by_second = np.zeros((*step.shape, 3))
     by_second[..., 0, 0] = by_second[..., 1, 1] = cos
@@ -205,23 +169,6 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
     by_pose[..., :2] = -by_disc
     by_pose[..., 0, 2], by_pose[..., 1, 2] = seen[..., 1], -seen[..., 0]
     return by_pose, by_disc
-
-
-def disc_in_map(pose: ArrayLike, seen_xy: ArrayLike) -> FloatArray:
-    """Inverse measurement model of a disc: where in the map it lies.
-
-    Takes `pose` (..., 3), `seen_xy` (..., 2); returns (..., 2).
-    """
-    robot = np.asarray(pose, dtype=np.float64)
-    seen = np.asarray(seen_xy, dtype=np.float64)
-    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
-    return np.stack(
-        [
-            robot[..., 0] + cos * seen[..., 0] - sin * seen[..., 1],
-            robot[..., 1] + sin * seen[..., 0] + cos * seen[..., 1],
-        ],
-        axis=-1,
-    )
 
 
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:

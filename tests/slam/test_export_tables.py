@@ -13,15 +13,10 @@ from numpy.typing import NDArray
 from camera import read_camera
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import write_table
+from redetect.plane import between, rotation
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.text import Axes, from_dataset
-from redetect.slam.models import (
-    bearing_of_vertical,
-    chain_steps,
-    disc_in_robot,
-    relative_pose,
-    rotation,
-)
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 
 FloatArray = NDArray[np.float64]
@@ -68,13 +63,13 @@ def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes)
     assert [row["prefix"] for row in rows] == list(recording.prefixes)
     assert [row["step"] for row in rows] == [str(k + 1) for k in range(80)]
     poses = estimates(recording)
-    ours = relative_pose(poses[:-1], poses[1:]) - recording.steps
+    ours = between(poses[:-1], poses[1:]) - recording.steps
     ours[:, 2] = wrap_angle(ours[:, 2])
     expected = squared(ours, recording.step_covariance)
 
     steps = numbers(rows, "dx_m", "dy_m", "dphi_rad")
     turned = from_dataset(poses, axes)
-    error = relative_pose(turned[:-1], turned[1:]) - steps
+    error = between(turned[:-1], turned[1:]) - steps
     error[:, 2] = wrap_angle(error[:, 2])
     before = symmetric(numbers(rows, *TRIANGLE), 3)
     assert squared(error, before) == pytest.approx(expected, rel=1e-9)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from redetect.landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
+from redetect.plane import between, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o import (
     RunGraph,
@@ -25,7 +26,7 @@ from redetect.slam.formats.g2o import (
 )
 from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.text import Axes
-from redetect.slam.models import disc_in_robot, relative_pose, rotation
+from redetect.slam.models import disc_in_robot
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
@@ -54,7 +55,7 @@ def text(frames: list[Frame]) -> bytes:
 
 def chi2(graph: RunGraph) -> float:
     """The error of a graph by this project's models, in the data set's axes."""
-    error = relative_pose(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
     error[:, 2] = wrap_angle(error[:, 2])
     place = dict(zip(graph.disc_ids.tolist(), graph.discs))
     rows = graph.circles

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import write_table
+from redetect.plane import between
 from redetect.slam.formats.g2o import RunGraph, graph_of_frames, write_g2o
 from redetect.slam.formats.tables import odometry_table
 from redetect.slam.formats.text import from_dataset
-from redetect.slam.models import disc_in_robot, relative_pose
+from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import read_recording
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
@@ -34,7 +35,7 @@ def estimates_with_error(file: Path) -> RunGraph:
 
 
 def step_errors(graph: RunGraph) -> FloatArray:
-    error = relative_pose(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
     error[:, 2] = wrap_angle(error[:, 2])
     return error
 

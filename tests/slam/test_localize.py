@@ -309,9 +309,9 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
+    from redetect.plane import between
     from redetect.slam.commands.files import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-    from redetect.slam.models import relative_pose
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)
@@ -319,7 +319,7 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     truth = json.loads((run_folder / "truth.json").read_text())
     start = np.array(truth["start"])
     poses = np.array([start] + [frame["pose"] for frame in truth["frames"]])
-    true_poses = relative_pose(start, poses)
+    true_poses = between(start, poses)
     ekf = EkfSlam(camera_xy=camera_xy)
     mapped = run_ekf(recording, ekf)
     located = run_localizer(recording, Localizer(ekf.landmark_map(), camera_xy=camera_xy))

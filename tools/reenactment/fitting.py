@@ -13,11 +13,12 @@ import numpy as np
 
 from camera import Camera
 from redetect.landmarks import wrap_angle
+from redetect.least_squares.solver import whitening
+from redetect.plane import between
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.graph import Estimate, Graph, whitening
+from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting as SlamWeighting
 from redetect.slam.mapping.solve import solve
-from redetect.slam.models import relative_pose
 from tools.arrays import BoolArray, FloatArray, IntArray
 from tools.reenactment.mounted_discs import Geometry, predict_pixels
 from tools.reenactment.recording import Recording
@@ -64,7 +65,7 @@ def nominal_geometry(camera: Camera, poses: FloatArray, disc_xy: FloatArray) -> 
 def odometry_residuals(poses: FloatArray, steps: FloatArray) -> FloatArray:
     """(N, 3) relative motions of poses, from the start (0, 0, 0) on, minus steps."""
     path = np.concatenate([np.zeros((1, 3)), poses])
-    residuals = relative_pose(path[:-1], path[1:]) - steps
+    residuals = between(path[:-1], path[1:]) - steps
     residuals[:, 2] = wrap_angle(residuals[:, 2])
     return residuals
 

@@ -30,9 +30,8 @@ from redetect.groundtruth.trajectories.streams import (
     moved_poses,
     planar_alignment,
     pose_differences,
-    squared_lengths,
 )
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 
 # The factors on odometry's deviations that are tried, and over how many nodes.
 _NOISE_FACTORS = (0.01, 20.0)
@@ -387,7 +386,7 @@ def _left_out(
         to_s,
         len(predicted),
         *_rms(error),
-        float(np.mean(squared_lengths(error, covariances)) / 3.0),
+        float(np.mean(squared_mahalanobis(error, covariances)) / 3.0),
         *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
     )
 

@@ -19,8 +19,9 @@ from redetect.groundtruth.files import read_json_value
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
-    align_poses,
     matched_streams,
+    moved_poses,
+    planar_alignment,
     read_planar_poses,
 )
 from redetect.storage.bounded import read_bounded
@@ -226,7 +227,7 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
         part = in_visits(odometry, [visit])
         try:
             mine, theirs, _ = matched_streams(part, inputs.truth)
-            parts.append(align_poses(mine, theirs))
+            parts.append(moved_poses(mine, planar_alignment(mine, theirs)))
         except GroundTruthError:
             continue  # a visit without odometry, or without truth
     if not parts:

@@ -22,6 +22,7 @@ from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import read_text
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
+from redetect.plane import fitted, rotation
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
 
@@ -337,25 +338,13 @@ def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
     """
     if len(poses) < 2:
         raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")
-    a, b = poses.poses[:, :2], truth.poses[:, :2]
-    from_a, from_b = a - a.mean(axis=0), b - b.mean(axis=0)
-    across = np.sum(from_a[:, 0] * from_b[:, 1] - from_a[:, 1] * from_b[:, 0])
-    angle = float(np.arctan2(across, np.sum(from_a * from_b)))
-    return np.array([*(b.mean(axis=0) - _rotation(angle) @ a.mean(axis=0)), angle])
-
-
-def align_poses(poses: PlanarPoses, truth: PlanarPoses) -> PlanarPoses:
-    """Poses moved rigidly in the plane, without scale, so that their positions fit the truth best.
-
-    Both have the same times (see `planar_alignment`).
-    """
-    return moved_poses(poses, planar_alignment(poses, truth))
+    return fitted(poses.poses[:, :2], truth.poses[:, :2])
 
 
 def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     """Poses, and their covariances, after a rigid motion (x, y, theta) of the world."""
     turn = np.eye(3)
-    turn[:2, :2] = _rotation(float(motion[2]))
+    turn[:2, :2] = rotation(motion[2])
     moved = poses.poses @ turn.T + motion
     covariances = None
     if poses.covariances is not None:
@@ -363,19 +352,8 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     return PlanarPoses(poses.times_s, moved, covariances)
 
 
-def _rotation(angle: float) -> FloatArray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s], [s, c]])
-
-
 def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
     """(N, 3) poses minus the truth's, headings the short way round."""
     difference = poses - truth
     difference[:, 2] = wrap_angle(difference[:, 2])
     return difference
-
-
-def squared_lengths(differences: FloatArray, covariances: FloatArray) -> FloatArray:
-    """(N,) squared Mahalanobis lengths of differences (N, d)."""
-    weighted = np.linalg.solve(covariances, differences[..., None])[..., 0]
-    return np.asarray(np.sum(differences * weighted, axis=1))

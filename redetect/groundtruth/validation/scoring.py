@@ -15,8 +15,8 @@ from redetect.groundtruth.trajectories.streams import (
     is_positive_definite,
     pose_differences,
     read_rows_of_numbers,
-    squared_lengths,
 )
+from redetect.landmarks import squared_mahalanobis
 from redetect.plane import between
 
 
@@ -74,7 +74,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         usable = is_positive_definite(covariances)
         count = int(usable.sum())
         if count:
-            squared = squared_lengths(error[usable], covariances[usable])
+            squared = squared_mahalanobis(error[usable], covariances[usable])
             normalised = float(np.mean(squared) / 3.0)
     return PoseScore(
         len(poses),

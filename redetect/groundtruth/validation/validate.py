@@ -17,10 +17,10 @@ from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     is_positive_definite,
     pose_differences,
-    squared_lengths,
 )
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
+from redetect.landmarks import squared_mahalanobis
 
 _BAND = 0.95
 
@@ -227,7 +227,7 @@ def pose_errors(
     if at_times.covariances is not None and len(error):
         both = at_times.covariances + stream.covariances[known]
         usable = is_positive_definite(at_times.covariances) & is_positive_definite(both)
-        nees[usable] = squared_lengths(error[usable], both[usable])
+        nees[usable] = squared_mahalanobis(error[usable], both[usable])
         sigma[usable, 0] = np.sqrt(both[usable, 0, 0] + both[usable, 1, 1])
         sigma[usable, 1] = np.sqrt(both[usable, 2, 2])
     there = [r for r, found in zip(references, known) if found]

@@ -22,9 +22,9 @@ import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
+from redetect.plane import rotation
 from redetect.slam.association.compatibility import Pairing, joint_compatible, nearest_compatible
 from redetect.slam.errors import SlamError
-from redetect.slam.models import rotation
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage.bounds import PROBABILITY, Bounds, Limit, Positive, demand_fields, whole
 

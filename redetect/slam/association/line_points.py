@@ -27,9 +27,10 @@ from numba import njit
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply
 from redetect.slam.association.loop_closing import intersect_bearings, solve_path
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_of_vertical, disc_in_map
+from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import ABOVE_0, PROBABILITY, Positive, demand_fields, whole
 
@@ -331,7 +332,7 @@ def rays_of(
     poses = path[frame + 1]
     return Rays(
         row=row,
-        centre=disc_in_map(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
+        centre=apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
         angle=bearing + poses[:, 2],
         bearing=bearing,
         sigma=np.hypot(sigma_scale * lines.sigma_rad[row], heading_sigma_rad),

@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.plane import apply, between, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     Match,
@@ -27,7 +28,7 @@ from redetect.slam.association.loops import (
 from redetect.slam.mapping.graph import Estimate, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.solve import solve
-from redetect.slam.models import chain_steps, disc_in_map, relative_pose, rotation
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
 
 
@@ -53,7 +54,7 @@ def intersect_bearings(
     lines = recording.lines
     count = int(labels.max(initial=-1)) + 1
     pose = path[lines.frame + 1]
-    centre = disc_in_map(pose, np.broadcast_to(np.asarray(camera_xy), (len(pose), 2)))
+    centre = apply(pose, np.broadcast_to(np.asarray(camera_xy), (len(pose), 2)))
     angle = lines.bearing_rad + pose[:, 2]
     along = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
@@ -114,7 +115,7 @@ def solve_path(
         camera_xy=np.asarray(camera_xy, dtype=np.float64),
         line_prior=places[known],
     )
-    seen = disc_in_map(poses[graph.disc_pose], graph.disc_xy)
+    seen = apply(poses[graph.disc_pose], graph.disc_xy)
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
     start = Estimate(poses, disc_xy, places[known])
@@ -244,9 +245,7 @@ def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
         moved[k, 2] += match.turn_rad
     before = np.concatenate([np.arange(count), first])
     after = np.concatenate([np.arange(1, count + 1), second])
-    seen = relative_pose(
-        np.concatenate([path[:-1], path[first]]), np.concatenate([path[1:], moved])
-    )
+    seen = between(np.concatenate([path[:-1], path[first]]), np.concatenate([path[1:], moved]))
     turns = np.concatenate([np.diff(path[:, 2]), moved[:, 2] - path[first, 2]])
     is_match = np.arange(len(before)) >= count
     weights = [1.0 / np.where(is_match, _MATCH_SIGMA[a], _STEP_SIGMA[a]) for a in (0, 1)]

@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from scipy.stats import binom
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.plane import apply, fitted, rotation
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand_fields, whole
 
@@ -295,17 +296,6 @@ def find_matches(
     return [matches[n] for n in order]
 
 
-def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]:
-    """The rigid motion of least squares between paired points of the plane.
-
-    Takes `moved, fixed` (n, 2); returns `turn_rad`, `shift` (2,).
-    """
-    first, second = moved.mean(axis=0), fixed.mean(axis=0)
-    a, b = moved - first, fixed - second
-    turn = float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
-    return turn, second - _turned(first, turn)
-
-
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
     """Points of two sets that are each other's nearest, and near.
 
@@ -343,13 +333,13 @@ def _refined(
     """Match by least squares over all landmarks that agree; None if too few agree then."""
     place, target = later.xy[moved], earlier.xy[fixed]
     centre = place.mean(axis=0)
-    shift = centre + offset - _turned(centre, turn)
+    pose = np.array([*(centre + offset - rotation(turn) @ centre), turn])
     for _ in range(5):
-        pairs = mutual_pairs(target, _turned(place, turn) + shift, settings.reach_m)
+        pairs = mutual_pairs(target, apply(pose, place), settings.reach_m)
         if len(pairs) < settings.least_agreeing:
             return None
-        turn, shift = fit_motion(place[pairs[:, 1]], target[pairs[:, 0]])
-    after = _turned(place, turn) + shift
+        pose = fitted(place[pairs[:, 1]], target[pairs[:, 0]])
+    after = apply(pose, place)
     nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
     chance = len(target) * np.pi * settings.reach_m**2 / _covered_area(target)
@@ -357,8 +347,8 @@ def _refined(
         earlier.middle_frame,
         later.middle_frame,
         np.stack([earlier.labels[fixed][pairs[:, 0]], later.labels[moved][pairs[:, 1]]], axis=1),
-        turn,
-        shift,
+        float(pose[2]),
+        pose[:2],
         log10_false_alarms(len(pairs), present, chance, tried),
     )
 
@@ -371,8 +361,3 @@ def _covered_area(xy: FloatArray) -> float:
         ys[None, None, :] - xy[:, 1, None, None]
     ) ** 2
     return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
-
-
-def _turned(xy: FloatArray, turn: float) -> FloatArray:
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.stack([cos * xy[..., 0] - sin * xy[..., 1], sin * xy[..., 0] + cos * xy[..., 1]], -1)

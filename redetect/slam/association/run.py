@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.plane import rotation
 from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally, tilt_jacobian
 from redetect.slam.association.line_points import PointSettings, lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -35,7 +36,7 @@ from redetect.slam.association.loop_closing import (
 )
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, rotation
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import LineRows, Recording
 from redetect.storage.bounds import PROBABILITY, demand_fields, whole
 

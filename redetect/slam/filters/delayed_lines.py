@@ -20,7 +20,8 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-from redetect.slam.models import bearing_of_vertical, disc_in_map, disc_in_robot
+from redetect.plane import apply
+from redetect.slam.models import bearing_of_vertical, disc_in_robot
 
 _MOST_ITERATIONS = 10
 _CONVERGED_M = 1e-6
@@ -147,7 +148,7 @@ def triangulate(
     Takes `poses` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,), `pose_covariance` (3 k, 3
     k); returns (2,).
     """
-    origin = disc_in_map(poses, camera_xy)
+    origin = apply(poses, camera_xy)
     angle = poses[:, 2] + bearing_rad
     # A ray looks along (sin, -cos) of its angle; this is across it.
     across = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

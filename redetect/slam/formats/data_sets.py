@@ -26,9 +26,10 @@ from scipy.io.matlab import MatReadError
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Step
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.plane import between
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.text import finite, text_rows, to_dataset
-from redetect.slam.models import chain_steps, relative_pose
+from redetect.slam.models import chain_steps
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -113,7 +114,7 @@ def _steps_between(
     knots = knots[knots >= ends[0]]
     held = np.clip(np.searchsorted(logged, knots[:-1], side="right") - 1, 0, None)
     poses = chain_steps(along(held, np.diff(knots)))[np.searchsorted(knots, times)]
-    return relative_pose(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+    return between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
 
 
 def read_robot(odometry: Path) -> RangeBearing:

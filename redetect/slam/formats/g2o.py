@@ -32,6 +32,7 @@ from redetect.landmarks import (
     parse_record,
 )
 from redetect.landmarks.map_file import Path2D, read_map, read_path
+from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.text import (
     AXES_COMMENT,
@@ -42,7 +43,7 @@ from redetect.slam.formats.text import (
     from_dataset,
     write_text,
 )
-from redetect.slam.models import OdometryNoise, chain_steps, disc_in_map, rotation
+from redetect.slam.models import OdometryNoise, chain_steps
 from redetect.slam.recording import ASSUMED, CircleRows, Recording, recording_of_frames
 
 #: Begins the comment with a frame's name and the qualities of its rows.
@@ -223,7 +224,7 @@ def graph_of_frames(
     poses = poses_of_run(recording, solution)
     disc_ids, first = np.unique(rows.ids, return_index=True)
     if solution is None:
-        discs = disc_in_map(poses.poses[rows.frame[first] + 1], rows.xy[first])
+        discs = apply(poses.poses[rows.frame[first] + 1], rows.xy[first])
     else:
         discs = _places(solution / "map.csv", disc_ids)
     return RunGraph(

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import whitening
+from redetect.plane import apply
 from redetect.slam.errors import SlamError
-from redetect.slam.models import chain_steps, disc_in_map
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import LineRows, Recording
 
 
@@ -182,7 +183,7 @@ def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
     _, first = np.unique(graph.disc_index, return_index=True)
     return Estimate(
         poses=poses,
-        disc_xy=disc_in_map(poses[graph.disc_pose[first]], graph.disc_xy[first]),
+        disc_xy=apply(poses[graph.disc_pose[first]], graph.disc_xy[first]),
         line_xy=np.full((len(graph.line_ids), 2), np.nan),
     )
 

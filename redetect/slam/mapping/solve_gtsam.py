@@ -19,11 +19,12 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
+from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
 from redetect.slam.mapping.solve import Solution
-from redetect.slam.models import bearing_jacobians, bearing_of_vertical, rotation
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical
 
 # Called with factor, values and, where derivatives are wanted, a list for them.
 ErrorFunction = Callable[[Any, Any, list[FloatArray] | None], FloatArray]

@@ -12,8 +12,9 @@ from scipy.stats import chi2
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
-    align_poses,
     interpolate_poses,
+    moved_poses,
+    planar_alignment,
     read_planar_poses,
 )
 from redetect.groundtruth.validation.scoring import score_poses
@@ -96,7 +97,7 @@ def test_alignment_takes_a_rigid_motion_off() -> None:
             [truth.poses[:, :2] @ np.array([[c, s], [-s, c]]) + [3, -4], truth.poses[:, 2] + 2.5]
         ),
     )
-    aligned = align_poses(moved, truth)
+    aligned = moved_poses(moved, planar_alignment(moved, truth))
     np.testing.assert_allclose(aligned.poses[:, :2], truth.poses[:, :2], atol=1e-12)
     assert score_poses(aligned, truth).angle_max_rad < 1e-12
 
