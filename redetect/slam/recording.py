@@ -203,11 +203,8 @@ def read_recording(
         )
     if not circles and not lines:
         raise SlamError(f"{path}: neither circles nor lines: expected at least one to be used")
-    files = [
-        landmark_file(path, suffix, stem)
-        for suffix, wanted in ((".circles", circles), (".lines", lines))
-        if wanted
-    ]
+    kinds = (".circles", circles), (".lines", lines)
+    files = [landmark_file(path, suffix, stem) for suffix, wanted in kinds if wanted]
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)

@@ -10,8 +10,8 @@ import numpy as np
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.frames import FilterRun
-from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
+from redetect.slam.filters.frames import FilterRun, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from tools.arrays import FloatArray
@@ -200,7 +200,7 @@ def localized(sigma_m: float, map_errors: MapErrors) -> Callable[[SimulatedRun, 
     def estimate(run: SimulatedRun, seed: int) -> FilterRun:
         some_map = true_map(run, sigma_m, seed + 1_000_000)
         localizer = Localizer(some_map, camera_xy=CAMERA_XY, map_errors=map_errors)
-        return run_localizer(run.recording, localizer)
+        return run_filter(run.recording, localizer)
 
     return estimate
 

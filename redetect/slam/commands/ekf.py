@@ -13,6 +13,7 @@ from redetect.slam.commands.files import (
     default_output,
     demand_free,
     draw_results,
+    flags_of,
     read_reference,
     read_run_of,
     timed,
@@ -39,7 +40,7 @@ def perform(command: Ekf) -> int:
     demand(command, SlamError, start=FINITE)
     associator = Associator(command.association, command.gate_probability)
     recording, camera_xy = read_run_of(command)
-    demand_free(output, names, overwrite=command.force)
+    demand_free([output / name for name in names], overwrite=command.force)
     ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
     run, time_line = timed(lambda: run_ekf(recording, ekf, associator))
     landmark_map = ekf.landmark_map()
@@ -56,10 +57,11 @@ def perform(command: Ekf) -> int:
         else None
     )
     comments = [f"slam ekf {slam.__version__}: {command.run}"]
+    output.mkdir(parents=True, exist_ok=True)
     write_path(output / PATH_NAME, run.path, comments, overwrite=command.force)
     write_map(output / MAP_NAME, landmark_map, comments, overwrite=command.force)
     write_joint_covariance(output / MAP_NAME, ekf.map_covariance(), overwrite=command.force)
-    content = summary(run, command, distance)
+    content = summary(run, flags_of(command), distance)
     content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
     if from_map is not None:
         content["distance_from_reference_map"] = from_map

@@ -130,7 +130,8 @@ def _export_tables(command: Export) -> int:
     if len(recording.lines):
         tables["bearings.csv"] = bearing_table(recording, camera_xy, axes)
     solution = ("path.csv", "map.csv") if command.solution is not None else ()
-    demand_free(folder, (*tables, *solution), overwrite=force)
+    demand_free([folder / name for name in (*tables, *solution)], overwrite=force)
+    folder.mkdir(parents=True, exist_ok=True)
     head = [_made_by(command.run), f"AXES {axes} ({MEANING[axes]})"]
     for name, table in tables.items():
         write_table(folder / name, table.columns, table.rows, head, overwrite=force)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from redetect.slam.filters.frames import NO_CAMERA, FilterRun
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import FilterFlags, RunFlags
 from redetect.slam.pictures import draw_errors, draw_map
-from redetect.slam.recording import Recording, read_recording
+from redetect.slam.recording import Recording, demand_landmarks, landmark_file, read_recording
 from redetect.storage import OutputExistsError, write_whole
 
 
@@ -111,20 +113,36 @@ def read_reference(path: Path, poses: Path2D) -> Path2D:
     return reference
 
 
-def default_output(run: Path, name: str) -> Path:
+def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
+
+
+def landmark_files(flags: RunFlags) -> list[Path]:
+    """The landmark files of the kinds that a command names."""
+    if not flags.run.is_dir():
+        return [demand_landmarks(flags.run)]
+    kinds = (".circles", flags.circles or not flags.lines), (".lines", flags.lines)
+    return [landmark_file(flags.run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
 PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
 
 
-def demand_free(folder: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
-    """Refuse before the work what could not be written after it, and make the folder."""
-    for name in names:
-        if (folder / name).exists() and not overwrite:
-            raise OutputExistsError(folder / name)
-    folder.mkdir(parents=True, exist_ok=True)
+def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
+    """Refuse before the work what could not be written after it."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise OutputExistsError(path)
+
+
+def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A command's flags as a JSON file has them."""
+    return {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in asdict(cast(Any, command)).items()
+        if name not in but
+    }
 
 
 def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
@@ -139,7 +157,7 @@ def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
     )
 
 
-def write_json(path: Path, content: dict[str, object], *, overwrite: bool) -> None:
+def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
     """Write a summary."""
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())

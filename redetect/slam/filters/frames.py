@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
@@ -139,9 +139,7 @@ class FrameRows:
         self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
     ) -> FrameRows:
         """The same rows under other identifiers."""
-        return FrameRows(
-            disc_ids, self.disc_xy, self.disc_covariance, line_ids, self.bearing_rad, self.sigma_rad
-        )
+        return replace(self, disc_ids=disc_ids, line_ids=line_ids)
 
     def innovation(
         self,
@@ -271,9 +269,7 @@ _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
 _NONE = np.zeros(0, dtype=np.int64)
 _NO_DISCS = MeasuredDiscs(_NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-_NO_LINES = MeasuredLines(
-    np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0)
-)
+_NO_LINES = MeasuredLines(_NONE, np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -352,10 +348,27 @@ class Associator:
 def run_filter(
     recording: Recording,
     estimate: Filter,
-    pairing: Associator,
+    associator: Associator | None = None,
     new_id: Callable[[], int] | None = None,
 ) -> FilterRun:
-    """Take a filter through a run; a `SlamError` names the step."""
+    """Take a filter through a run.
+
+    Parameters
+    ----------
+    recording : Recording
+    estimate : Filter
+        At the start; changed.
+    associator : Associator, optional
+        How rows are paired with landmarks; by default by their identifiers.
+    new_id : callable, optional
+        Gives the next identifier for a row that is found to show a new disc.
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible; the message names the step.
+    """
+    pairing = associator or Associator()
     disc_ids: list[int] = []
     line_ids: list[tuple[int, ...]] = []
     poses = np.empty((len(recording) + 1, 3))
@@ -399,6 +412,15 @@ def _closest(innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -
     """Squared Mahalanobis distance of each row of a disc from the landmark closest to it: (n,)."""
     pairs = np.arange(innovation.shape[1])
     own = predicted.reshape(len(pairs), 2, len(pairs), 2)[pairs, :, pairs, :]
-    covariance = own[None] + noise[:, None]
-    solved = np.linalg.solve(covariance, innovation[..., None])[..., 0]
-    return np.asarray(np.min(np.sum(innovation * solved, axis=2), axis=1))
+    return np.asarray(np.min(squared_mahalanobis(innovation, own + noise[:, None]), axis=1))
+
+
+def innovation_root(covariance: FloatArray) -> FloatArray:
+    """Cholesky factor of an innovation's covariance; `SlamError` where there is none."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        raise SlamError(
+            "the covariance of the innovation is not positive definite: rows or steps with "
+            "covariances that contradict each other"
+        ) from None

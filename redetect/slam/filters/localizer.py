@@ -19,17 +19,14 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
-from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import (
     NO_CAMERA,
-    Associator,
-    FilterRun,
     FrameRows,
     RowCount,
-    run_filter,
+    innovation_root,
 )
 from redetect.slam.models import move, move_jacobians
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.recording import UNKNOWN_ID
 
 MapErrors = Literal["considered", "white", "ignored"]
 
@@ -151,13 +148,7 @@ class Localizer:
         )
         block = self.block(index)
         covariance = jacobian @ block @ jacobian.T + noise
-        try:
-            root = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            raise SlamError(
-                "the covariance of the innovation is not positive definite: rows or steps with "
-                "covariances that contradict each other"
-            ) from None
+        root = innovation_root(covariance)
         whitened = np.linalg.solve(root, innovation)
         # The pose's part of P H^T, over the root of S.
         factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
@@ -185,30 +176,3 @@ class Localizer:
                 self.count.left_out[reason] += 1
         self.count.discs += len(discs)
         self.count.lines += len(lines)
-
-
-def run_localizer(
-    recording: Recording, localizer: Localizer, associator: Associator | None = None
-) -> FilterRun:
-    """Take a localizer through a run.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    localizer : Localizer
-        A filter at the start; changed.
-    associator : Associator, optional
-        How rows are paired with the map; by default by their identifiers.
-
-    Returns
-    -------
-    FilterRun
-        With the landmarks that each row was taken to show.
-
-    Raises
-    ------
-    SlamError
-        If an update is not possible; the message names the step.
-    """
-    return run_filter(recording, localizer, associator or Associator())
