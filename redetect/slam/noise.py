@@ -17,13 +17,7 @@ from redetect.storage.bounds import NotNegative, demand_fields, whole
 
 @dataclass(frozen=True)
 class AddedNoise:
-    """Standard deviations of the added noise, independent for each number.
-
-    Raises
-    ------
-    SlamError
-        If a standard deviation is negative or not finite, or the seed is negative.
-    """
+    """Standard deviations of the added noise, independent for each number."""
 
     disc_m: NotNegative = 0.0  # to x and y of a disc
     # To the bearing of a line. Its ends in the image stay as they are.

@@ -54,13 +54,7 @@ _MUCH_LESS_CERTAIN = 4.0
 
 @dataclass(frozen=True)
 class SyncSettings:
-    """Bounds of the search.
-
-    Raises
-    ------
-    GroundTruthError
-        If one is not finite or not positive, or the drift is half or more.
-    """
+    """Bounds of the search."""
 
     largest_offset_s: Positive = 1.0  # Of the time offset, either way (s)
     # The clocks' rates differ by at most this share

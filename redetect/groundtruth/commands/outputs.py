@@ -40,7 +40,7 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     """Metadata of a result: version, settings, and the files that it depends on."""
     return {
         "version": __version__,
-        "settings": asdict(settings),
+        "settings": settings if isinstance(settings, dict) else asdict(settings),
         "files": {
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
         },

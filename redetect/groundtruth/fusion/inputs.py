@@ -17,13 +17,7 @@ from redetect.storage.bounds import ABOVE_0, PROBABILITY, NotNegative, demand_fi
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """How odometry errs, and how far a measurement may be off.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is not finite, negative, or no probability.
-    """
+    """How odometry errs, and how far a measurement may be off."""
 
     # Standard deviation of odometry's distance after a metre (m); it grows with the root.
     distance_sigma: NotNegative = 0.02

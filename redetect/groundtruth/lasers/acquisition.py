@@ -32,13 +32,7 @@ from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 @dataclass(frozen=True)
 class LaserSettings:
-    """Settings of laser tracking.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is out of range.
-    """
+    """Settings of laser tracking."""
 
     gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m)
     kept: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best

@@ -55,13 +55,7 @@ _INCONSISTENT_M = 0.05
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Settings of the scanners' alignment.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is out of range.
-    """
+    """Settings of the scanners' alignment."""
 
     # Farthest that a reading may lie from what it is matched with at first (m)
     gate_m: Positive = 0.5

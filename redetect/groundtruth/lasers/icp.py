@@ -36,13 +36,7 @@ _REPEATED, _DAMPING = 10, 1e-3
 
 @dataclass(frozen=True)
 class IcpSettings:
-    """Settings of an ICP.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is out of range.
-    """
+    """Settings of an ICP."""
 
     gate_m: Positive = 0.2  # Pairs farther apart than this do not count (m)
     kept: ShareAbove0 = 0.95  # Share of the pairs within the gate that counts: the best

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -172,14 +172,20 @@ def _map(
             axes.plot(x, y, color=track.colour, lw=1.3, dashes=track.dashes, label=track.label)
         for outline in outlines:
             axes.fill(*outline.T, fc=tracks[0].colour, ec=tracks[0].colour, lw=0.8, alpha=0.3)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal")
-        axes.set(xlabel="x / m", ylabel="y / m")
+        _frame(axes, low, high)
         axes.grid(alpha=0.25, lw=0.6)
         if len(tracks) > 1:
             axes.legend(fontsize=8)
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
+
+
+def _frame(axes: Axes, low: FloatArray, high: FloatArray, title: str = "", **words: Any) -> None:
+    """The frame of a map between two corners."""
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x / m", ylabel="y / m")
+    axes.set_aspect("equal")
+    axes.grid(alpha=0.25)
+    if title:
+        axes.set_title(title, **words)
 
 
 def draw_walls(axes: Axes, building: FloatArray) -> None:
@@ -215,13 +221,9 @@ def draw_rig(estimate: RigEstimate) -> bytes:
                 label=f"pairwise, agrees ({len(agreeing)})", zorder=2,
             )  # fmt: skip
             _draw_markers(axes, rig, across, up)
-            axes.set_xlim(middle[across] - reach, middle[across] + reach)
-            axes.set_ylim(middle[up] - reach, middle[up] + reach)
-            axes.set_aspect("equal")
-            axes.set_xlabel(f"{_AXES[across]} / m")
-            axes.set_ylabel(f"{_AXES[up]} / m")
-            axes.set_title(title)
-            axes.grid(alpha=0.25)
+            of = [across, up]
+            _frame(axes, middle[of] - reach, middle[of] + reach, title)
+            axes.set(xlabel=f"{_AXES[across]} / m", ylabel=f"{_AXES[up]} / m")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return content.getvalue()
 
@@ -231,12 +233,8 @@ def _clouds(estimate: RigEstimate, rig: Rig) -> tuple[FloatArray, FloatArray]:
     agreeing, differing = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for (a, b), pair in sorted(estimate.pairs.items()):
         poses = rig.robot_from_marker
-        places = np.concatenate(
-            [
-                (poses[a] @ pair.estimates)[:, :3, 3],
-                (poses[b] @ inverse(pair.estimates))[:, :3, 3],
-            ]
-        )
+        estimates = poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)
+        places = np.concatenate(estimates)[:, :3, 3]
         agrees = np.tile(pair.agrees, 2)
         agreeing.append(places[agrees])
         differing.append(places[~agrees])
@@ -288,13 +286,7 @@ def draw_alignment(
                 axes.plot(
                     *pose[:2], "o", color=colour, ms=7, zorder=3, label=alignment.scanners[k].name
                 )
-            axes.set_xlim(low[0], high[0])
-            axes.set_ylim(low[1], high[1])
-            axes.set_aspect("equal")
-            axes.set_xlabel("x / m")
-            axes.set_ylabel("y / m")
-            axes.set_title(title)
-            axes.grid(alpha=0.25)
+            _frame(axes, low, high, title)
         axes.legend(loc="upper right", framealpha=0.9)
     return content.getvalue()
 
@@ -384,13 +376,7 @@ def draw_errors(
                 str(error.index), pose[:2], xytext=(4, 4), textcoords="offset points", fontsize=7
             )
         low, high = poses[:, :2].min(axis=0) - 1.5, poses[:, :2].max(axis=0) + 1.5
-        where.set_xlim(low[0], high[0])
-        where.set_ylim(low[1], high[1])
-        where.set_aspect("equal")
-        where.set_xlabel("x / m")
-        where.set_ylabel("y / m")
-        where.set_title(f"errors, drawn {factor:g} times as long", fontsize=10)
-        where.grid(alpha=0.25)
+        _frame(where, low, high, f"errors, drawn {factor:g} times as long", fontsize=10)
     return content.getvalue()
 
 

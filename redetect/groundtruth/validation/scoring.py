@@ -80,11 +80,11 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         len(poses),
         unmatched,
         float(distance.mean()),
-        _sigma(distance),
+        sigma_of(distance),
         float(np.sqrt(np.mean(distance**2))),
         float(distance.max()),
         float(error[:, 2].mean()),
-        _sigma(error[:, 2]),
+        sigma_of(error[:, 2]),
         float(np.abs(error[:, 2]).max()),
         float(np.abs(error[:, 2]).mean()),
         float(np.median(distance)),
@@ -93,11 +93,9 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
     )
 
 
-def _sigma(values: FloatArray) -> float:
+def sigma_of(values: FloatArray) -> float:
+    """Standard deviation with N - 1; 0 of a single value."""
     return float(values.std(ddof=1)) if len(values) > 1 else 0.0
-
-
-_COLUMNS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +141,7 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
     StreamError
         If the file cannot be read or a row is malformed; the message names file and line.
     """
-    table = read_rows_of_numbers(path, _COLUMNS, "t_i, t_j, x, y, z, roll, pitch, yaw")
+    table = read_rows_of_numbers(path, 8, "t_i, t_j, x, y, z, roll, pitch, yaw")
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 
 
@@ -208,7 +206,7 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
         len(error),
         unmatched,
         float(length.mean()),
-        float(length.std(ddof=1)) if len(length) > 1 else 0.0,
+        sigma_of(length),
         float(np.median(length)),
         float(np.sqrt(np.mean(length**2))),
         float(length.max()),

@@ -20,6 +20,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
+from redetect.groundtruth.validation.scoring import sigma_of
 from redetect.landmarks import squared_mahalanobis
 
 _BAND = 0.95
@@ -267,16 +268,13 @@ def figures_of(errors: Sequence[PoseError]) -> Figures:
         tails = [0.5 * (1.0 + _BAND), 0.5 * (1.0 - _BAND)]
         low, high = (float(v) / freedom for v in chdtri(freedom, tails))
 
-    def sigma(values: FloatArray) -> float:
-        return float(values.std(ddof=1)) if len(values) > 1 else 0.0
-
     return Figures(
         len(errors),
         float(linear.mean()),
-        sigma(linear),
+        sigma_of(linear),
         float(linear.max()),
         float(angular.mean()),
-        sigma(angular),
+        sigma_of(angular),
         float(np.abs(angular).max()),
         len(nees),
         float(nees.mean() / 3.0) if len(nees) else math.nan,
@@ -294,6 +292,7 @@ def table_rows(
     for r in references:
         error = by_index.get(r.index)
         sigma = np.sqrt(np.diagonal(r.covariance))
+        good = r.distances.residuals_m[r.distances.used]
         rows.append(
             {
                 "pose": r.index,
@@ -306,15 +305,13 @@ def table_rows(
                 "sigma_theta_rad": float(sigma[2]),
                 "distances": int(r.distances.used.sum()),
                 "gross": int((~r.distances.used).sum()),
-                "distance_rms_m": float(
-                    np.sqrt(np.mean(r.distances.residuals_m[r.distances.used] ** 2))
-                ),
+                "distance_rms_m": float(np.sqrt(np.mean(good**2))),
                 "scans": r.scans,
                 "error_x_m": None if error is None else error.x_m,
                 "error_y_m": None if error is None else error.y_m,
                 "linear_m": None if error is None else error.linear_m,
                 "angular_deg": None if error is None else math.degrees(error.angular_rad),
-                "nees": None if error is None else _finite(error.nees),
+                "nees": None if error is None else finite_or_none(error.nees),
             }
         )
     return rows
@@ -323,11 +320,12 @@ def table_rows(
 def document(figures: Figures, refused: Sequence[Refused]) -> dict[str, Any]:
     """Figures and refused poses as written to a JSON file: null for missing values."""
     return {
-        "figures": {k: _finite(v) for k, v in asdict(figures).items()},
+        "figures": {k: finite_or_none(v) for k, v in asdict(figures).items()},
         "published": [asdict(published) for published in PUBLISHED],
         "refused": [asdict(r) for r in refused],
     }
 
 
-def _finite(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
+    """A number as JSON has it."""
     return value if math.isfinite(value) else None

@@ -19,12 +19,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
-from redetect.slam.filters.frames import (
-    NO_CAMERA,
-    FrameRows,
-    RowCount,
-    innovation_root,
-)
+from redetect.slam.filters.frames import NO_CAMERA, FrameRows, RowCount, innovation_root
 from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID
 
