@@ -26,7 +26,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     refine_outline,
 )
 from redetect.landmarks import wrap_angle
-from redetect.plane import compose, invert
+from redetect.plane import compose, invert, rotation
 from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 
@@ -130,9 +130,7 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
     poses, errors = [], []
     for degrees in range(-180, 180, 3):
         angle = math.radians(degrees)
-        c, s = math.cos(angle), math.sin(angle)
-        turned = np.array([c * centre[0] - s * centre[1], s * centre[0] + c * centre[1]])
-        pose = np.array([*(centre - turned), angle])
+        pose = np.array([*(centre - rotation(angle) @ centre), angle])
         poses.append(pose)
         errors.append(_farthest_m(points, faces, pose))
     found: list[FloatArray] = []
@@ -293,14 +291,12 @@ def _search(
     tried: list[FloatArray] = []
     for k in range(settings.headings):
         theta = 2.0 * math.pi * k / settings.headings
-        c, s = math.cos(theta), math.sin(theta)
-        x, y = body.middle
-        start = np.array([place[0] - c * x + s * y, place[1] - s * x - c * y, theta])
+        start = np.array([*(place - rotation(theta) @ body.middle), theta])
         pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
         pose, _, count = fit_outline(
             seen.points, body.faces, pose, settings.gate_m, settings.kept, 1e-4, settings.most_steps
         )
-        if count < settings.acquire_readings or any(_close(pose, other) for other in tried):
+        if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
         refined = refine(seen, pose, tables, body, settings, 0.1)
@@ -315,15 +311,12 @@ def _search(
     return found
 
 
-def _close(a: FloatArray, b: FloatArray) -> bool:
-    near = math.hypot(a[0] - b[0], a[1] - b[1]) < 0.02
-    return near and abs(float(wrap_angle(a[2] - b[2]))) < math.radians(2.0)
+def _close(a: FloatArray, b: FloatArray, metres: float, degrees: float) -> bool:
+    near = math.hypot(a[0] - b[0], a[1] - b[1]) < metres
+    return near and abs(float(wrap_angle(a[2] - b[2]))) < math.radians(degrees)
 
 
 def _same(a: FloatArray, b: FloatArray, body: Body) -> bool:
     """Whether two poses are equal up to noise and the outline's symmetries."""
-    for other in (b, *(compose(b, symmetry) for symmetry in body.symmetries)):
-        near = math.hypot(a[0] - other[0], a[1] - other[1]) < 0.1
-        if near and abs(float(wrap_angle(a[2] - other[2]))) < math.radians(8.0):
-            return True
-    return False
+    others = (b, *(compose(b, symmetry) for symmetry in body.symmetries))
+    return any(_close(a, other, 0.1, 8.0) for other in others)

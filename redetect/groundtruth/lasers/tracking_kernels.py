@@ -137,6 +137,47 @@ def new_points(
 
 
 @njit(cache=True, error_model="numpy")
+def _face_of(
+    x: float,
+    y: float,
+    bx: float,
+    by: float,
+    range_m: float,
+    faces: FloatArray,
+    normal: FloatArray,
+    gate_m: float,
+) -> int:
+    """The face that a reading at (x, y) belongs to, -1 for none; (bx, by) is its beam's direction.
+
+    Of faces turned to the scanner that which the beam meets first; where its range is not given
+    (below 0), the nearest one within the gate.
+    """
+    best, face = np.inf, -1
+    for k in range(faces.shape[0]):
+        slope = normal[k, 0] * bx + normal[k, 1] * by
+        if slope >= 0.0:
+            continue
+        x1, y1 = faces[k, 0], faces[k, 1]
+        ex, ey = faces[k, 2] - x1, faces[k, 3] - y1
+        length2 = ex * ex + ey * ey
+        if range_m < 0.0:
+            t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
+            d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
+            if d > gate_m:
+                continue
+        else:
+            # From the reading along its beam to the face: the beam's point there.
+            ahead = (normal[k, 0] * (x1 - x) + normal[k, 1] * (y1 - y)) / slope
+            t = ((x + ahead * bx - x1) * ex + (y + ahead * by - y1) * ey) / length2
+            d = range_m + ahead
+            if t < 0.0 or t > 1.0 or d <= 0.0:
+                continue
+        if d < best:
+            best, face = d, k
+    return face
+
+
+@njit(cache=True, error_model="numpy")
 def refine_outline(
     seen: Seen,
     faces: FloatArray,
@@ -180,32 +221,11 @@ def refine_outline(
         for i in range(points.shape[0]):
             dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
             x, y = c * dx + s * dy, -s * dx + c * dy
-            bx, by = (
-                c * direction[i, 0] + s * direction[i, 1],
-                (-s * direction[i, 0] + c * direction[i, 1]),
-            )
-            best, face = np.inf, -1
-            for k in range(faces.shape[0]):
-                slope = normal[k, 0] * bx + normal[k, 1] * by
-                if slope >= 0.0:
-                    continue
-                x1, y1 = faces[k, 0], faces[k, 1]
-                ex, ey = faces[k, 2] - x1, faces[k, 3] - y1
-                length2 = ex * ex + ey * ey
-                if step == 0:
-                    t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
-                    d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
-                    if d > fit.gate_m:
-                        continue
-                else:
-                    # From the reading along its beam to the face: the beam's point there.
-                    ahead = (normal[k, 0] * (x1 - x) + normal[k, 1] * (y1 - y)) / slope
-                    t = ((x + ahead * bx - x1) * ex + (y + ahead * by - y1) * ey) / length2
-                    d = range_m[i] + ahead
-                    if t < 0.0 or t > 1.0 or d <= 0.0:
-                        continue
-                if d < best:
-                    best, face = d, k
+            bx = c * direction[i, 0] + s * direction[i, 1]
+            by = -s * direction[i, 0] + c * direction[i, 1]
+            # While the pose may be off, the nearest face.
+            reach = -1.0 if step == 0 else range_m[i]
+            face = _face_of(x, y, bx, by, reach, faces, normal, fit.gate_m)
             if face < 0:
                 continue
             nx, ny = normal[face, 0], normal[face, 1]

@@ -369,14 +369,9 @@ def _observed(
 def _pairing(
     innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: LocalSettings
 ) -> Pairing:
+    gate = setting.gate_probability
     if setting.method == "nearest":
-        return nearest_compatible(
-            innovations, predicted, noise, gate_probability=setting.gate_probability
-        )
+        return nearest_compatible(innovations, predicted, noise, gate_probability=gate)
     return joint_compatible(
-        innovations,
-        predicted,
-        noise,
-        gate_probability=setting.gate_probability,
-        most_nodes=setting.most_nodes,
+        innovations, predicted, noise, gate_probability=gate, most_nodes=setting.most_nodes
     )

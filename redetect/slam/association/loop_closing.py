@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import squared_mahalanobis
 from redetect.plane import apply, between, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
@@ -220,7 +221,7 @@ def pairs_in_place(
     one_place = np.asarray((linked @ seen[:, first]).multiply(seen[:, second]).sum(axis=0)) > 0
     apart = xy[first] - xy[second]
     both = covariance[first] + covariance[second]
-    squared = np.sum(apart * np.linalg.solve(both, apart[..., None])[..., 0], axis=1)
+    squared = squared_mahalanobis(apart, both)
     usable = np.flatnonzero(one_place & (squared <= chi2.ppf(gate_probability, 2)))
     ordered = usable[np.lexsort((second[usable], first[usable], squared[usable]))]
     return [(int(first[k]), int(second[k])) for k in ordered]
