@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from redetect import slam
-from redetect.landmarks.map_file import read_map, write_map, write_path
+from redetect.landmarks.map_file import (
+    covariance_file,
+    read_map,
+    write_joint_covariance,
+    write_map,
+    write_path,
+)
 from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
@@ -23,7 +29,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.frames import Associator
 from redetect.slam.filters.report import map_distance, path_distance, summary, table
-from redetect.slam.mapping.covariance_file import covariance_file, write_joint_covariance
 from redetect.slam.options import Ekf
 from redetect.storage.bounds import FINITE, demand
 

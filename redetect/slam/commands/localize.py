@@ -6,7 +6,13 @@ import numpy as np
 
 from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    covariance_file,
+    read_joint_covariance,
+    read_map,
+    write_path,
+)
 from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
@@ -25,7 +31,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import Associator, FilterRun, run_filter
 from redetect.slam.filters.localizer import Localizer, MapErrors
 from redetect.slam.filters.report import path_distance, summary, table
-from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from redetect.slam.options import Localize
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand

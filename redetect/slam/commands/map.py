@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from redetect import slam
-from redetect.landmarks.map_file import LandmarkMap, no_landmarks, write_map, write_path
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    covariance_file,
+    no_landmarks,
+    write_joint_covariance,
+    write_map,
+    write_path,
+)
 from redetect.slam.commands.files import (
     camera_of_run,
     default_output,
@@ -21,11 +28,6 @@ from redetect.slam.commands.files import (
     write_json,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.covariance_file import (
-    covariance_file,
-    joint_covariance,
-    write_joint_covariance,
-)
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import (
     LeftOut,
@@ -37,6 +39,7 @@ from redetect.slam.mapping.run_map import (
     path_of,
     table_lines,
 )
+from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording

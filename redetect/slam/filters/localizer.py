@@ -6,7 +6,7 @@ the filter *considers* them: it carries the correlation of the pose with each la
 without estimating the landmarks anew (Schmidt-Kalman filter).
 
 Landmarks of a map made by driving share most of their error with their neighbours. The joint
-covariance describes this (`redetect.slam.mapping.covariance_file`); without it landmarks are
+covariance describes this (`redetect.landmarks.map_file`); without it landmarks are
 assumed to be independent of each other.
 """
 
