@@ -90,7 +90,7 @@ def circle_landmarks(
     )
 
 
-def is_positive_definite(covariance: ArrayLike) -> BoolArray:
+def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArray:
     """Which covariance matrices are positive definite, that is, can be inverted and used.
 
     Covariances are read from files unchecked; callers that need valid ones check them here.
@@ -98,15 +98,20 @@ def is_positive_definite(covariance: ArrayLike) -> BoolArray:
     Parameters
     ----------
     covariance : (..., n, n) array_like
-        Symmetric matrices; only their lower triangles are used.
+        Symmetric matrices.
+    least : float
+        What the smallest eigenvalue of the correlations must be above: where it is not, two
+        quantities are one.
 
     Returns
     -------
     (...) bool
-        True where the smallest eigenvalue is positive beyond rounding.
     """
     matrices = np.asarray(covariance, dtype=np.float64)
-    eigenvalues = np.linalg.eigvalsh(matrices)
-    rounding = np.finfo(np.float64).eps * matrices.shape[-1]
-    smallest, largest = eigenvalues[..., 0], eigenvalues[..., -1]
-    return np.asarray(smallest > rounding * np.abs(largest), dtype=np.bool_)
+    scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = matrices / safe[..., :, None] / safe[..., None, :]
+    sane = np.all(scale > 0.0, axis=-1) & np.all(np.isfinite(correlation), axis=(-2, -1))
+    correlation = np.where(sane[..., None, None], correlation, 0.0)
+    return np.asarray(sane & (np.linalg.eigvalsh(correlation)[..., 0] > least))

@@ -364,17 +364,13 @@ def _draw_landmarks(
         filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
         patches = PolyCollection(
             list(outlines),
-            facecolors=[(*_rgb(colour), filling)],
-            edgecolors=[(*_rgb(colour), edge)],
+            facecolors=[(*to_rgb(colour), filling)],
+            edgecolors=[(*to_rgb(colour), edge)],
             linewidths=width,
             zorder=2,
         )
         patches.set_label(f"3 {_SIGMA} of {name}")
         axes.add_collection(patches, autolim=False)
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    return to_rgb(colour)
 
 
 class Crop(NamedTuple):

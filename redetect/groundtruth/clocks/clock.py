@@ -73,18 +73,14 @@ class ClockModel:
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
         """Robot times of times on the ground truth's clock."""
-        knots, offsets = self._knots()
+        knots, offsets = knots_of(self.segments)
         times = np.asarray(times_s, dtype=np.float64)
-        offset = np.interp(times, knots, offsets)
-        first, last = self.segments[0], self.segments[-1]
-        early, late = times < knots[0], times > knots[-1]
-        offset[early] += (first.rate - 1.0) * (times[early] - knots[0])
-        offset[late] += (last.rate - 1.0) * (times[late] - knots[-1])
-        return np.asarray(times + offset)
+        drifts = (self.segments[0].rate - 1.0, self.segments[-1].rate - 1.0)
+        return times + _extended(times, knots, offsets, drifts)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
         """Times on the ground truth's clock of robot times: the inverse of `robot_times`."""
-        knots, offsets = self._knots()
+        knots, offsets = knots_of(self.segments)
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
         if backward.size:
@@ -94,23 +90,29 @@ class ClockModel:
                 "its times are ambiguous there"
             )
         times = np.asarray(robot_times_s, dtype=np.float64)
-        result = np.interp(times, robot, knots)
-        first, last = self.segments[0], self.segments[-1]
-        early, late = times < robot[0], times > robot[-1]
-        result[early] = knots[0] + (times[early] - robot[0]) / first.rate
-        result[late] = knots[-1] + (times[late] - robot[-1]) / last.rate
-        return np.asarray(result)
+        slopes = (1.0 / self.segments[0].rate, 1.0 / self.segments[-1].rate)
+        return _extended(times, robot, knots, slopes)
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        """The segments' ends and the offsets there."""
-        knots, offsets = [], []
-        for segment in self.segments:
-            for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9)):
-                knots.append(time)
-                offsets.append(
-                    segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s)
-                )
-        return np.array(knots), np.array(offsets)
+
+def knots_of(segments: Sequence[ClockSegment]) -> tuple[FloatArray, FloatArray]:
+    """The ends of segments and the offsets there."""
+    ends = [
+        (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
+        for segment in segments
+        for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9))
+    ]
+    times, offsets = np.array(ends).T
+    return times, offsets
+
+
+def _extended(
+    at: FloatArray, knots: FloatArray, values: FloatArray, slopes: tuple[float, float]
+) -> FloatArray:
+    """Values between knots, and beyond the first and the last along straight lines."""
+    beyond = slopes[0] * np.minimum(at - knots[0], 0.0) + slopes[1] * np.maximum(
+        at - knots[-1], 0.0
+    )
+    return np.asarray(np.interp(at, knots, values) + beyond)
 
 
 def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:

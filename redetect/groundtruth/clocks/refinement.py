@@ -20,7 +20,7 @@ from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.fuse import likeliest_noise, noise_of
 from redetect.groundtruth.fusion.inputs import FuseSettings
-from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 _MARGIN_S = 2.0
@@ -83,28 +83,21 @@ def _refined(
     start = np.array([segment.offset_s, segment.rate - 1.0])
     bounds = Bounds((-np.array(largest) - start) / unit, (np.array(largest) - start) / unit)
 
+    def moved(x: FloatArray) -> ClockSegment:
+        offset_s, rate = (segment.offset_s, segment.rate) + unit * x
+        return replace(segment, offset_s=float(offset_s), rate=float(rate))
+
+    def problem_at(x: FloatArray) -> MovementProblem:
+        times = ClockModel((moved(x),)).groundtruth_times(robot_times)
+        return movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
+
     def surprise(x: FloatArray) -> float:
-        moved = replace(
-            segment,
-            offset_s=segment.offset_s + unit[0] * float(x[0]),
-            rate=segment.rate + unit[1] * float(x[1]),
-        )
-        times = ClockModel((moved,)).groundtruth_times(robot_times)
-        problem = movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
-        return problem.surprise(noise)
+        return problem_at(x).surprise(noise)
 
     best = np.zeros(2)
     try:
         for _ in range(_ROUNDS):
-            moved = replace(
-                segment,
-                offset_s=segment.offset_s + unit[0] * float(best[0]),
-                rate=segment.rate + unit[1] * float(best[1]),
-            )
-            times = ClockModel((moved,)).groundtruth_times(robot_times)
-            noise = likeliest_noise(
-                movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
-            )
+            noise = likeliest_noise(problem_at(best))
             found = minimize(
                 surprise,
                 best,
@@ -122,13 +115,7 @@ def _refined(
     if covariance is None:
         return segment
     sigma = _SIGMA_FACTOR * unit * np.sqrt(np.diag(covariance))
-    return replace(
-        segment,
-        offset_s=segment.offset_s + float(unit[0] * best[0]),
-        rate=segment.rate + float(unit[1] * best[1]),
-        sigma_offset_s=float(sigma[0]),
-        sigma_rate=float(sigma[1]),
-    )
+    return replace(moved(best), sigma_offset_s=float(sigma[0]), sigma_rate=float(sigma[1]))
 
 
 _SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])

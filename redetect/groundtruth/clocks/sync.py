@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import Bounds, direct, minimize
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
+from redetect.groundtruth.clocks.clock import ClockSegment, Status, knots_of, on_one_line
 from redetect.groundtruth.clocks.headings import (
     HeadingPair,
     Wandering,
@@ -346,12 +346,7 @@ def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
     determined = [segment for segment in segments if segment.status != "no turns"]
     if not determined:
         return segments
-    ends = [
-        (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
-        for segment in determined
-        for time in (segment.from_s, segment.to_s)
-    ]
-    times, offsets = np.array(ends).T
+    times, offsets = knots_of(determined)
     return [
         replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
         if segment.status == "no turns"

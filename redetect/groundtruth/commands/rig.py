@@ -59,7 +59,13 @@ def perform(command: RigCommand) -> int:
     estimate, frame = _in_robot_frame(command, estimate)
     rig = estimate.rig
     table = [
-        {"marker": marker, **residual_figures(estimate.adjusted, _views_of(estimate, index))}
+        {
+            "marker": marker,
+            **residual_figures(
+                estimate.adjusted,
+                [i for i, view in enumerate(estimate.views) if view.rig_index == index],
+            ),
+        }
         for index, marker in enumerate(rig.ids)
     ]
     pairs = [
@@ -172,10 +178,6 @@ def _markers(
 
 def _listed(ids: Sequence[int], most: int = 10) -> str:
     return ", ".join(map(str, ids[:most])) + (", ..." if len(ids) > most else "")
-
-
-def _views_of(estimate: RigEstimate, index: int) -> list[int]:
-    return [i for i, view in enumerate(estimate.views) if view.rig_index == index]
 
 
 def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:

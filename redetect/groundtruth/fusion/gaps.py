@@ -147,44 +147,21 @@ def _likeliest(
     end_spread: FloatArray,
 ) -> tuple[float, float, FloatArray] | None:
     """Surprise, squared distance of the end and states, by Gauss-Newton steps, if they settle."""
-    end = path[-1:, :POSE].copy()
+    count = len(controls)
+    measured = MeasuredPoses(np.array([count - 1]), path[-1:, :POSE].copy(), end_spread[None])
+    odometry, history = Odometry(controls, variances), empty_history(count)
     for _ in range(_MOST_STEPS):
-        surprise, squared, better = _step(
-            controls, variances, path, begin, spread, end, end_spread[None]
+        squared, _, _, surprise = filter_forward(
+            odometry, begin, spread, measured, _no_gate(count), path, history
         )
+        better, _ = smooth_backward(history)
         moved = float(np.max(np.abs(better[:, 2] - path[:, 2])))
         path = better
         if not moved < 10.0 * math.pi:
             return None
         if moved < _SETTLED_RAD:
-            return surprise, squared, path
+            return float(surprise), float(squared[0]), path
     return None
-
-
-def _step(
-    controls: FloatArray,
-    variances: FloatArray,
-    points: FloatArray,
-    begin: FloatArray,
-    spread: FloatArray,
-    measured: FloatArray,
-    measured_covariances: FloatArray,
-) -> tuple[float, float, FloatArray]:
-    """Filter and smooth over a gap with the measurement at its end (none, or one pose)."""
-    count = len(controls)
-    history = empty_history(count)
-    end = np.full(len(measured), count - 1, dtype=np.int64)
-    squared, _, _, surprise = filter_forward(
-        Odometry(controls, variances),
-        begin,
-        spread,
-        MeasuredPoses(end, measured, measured_covariances),
-        _no_gate(count),
-        points,
-        history,
-    )
-    states, _ = smooth_backward(history)
-    return float(surprise), float(squared[0]), states
 
 
 def _no_gate(nodes: int) -> Gating:

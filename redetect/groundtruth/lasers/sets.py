@@ -172,16 +172,12 @@ def _group(
     order: IntArray, owner: IntArray, times: FloatArray, scanners: int, window_s: float
 ) -> IntArray:
     rows: list[list[int]] = []
-    current = [-1] * scanners
     begun = -np.inf
     for i, scanner, t in zip(order.tolist(), owner[order].tolist(), times[order].tolist()):
-        if rows and current[scanner] < 0 and t - begun <= window_s:
-            current[scanner] = i
-            continue
-        current = [-1] * scanners
-        current[scanner] = i
-        begun = t
-        rows.append(current)
+        if not rows or rows[-1][scanner] >= 0 or t - begun > window_s:
+            rows.append([-1] * scanners)
+            begun = t
+        rows[-1][scanner] = i
     return np.array(rows, dtype=np.int64).reshape(-1, scanners)
 
 
@@ -197,12 +193,10 @@ def load_session(
     """
     scanners = read_scanners(calibration)
     robot = read_robot(folder / "robot.json")
-    backgrounds = []
-    for scanner in scanners:
-        path = find_scans(folder / "empty", scanner.name)
-        backgrounds.append(
-            learn_background(read_scans(path, scanner.readings).ranges_mm, scanner.max_range_m)
-        )
+    empties, scans = (
+        [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
+        for place in (folder / "empty", folder)
+    )
+    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
     tables = scanner_tables(scanners, backgrounds)
-    scans = [read_scans(find_scans(folder, s.name), s.readings) for s in scanners]
     return scanners, robot, tables, sets_of_scans(scans)

@@ -100,13 +100,9 @@ def group_by_time(
     """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
-        last = groups[-1] if groups else None
-        if (
-            last is not None
-            and frame.time_s - last[0].time_s <= tolerance_s
-            and all(frame.camera != other.camera for other in last)
-        ):
-            last.append(frame)
+        near = bool(groups) and frame.time_s - groups[-1][0].time_s <= tolerance_s
+        if near and all(frame.camera != other.camera for other in groups[-1]):
+            groups[-1].append(frame)
         else:
             groups.append([frame])
     return [tuple(group) for group in groups]
@@ -154,13 +150,8 @@ def pose_problem(
     views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
 ) -> PoseProblem:
     """The problem of the robot's pose at one time."""
-    floor = None
-    if settings.floor:
-        floor = Floor(
-            settings.floor_z_m,
-            settings.floor_sigma_z_m,
-            float(np.radians(settings.floor_sigma_tilt_deg)),
-        )
+    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
+    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
     return PoseProblem(
         network.cameras,
         network.world_from_camera,

@@ -96,22 +96,6 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     return poses if np.all(last) else poses.only(last)
 
 
-def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> BoolArray:
-    """Which of (..., d, d) covariances can be inverted in earnest.
-
-    `covariances` (..., d, d). `rounding`: by how much each entry may be off; an eigenvalue must be
-    larger than that.
-    """
-    symmetric = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
-    scale = np.sqrt(np.clip(np.diagonal(symmetric, axis1=-2, axis2=-1), 0.0, None))
-    positive = np.all(scale > 0.0, axis=-1)
-    safe = np.where(positive[..., None], scale, 1.0)
-    correlation = symmetric / safe[..., :, None] / safe[..., None, :]
-    smallest = np.linalg.eigvalsh(correlation)[..., 0]
-    absolute = np.linalg.eigvalsh(symmetric)[..., 0]
-    return np.asarray(positive & (smallest > 1e-9) & (absolute > rounding))
-
-
 def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 

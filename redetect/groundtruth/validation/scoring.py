@@ -12,12 +12,14 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
-    is_positive_definite,
     pose_differences,
     read_rows_of_numbers,
 )
-from redetect.landmarks import squared_mahalanobis
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.plane import between
+
+#: Covariances that files round to six decimals are singular below this.
+LEAST_CORRELATION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         covariances = poses.covariances
         if truth.covariances is not None:
             covariances = covariances + truth.covariances
-        usable = is_positive_definite(covariances)
+        usable = is_positive_definite(covariances, LEAST_CORRELATION)
         count = int(usable.sum())
         if count:
             squared = squared_mahalanobis(error[usable], covariances[usable])

@@ -13,15 +13,11 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.trajectories.streams import (
-    PlanarPoses,
-    is_positive_definite,
-    pose_differences,
-)
+from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
-from redetect.groundtruth.validation.scoring import sigma_of
-from redetect.landmarks import squared_mahalanobis
+from redetect.groundtruth.validation.scoring import LEAST_CORRELATION, sigma_of
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 _BAND = 0.95
 
@@ -227,7 +223,8 @@ def pose_errors(
     sigma = np.full((len(error), 2), np.nan)
     if at_times.covariances is not None and len(error):
         both = at_times.covariances + stream.covariances[known]
-        usable = is_positive_definite(at_times.covariances) & is_positive_definite(both)
+        usable = is_positive_definite(at_times.covariances, LEAST_CORRELATION)
+        usable &= is_positive_definite(both, LEAST_CORRELATION)
         nees[usable] = squared_mahalanobis(error[usable], both[usable])
         sigma[usable, 0] = np.sqrt(both[usable, 0, 0] + both[usable, 1, 1])
         sigma[usable, 1] = np.sqrt(both[usable, 2, 2])

@@ -177,18 +177,15 @@ def _demand_vertices(path: str | os.PathLike[str], rows: _Rows) -> None:
         for vertex in row.vertices:
             if vertex not in rows.poses and vertex not in rows.discs:
                 raise SlamError(f"{path}:{row.line}: no vertex {vertex}")
-    for row in (*rows.steps.values(), *rows.sights):
-        if row.vertices[0] not in rows.poses:
-            raise SlamError(f"{path}:{row.line}: no VERTEX_SE2 {row.vertices[0]}")
-    for row in rows.steps.values():
-        if row.vertices[1] not in rows.poses:
-            raise SlamError(f"{path}:{row.line}: no VERTEX_SE2 {row.vertices[1]}")
+    named = [(row.line, vertex) for row in rows.steps.values() for vertex in row.vertices]
+    named += [(row.line, row.vertices[0]) for row in rows.sights]
+    named += [(line, vertex) for vertex, (line, _, _) in rows.frames.items()]
+    for line, vertex in named:
+        if vertex not in rows.poses:
+            raise SlamError(f"{path}:{line}: no VERTEX_SE2 {vertex}")
     for row in rows.sights:
         if row.vertices[1] not in rows.discs:
             raise SlamError(f"{path}:{row.line}: no VERTEX_XY {row.vertices[1]}")
-    for vertex, (line, _, _) in rows.frames.items():
-        if vertex not in rows.poses:
-            raise SlamError(f"{path}:{line}: no VERTEX_SE2 {vertex}")
 
 
 def _chain(path: str | os.PathLike[str], rows: _Rows) -> list[int]:
