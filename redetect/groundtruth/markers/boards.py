@@ -34,7 +34,7 @@ from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.files import covariance_entry, numbers, read_json
+from redetect.groundtruth.files import covariance_entry, is_number, numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_pose
 from redetect.storage.bounded import path_inside, read_bounded
 from redetect.storage.image_header import claimed_size
