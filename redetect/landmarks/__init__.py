@@ -5,18 +5,16 @@
 ...     print(frame.step.prefix, [circle.ids for circle in frame.circles])
 """
 
+from redetect.landmarks.arrays import Association as Association
 from redetect.landmarks.arrays import CircleArrays as CircleArrays
+from redetect.landmarks.arrays import associate as associate
+from redetect.landmarks.arrays import associate_positions as associate_positions
+from redetect.landmarks.arrays import associate_within_covariance as associate_within_covariance
 from redetect.landmarks.arrays import circle_arrays as circle_arrays
 from redetect.landmarks.arrays import circle_landmarks as circle_landmarks
 from redetect.landmarks.arrays import is_positive_definite as is_positive_definite
-from redetect.landmarks.association import Association as Association
-from redetect.landmarks.association import associate as associate
-from redetect.landmarks.association import associate_positions as associate_positions
-from redetect.landmarks.association import (
-    associate_within_covariance as associate_within_covariance,
-)
-from redetect.landmarks.association import squared_mahalanobis as squared_mahalanobis
-from redetect.landmarks.association import wrap_angle as wrap_angle
+from redetect.landmarks.arrays import squared_mahalanobis as squared_mahalanobis
+from redetect.landmarks.arrays import wrap_angle as wrap_angle
 from redetect.landmarks.files import format_frame as format_frame
 from redetect.landmarks.files import format_head as format_head
 from redetect.landmarks.files import format_levelling as format_levelling

@@ -20,7 +20,6 @@ import pycolmap
 from camera import Camera
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.adjustment import project_chain
 from redetect.groundtruth.markers.refinement import (
     PoseProblem,
     RefinedPose,
@@ -153,14 +152,7 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
 
 def robot_rms_px(problem: PoseProblem, world_from_robot: FloatArray) -> float:
     """Root mean square residual per coordinate; infinite with a corner behind its camera."""
-    pixels = project_chain(
-        problem.cameras,
-        problem.world_from_camera,
-        world_from_robot[None],
-        problem.robot_from_marker,
-        problem.seen,
-    )
-    return _root_mean_square(pixels - problem.seen.pixels)
+    return _root_mean_square(problem.pixels(world_from_robot) - problem.seen.pixels)
 
 
 def _rms_px(camera: Camera, pose: FloatArray, points: FloatArray, pixels: FloatArray) -> float:
@@ -357,12 +349,10 @@ def _own_poses(problem: PoseProblem) -> list[FloatArray]:
 
 def _mirrored(problem: PoseProblem) -> list[FloatArray]:
     """Both solutions of each camera's largest view: starts from which a mirror image is found."""
-    largest = []
-    pixels = problem.seen.pixels
-    for camera in np.unique(problem.seen.camera):
-        views = np.unique(problem.view[problem.seen.camera == camera])
-        extent = [np.ptp(pixels[problem.view == view], axis=0).sum() for view in views]
-        largest.append(int(views[int(np.argmax(extent))]))
+    largest = [
+        int(max(np.unique(problem.view[problem.seen.camera == camera]), key=problem.extent_px))
+        for camera in np.unique(problem.seen.camera)
+    ]
     poses = [pose for view in largest for pose in view_poses(problem, view)]
     return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
 
@@ -426,7 +416,7 @@ def _consensus(
     count = problem.views
     found: dict[bytes, tuple[BoolArray, RefinedPose]] = {}
     # A larger marker is the better hypothesis.
-    extents = [np.ptp(problem.seen.pixels[problem.view == v], axis=0).sum() for v in range(count)]
+    extents = [problem.extent_px(view) for view in range(count)]
     hypotheses = (
         (view, start) for view in np.argsort(extents)[::-1] for start in view_poses(problem, view)
     )

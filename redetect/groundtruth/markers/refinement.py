@@ -63,6 +63,20 @@ class PoseProblem:
         """V, the number of markers in images."""
         return int(self.view.max()) + 1 if len(self.view) else 0
 
+    def pixels(self, world_from_robot: FloatArray) -> FloatArray:
+        """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
+        return project_chain(
+            self.cameras,
+            self.world_from_camera,
+            world_from_robot[None],
+            self.robot_from_marker,
+            self.seen,
+        )
+
+    def extent_px(self, view: int) -> float:
+        """Width and height of a marker in an image, together."""
+        return float(np.ptp(self.seen.pixels[self.view == view], axis=0).sum())
+
     def only(self, views: BoolArray) -> PoseProblem:
         """The problem with only those of the V views."""
         chosen = views[self.view]
@@ -244,14 +258,7 @@ def _covariance(problem: PoseProblem, here: _Corners, weights: FloatArray) -> Fl
 
 def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> float:
     """Squared Mahalanobis length of all residuals; infinite where a corner cannot be seen."""
-    pixels = project_chain(
-        problem.cameras,
-        problem.world_from_camera,
-        pose[None],
-        problem.robot_from_marker,
-        problem.seen,
-    )
-    residuals = (problem.seen.pixels - pixels).ravel()
+    residuals = (problem.seen.pixels - problem.pixels(pose)).ravel()
     if not np.all(np.isfinite(residuals)):
         return np.inf
     cost = float(squared_mahalanobis(residuals, covariance))

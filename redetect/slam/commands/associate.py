@@ -140,23 +140,18 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
 
 def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
     """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was."""
-    counts = {
-        kind: sum(isinstance(row.record, kind) for row in rows)
-        for kind in (CircleLandmark, LineLandmark)
-    }
-    expected = (len(found.circle_labels), len(found.line_labels))
-    for count, size in zip(counts.values(), expected):
-        if count not in (0, size):
-            raise SlamError(f"{source}: {count} rows of a kind: expected the {size} associated")
-    circle, line = (
-        iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
-        for labels in (found.circle_labels, found.line_labels)
-    )
+    numbers: dict[type, Iterator[int]] = {}
+    for kind, labels in ((CircleLandmark, found.circle_labels), (LineLandmark, found.line_labels)):
+        count = sum(isinstance(row.record, kind) for row in rows)
+        if count not in (0, len(labels)):
+            raise SlamError(
+                f"{source}: {count} rows of a kind: expected the {len(labels)} associated"
+            )
+        numbers[kind] = iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
     for row in rows:
-        if isinstance(row.record, CircleLandmark):
-            yield row.with_record(replace(row.record, ids=(next(circle),)))
-        elif isinstance(row.record, LineLandmark):
-            yield row.with_record(replace(row.record, ids=(next(line),)))
+        if isinstance(row.record, CircleLandmark | LineLandmark):
+            number = next(numbers[type(row.record)])
+            yield row.with_record(replace(row.record, ids=(number,)))
         else:
             yield row
 

@@ -131,11 +131,8 @@ def _report(recording: Recording, audit: Audit) -> list[str]:
             f"{f'{x:.2f}, {y:.2f}':<18}{group.own_m:>6.2f} m{group.chi_squared:>13,.1f}  {shows}"
         )
     lines.append(f"{'':<12}{'rows':>8}{'discs':>8}{'chi-squared':>14}{'expected':>10}{'factor':>8}")
-    for name, table in (
-        ("as written", audit.before),
-        ("dropped", audit.dropped),
-        ("mended", audit.mended),
-    ):
+    tables = {"as written": audit.before, "dropped": audit.dropped, "mended": audit.mended}
+    for name, table in tables.items():
         lines.append(
             f"{name:<12}{table.measurements:>8,}{table.landmarks:>8,}{table.chi_squared:>14,.2f}"
             f"{table.expected:>10,}{table.factor:>8.2f}"

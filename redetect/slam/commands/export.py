@@ -160,16 +160,10 @@ def _import(command: Import) -> int:
     if command.file.suffix == ".tum" or (
         command.file.suffix != ".g2o" and _first_word(command.file) not in _G2O_WORDS
     ):
-        path = read_tum(command.file, axes=command.axes)
-        write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, read_tum(command.file, axes=command.axes))
     graph = read_g2o(command.file, axes=command.axes)
     if command.output.suffix == ".csv":
-        path = Path2D(graph.prefixes, graph.poses)
-        write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, Path2D(graph.prefixes, graph.poses))
     frames = frames_of_graph(graph)
     demand_readable(frames, str(command.file))
     unknown = int(np.sum(~np.isfinite(graph.quality)))
@@ -192,10 +186,7 @@ def _import_data_set(command: Import) -> int:
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
         return 0
     if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
-        path = data_sets.read_truth(file)
-        write_path(command.output, path, head, overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, data_sets.read_truth(file))
     if file.name.endswith(data_sets.ODOMETRY):
         run = data_sets.read_robot(file)
     elif file.name == data_sets.DRIVE:
@@ -208,6 +199,12 @@ def _import_data_set(command: Import) -> int:
     frames = data_sets.frames_of(run, command.range_sigma, command.bearing_sigma)
     write_frames(command.output, frames, head=head[0], overwrite=command.force)
     print(f"{command.output}: {len(frames)} steps, {len(run.frame)} measurements")
+    return 0
+
+
+def _write_path(command: Import, path: Path2D) -> int:
+    write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
+    print(f"{command.output}: {len(path.poses)} poses")
     return 0
 
 

@@ -223,9 +223,8 @@ def trees_of(scan: FloatArray) -> FloatArray:
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
-    before = np.concatenate(
-        [[0.0], scan[starts[1:] - 1]]
-    )  # what the scan's border hides is unknown
+    # What the scan's border hides is unknown.
+    before = np.concatenate([[0.0], scan[starts[1:] - 1]])
     after = np.concatenate([scan[ends[:-1]], [0.0]])
     found = []
     for first, last, right, left in zip(starts, ends, before, after):
