@@ -16,7 +16,6 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar, nnls
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 
@@ -40,8 +39,6 @@ def heading_noise(times_s: FloatArray, headings_rad: FloatArray) -> float:
 
     `times_s`, `headings_rad` (N,): at least 5 samples, headings continuous.
     """
-    if len(times_s) < 5:
-        raise GroundTruthError(f"{len(times_s)} headings: expected 5 or more")
     third = np.diff(headings_rad, 3)
     # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
     return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
@@ -334,10 +331,6 @@ def estimate_wandering(
     is in the values is taken off. `lags`: how many samples apart they are compared; short ones do
     not mind what changes slowly.
     """
-    if len(times_s) < 10:
-        raise GroundTruthError(f"{len(times_s)} samples: expected 10 or more")
-    if not np.all(np.diff(times_s) > 0.0):
-        raise GroundTruthError("two samples of one time: expected times that ascend")
     shapes = np.zeros((len(times_s), 0)) if systematic is None else systematic
     if shapes.shape[1]:
         # Their factors by least squares of what changes from sample to sample, which noise and

@@ -82,14 +82,9 @@ def outline_faces(outline: ArrayLike) -> FloatArray:
     Raises
     ------
     GroundTruthError
-        If there are fewer than three corners, two that follow each other are one, a number is not
-        finite, or faces cross.
+        If two corners that follow each other are one, faces cross, or the outline encloses nothing.
     """
     corners = np.asarray(outline, dtype=np.float64)
-    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-        raise GroundTruthError(f"outline of shape {corners.shape}: expected (k, 2), k of 3 or more")
-    if not np.isfinite(corners).all():
-        raise GroundTruthError("outline with a number that is not finite")
     following = np.roll(corners, -1, axis=0)
     if np.any(np.hypot(*(following - corners).T) < 1e-6):
         raise GroundTruthError("outline: two corners that follow each other are the same")

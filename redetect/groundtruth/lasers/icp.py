@@ -77,12 +77,10 @@ def icp_to_segments(
     start from.
     """
     s = IcpSettings() if settings is None else settings
-    lines, cloud = _checked(segments, 4, "segments"), _checked(points, 2, "points")
-    begin = np.array(start, dtype=np.float64)
-    if begin.shape != (3,) or not np.isfinite(begin).all():
-        raise GroundTruthError(f"start {start!r}: expected three finite numbers")
+    lines = np.ascontiguousarray(segments, dtype=np.float64)
+    cloud = np.ascontiguousarray(points, dtype=np.float64)
     found, rms, count = fit_outline(
-        cloud, lines, invert(begin), s.gate_m, s.kept, s.threshold_m, _MOST_STEPS
+        cloud, lines, invert(start), s.gate_m, s.kept, s.threshold_m, _MOST_STEPS
     )
     if count < 3:
         raise GeometryError(
@@ -375,12 +373,3 @@ def fit_outline(
         before = rms
         pose = rigid_fit(nearest, points, used)
         step += 1
-
-
-def _checked(values: ArrayLike, columns: int, name: str) -> FloatArray:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != columns or len(array) == 0:
-        raise GroundTruthError(f"{name} of shape {array.shape}: expected (n, {columns}), n > 0")
-    if not np.isfinite(array).all():
-        raise GroundTruthError(f"{name} with a number that is not finite")
-    return array

@@ -56,16 +56,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         With the same times. If the truth has covariances, they count in the normalised error.
     unmatched : int
         Handed through.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no pose, or the numbers differ.
     """
-    if len(poses) == 0 or len(poses) != len(truth):
-        raise GroundTruthError(
-            f"{len(poses)} poses and {len(truth)} of the truth: expected as many, and at least one"
-        )
     error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
     normalised, count = float("nan"), 0
@@ -187,10 +178,8 @@ def score_steps(
     Raises
     ------
     GroundTruthError
-        If the numbers of poses differ or no step remains.
+        If no step remains.
     """
-    if len(poses) != len(truth):
-        raise GroundTruthError(f"{len(poses)} poses and {len(truth)} of the truth: expected equal")
     if step < 1:
         raise GroundTruthError(f"step is {step}: expected 1 or more")
     known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s

@@ -156,7 +156,7 @@ def test_a_still_scan_leaves_out_what_moves() -> None:
 
 
 def test_bad_input_is_said() -> None:
-    with pytest.raises(GroundTruthError, match="expected as many"):
+    with pytest.raises(GroundTruthError, match="no scanners"):
         align_scanners([], [], ROOM)
     with pytest.raises(GroundTruthError, match="gate_m"):
         AlignmentSettings(gate_m=-1.0)

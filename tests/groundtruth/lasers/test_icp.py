@@ -142,12 +142,8 @@ def test_a_corridor_leaves_its_direction_open() -> None:
 def test_bad_input_is_said() -> None:
     with pytest.raises(GeometryError, match="expected 3 or more"):
         icp_to_segments(np.full((10, 2), 100.0), ROOM)
-    with pytest.raises(GroundTruthError, match="segments of shape"):
-        icp_to_segments(np.zeros((10, 2)), ROOM[:, :3])
-    with pytest.raises(GroundTruthError, match="not finite"):
-        icp_to_segments(np.full((10, 2), np.nan), ROOM)
-    with pytest.raises(GroundTruthError, match="start"):
-        icp_to_segments(np.zeros((10, 2)), ROOM, (0.0, 0.0))
+    with pytest.raises(GeometryError, match="expected 3 or more"):
+        icp_to_segments(np.zeros((0, 2)), ROOM)
     with pytest.raises(GroundTruthError, match="gate_m"):
         IcpSettings(gate_m=0.0)
     with pytest.raises(GroundTruthError, match="kept"):

@@ -76,8 +76,6 @@ def test_beams_are_counted_counter_clockwise_from_the_first_angle() -> None:
         ({"first_angle_rad": float("inf")}, "first_angle_rad"),
         ({"max_range_m": 0.0}, "max_range_m"),
         ({"sigma_m": -0.1}, "sigma_m"),
-        ({"pose": np.zeros(2)}, "pose of 3"),
-        ({"pose": np.array([0.0, np.nan, 0.0])}, "not finite"),
     ],
 )
 def test_scanners_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:

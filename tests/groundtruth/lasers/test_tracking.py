@@ -441,6 +441,6 @@ def test_settings_are_checked() -> None:
         LaserSettings(kept=1.2)
     with pytest.raises(GroundTruthError, match="gate_m"):
         LaserSettings(gate_m=float("nan"))
-    with pytest.raises(GroundTruthError, match="expected as many"):
+    with pytest.raises(GroundTruthError, match="no scanners"):
         scanner_tables([], [])
     assert invert(np.zeros(3)) == pytest.approx(np.zeros(3))
