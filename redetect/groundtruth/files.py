@@ -28,16 +28,8 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     GroundTruthError
         If it cannot be read or is none.
     """
-    content = read_json_value(path)
-    if not isinstance(content, dict):
-        raise GroundTruthError(f"{path}: expected a JSON object")
-    return content
-
-
-def read_json_value(path: str | os.PathLike[str]) -> Any:
-    """Read a file that holds JSON, whatever its value is."""
     try:
-        return json.loads(read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
+        content = json.loads(read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise GroundTruthError(f"{path}: no such file") from None
     except json.JSONDecodeError as error:
@@ -50,6 +42,9 @@ def read_json_value(path: str | os.PathLike[str]) -> Any:
         raise GroundTruthError(f"{path}: is no JSON that can be read: a number too long") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+    if not isinstance(content, dict):
+        raise GroundTruthError(f"{path}: expected a JSON object")
+    return content
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -27,7 +27,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import read_json_value
+from redetect.groundtruth.files import read_json
 from redetect.storage.bounded import read_bounded
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
@@ -135,8 +135,7 @@ def read_clock(path: str | os.PathLike[str]) -> ClockModel:
         If the file cannot be read or a value is missing or impossible; the message names it.
     """
     place = Path(path)
-    document = read_json_value(place)
-    rows = document.get("segments") if isinstance(document, dict) else None
+    rows = read_json(place).get("segments")
     if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SEGMENTS:
         raise GroundTruthError(f"{place}: no list of segments: expected what `sync` writes")
     segments = tuple(_segment(place, k, row) for k, row in enumerate(rows, 1))

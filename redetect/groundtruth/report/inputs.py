@@ -15,7 +15,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_json_value
+from redetect.groundtruth.files import read_json
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -96,7 +96,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         session / "fused.json",
         session / "validation" / "validation.json",
     ):
-        document = _read(inputs, path, _document, quiet=path.name == "clock.json")
+        document = _read(inputs, path, read_json, quiet=path.name == "clock.json")
         if document is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
@@ -142,13 +142,6 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
         inputs.missing.append("building.csv or building.dxf")
         return None
     return _read(inputs, path, read_building)
-
-
-def _document(path: Path) -> dict[str, Any]:
-    content = read_json_value(path)
-    if not isinstance(content, dict):
-        raise GroundTruthError(f"{path}: expected an object")
-    return content
 
 
 def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:

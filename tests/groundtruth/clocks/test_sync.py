@@ -244,7 +244,7 @@ def test_clock_files_come_back(tmp_path: Path) -> None:
     [
         ("{", "is no JSON"),
         ("[" * 100000, "is no JSON"),
-        ("[]", "no list of segments"),
+        ("[]", "expected a JSON object"),
         ('{"segments": []}', "no list of segments"),
         ('{"segments": [3]}', "segment 1 is no object"),
         ('{"segments": [{"from_s": "a"}]}', "segment 1: from_s is not a number"),
