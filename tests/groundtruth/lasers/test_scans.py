@@ -403,10 +403,3 @@ def test_damaged_archives_never_do_more_than_be_refused(noise: bytes, at: int) -
         except GroundTruthError:
             return
         assert read.ranges_mm.shape[0] == len(read)
-
-
-def test_scans_of_wrong_types_are_refused() -> None:
-    with pytest.raises(GroundTruthError, match="float64"):
-        Scans(np.zeros(2, np.float32), np.zeros((2, 3), np.uint16))
-    with pytest.raises(GroundTruthError, match="uint16"):
-        Scans(np.zeros(2), np.zeros((2, 3)))  # type: ignore[arg-type]
