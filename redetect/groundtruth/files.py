@@ -28,20 +28,15 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     GroundTruthError
         If it cannot be read or is none.
     """
+    text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
-        content = json.loads(read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
+        content = json.loads(text)
     except json.JSONDecodeError as error:
         raise GroundTruthError(f"{path}:{error.lineno}: is no JSON: {error.msg}") from None
     except RecursionError:
         raise GroundTruthError(f"{path}: is no JSON that can be read: nested too deep") from None
-    except UnicodeDecodeError:
-        raise GroundTruthError(f"{path}: is no text: expected JSON") from None
     except ValueError:  # Python converts no more than some thousand digits
         raise GroundTruthError(f"{path}: is no JSON that can be read: a number too long") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
         raise GroundTruthError(f"{path}: expected a JSON object")
     return content

@@ -20,7 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -170,16 +170,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
 
 def scanner_entry(scanner: Scanner) -> dict[str, Any]:
     """A scanner as files have it."""
-    return {
-        "name": scanner.name,
-        "pose": scanner.pose.tolist(),
-        "covariance": scanner.covariance.tolist(),
-        "first_angle_rad": scanner.first_angle_rad,
-        "angle_step_rad": scanner.angle_step_rad,
-        "readings": scanner.readings,
-        "max_range_m": scanner.max_range_m,
-        "sigma_m": scanner.sigma_m,
-    }
+    values = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
 def _scanners(path: str | os.PathLike[str], content: dict[str, Any]) -> tuple[Scanner, ...]:

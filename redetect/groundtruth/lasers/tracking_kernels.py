@@ -178,6 +178,36 @@ def _face_of(
 
 
 @njit(cache=True, error_model="numpy")
+def _hold_open(
+    h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
+) -> tuple[int, FloatArray]:
+    """Add the start as a prior of the directions that the readings leave open, in place.
+
+    `h` (3, 3) and `g` (3,) are the normal equations; directions are evaluated about the `middle`
+    (2,) of the points, theta in metres. Returns how many are open, and the least determined one.
+    """
+    scale = fit.scale_m
+    # Turning about the middle: xi' = (t + theta x middle, theta * scale).
+    back = np.array(
+        [[1.0, 0.0, middle[1] / scale], [0.0, 1.0, -middle[0] / scale], [0.0, 0.0, 1.0 / scale]]
+    )
+    values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
+    there = np.linalg.inv(back)
+    open_count = 0
+    for k in range(3):
+        if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
+            open_count += 1
+            row = np.ascontiguousarray(vectors[:, k]) @ there
+            p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
+            ahead = row @ to_start
+            for a in range(3):
+                g[a] -= p * row[a] * ahead
+                for b in range(3):
+                    h[a, b] += p * row[a] * row[b]
+    return open_count, vectors[:, 0].copy()
+
+
+@njit(cache=True, error_model="numpy")
 def refine_outline(
     seen: Seen,
     faces: FloatArray,
@@ -256,28 +286,9 @@ def refine_outline(
         if used < 3:
             break
         rms = math.sqrt(squares / used)
-        # Undetermined directions are evaluated about the middle of the points, theta in metres.
-        mx, my = sx / used, sy / used
-        scale = fit.scale_m
-        # Turning about the middle: xi' = (t + theta x middle, theta * scale).
-        back = np.array([[1.0, 0.0, my / scale], [0.0, 1.0, -mx / scale], [0.0, 0.0, 1.0 / scale]])
-        values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
-        there = np.linalg.inv(back)
-        open_count = 0
         dx, dy = start[0] - pose[0], start[1] - pose[1]
-        turn = start[2] - pose[2]
-        to_start = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
-        for k in range(3):
-            if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
-                open_count += 1
-                row = np.ascontiguousarray(vectors[:, k]) @ there
-                p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
-                ahead = row @ to_start
-                for a in range(3):
-                    g[a] -= p * row[a] * ahead
-                    for b in range(3):
-                        h[a, b] += p * row[a] * row[b]
-        v = vectors[:, 0]
+        to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
+        open_count, v = _hold_open(h, g, np.array([sx / used, sy / used]), to_start, fit)
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance[:, :] = np.linalg.inv(h)
         delta = -local_covariance @ g

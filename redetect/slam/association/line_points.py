@@ -284,31 +284,46 @@ def lines_by_points(
     `labels` (m,), `path` (N + 1, 3).
     """
     setting = settings or PointSettings()
+    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
+    scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
+
+    def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
+        """Least squares over poses, discs and points, again without the rows that are far off."""
+        count = len(points)
+        used = (labels >= 0) & (
+            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
+        )
+        for _ in range(3):
+            solution = solve_path(
+                scaled,
+                circle_labels,
+                np.where(used, labels, count),
+                path,
+                np.concatenate([points, [[np.nan, np.nan]]]),
+                camera_xy=camera_xy,
+                sigma_scale=disc_sigma_scale,
+            )
+            path = solution.path
+            places = solution.line_xy[np.where(used, labels, 0)]
+            bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
+            off = wrap_angle(bearing - recording.lines.bearing_rad)
+            used &= np.abs(off) < 4.0 * sigma
+        return path
+
     for _ in range(_FIRST_ROUNDS):
         places = intersect_bearings(recording, path, line_labels, camera_xy=camera_xy)
         known = np.isfinite(places[:, 0])
         if not np.any(known):
             break
         label_of = np.where(known, np.cumsum(known) - 1, -1)
-        path = _path_with_points(
-            recording,
-            path,
-            circle_labels,
-            label_of[line_labels],
-            places[known],
-            setting,
-            camera_xy,
-            disc_sigma_scale,
-        )
+        path = corrected(path, label_of[line_labels], places[known])
     labels = np.full(len(line_labels), -1, dtype=np.int64)
     last = len(setting.heading_sigma_deg) - 1
     for number, sigma_deg in enumerate(setting.heading_sigma_deg):
         rays = rays_of(recording, path, camera_xy, setting.sigma_scale, np.radians(sigma_deg))
         labels, points = find_points(rays, setting)
         if number < last and len(points):
-            path = _path_with_points(
-                recording, path, circle_labels, labels, points, setting, camera_xy, disc_sigma_scale
-            )
+            path = corrected(path, labels, points)
     rest = labels < 0
     _, own = np.unique(line_labels[rest], return_inverse=True)
     labels[rest] = labels.max(initial=-1) + 1 + own
@@ -365,38 +380,3 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     labels = np.empty(len(taken), dtype=np.int64)
     labels[rays.row] = taken
     return labels, found
-
-
-def _path_with_points(
-    recording: Recording,
-    path: FloatArray,
-    circle_labels: IntArray,
-    labels: IntArray,
-    points: FloatArray,
-    setting: PointSettings,
-    camera_xy: tuple[float, float],
-    disc_sigma_scale: float,
-) -> FloatArray:
-    """Least squares over poses, discs and points, done again without the rows that are far off."""
-    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
-    scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
-    count = len(points)
-    used = (labels >= 0) & (
-        np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
-    )
-    for _ in range(3):
-        solution = solve_path(
-            scaled,
-            circle_labels,
-            np.where(used, labels, count),
-            path,
-            np.concatenate([points, [[np.nan, np.nan]]]),
-            camera_xy=camera_xy,
-            sigma_scale=disc_sigma_scale,
-        )
-        path = solution.path
-        places = solution.line_xy[np.where(used, labels, 0)]
-        bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
-        off = wrap_angle(bearing - recording.lines.bearing_rad)
-        used &= np.abs(off) < 4.0 * sigma
-    return path
