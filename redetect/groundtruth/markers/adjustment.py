@@ -271,7 +271,7 @@ def adjust_bundle(
 def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
     """The problem near a bundle's poses; the unknowns are right perturbations, ordered as `free`.
 
-    Residuals are those of the points, in pixels, and of the priors, in standard deviations.
+    Residuals are in standard deviations: those of the points, then those of the priors.
     """
     seen, free = bundle.seen, bundle.free
     projection = project_chain_with_jacobians(

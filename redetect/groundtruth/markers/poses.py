@@ -1,10 +1,9 @@
 """The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
 
 The chosen solver (of OpenCV or pycolmap) gives initial poses, which are refined by least squares
-over all corners. If all
-markers agree, it remains to check whether the mirror image of the markers explains the corners as
-well. If not, each marker's own two solutions are hypotheses, and the one that most others agree
-with decides which markers are wrong.
+over all corners. If all markers agree, it remains to check whether the mirror image of the markers
+explains the corners as well. If not, each marker's own two solutions are hypotheses, and the one
+that most others agree with decides which markers are wrong.
 """
 
 from __future__ import annotations

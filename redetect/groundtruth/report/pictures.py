@@ -1,6 +1,7 @@
-"""Figures of the report (SVG): the map with paths and ellipses, errors over time; and pictures
-beside
-results (PNG): a rig, the scanners' alignment, errors at reference poses.
+"""Figures of the report, and pictures beside results.
+
+The former (SVG) are the map with paths and ellipses, and errors over time; the latter (PNG) a rig,
+the scanners' alignment, errors at reference poses.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Poses over time: their files, poses at other times, and paths moved rigidly onto others.
 
 Files are RAWSEEDS' comma-separated streams, TUM trajectories and ``.times``. A RAWSEEDS stream has
-a
-row per pose: time (s), x, y (m), heading theta (rad), and for ground truth the 3x3 covariance of
+a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth the 3x3 covariance of
 (x, y, theta) row by row. It has no comments and no header.
 """
 
