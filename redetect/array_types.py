@@ -1,4 +1,4 @@
-"""Names of the arrays that signatures and attributes have; their shapes stand in the docstrings."""
+"""Names of the arrays that signatures and attributes have; shapes are in the docstrings."""
 
 from __future__ import annotations
 
