@@ -176,8 +176,8 @@ def _markers(
     return dictionary, widths
 
 
-def _listed(ids: Sequence[int], most: int = 10) -> str:
-    return ", ".join(map(str, ids[:most])) + (", ..." if len(ids) > most else "")
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
 
 
 def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:

@@ -65,29 +65,21 @@ def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Pa
     return list(paths), network_path if network_path is not None else beside
 
 
-def read_marker_frames(
-    run: Path, camera: int, *, detected: Path | None = None, timed: bool = True
-) -> list[MarkerFrame]:
+def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
     """The markers found in a run's images, in the file's order, and the images' times.
 
-    The run folder has ``detected.markers`` (or `detected`) and ``<name>.times``. Frames are
-    numbered instead if they need not be `timed`.
+    The run folder has ``detected.markers`` and ``<name>.times``. Frames are numbered instead if they
+    need not be `timed`.
     """
-    path = detected if detected is not None else run / DETECTED_NAME
-    times: dict[str, float] = {}
     times_path = run / f"{run.resolve().name}.times"
-    if timed:
-        times = _times_by_name(times_path)
+    times = _times_by_name(times_path) if timed else {}
     frames = []
-    for number, frame in enumerate(read_frames(path)):
+    for number, frame in enumerate(read_frames(run / DETECTED_NAME)):
         name = _image_name(frame.step.prefix)
         if timed and name not in times:
             raise GroundTruthError(f"{times_path}: no time of image {frame.step.prefix}")
-        frames.append(
-            MarkerFrame(
-                camera, frame.step.prefix, times[name] if timed else float(number), frame.markers
-            )
-        )
+        time_s = times[name] if timed else float(number)
+        frames.append(MarkerFrame(camera, frame.step.prefix, time_s, frame.markers))
     return frames
 
 

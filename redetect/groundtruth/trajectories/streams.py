@@ -149,15 +149,11 @@ def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> st
 
 
 def write_planar_poses(
-    path: str | os.PathLike[str],
-    poses: PlanarPoses,
-    *,
-    covariance_decimals: int = 12,
-    overwrite: bool = False,
+    path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
 ) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
     with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_planar_poses(poses, covariance_decimals).encode())
+        stream.write(format_planar_poses(poses).encode())
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:

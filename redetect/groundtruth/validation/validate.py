@@ -20,6 +20,7 @@ from redetect.groundtruth.validation.scoring import LEAST_CORRELATION, sigma_of
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 _BAND = 0.95
+_FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def stream_of(references: Sequence[ReferencePose]) -> PlanarPoses:
 
 
 def pose_errors(
-    references: Sequence[ReferencePose], poses: PlanarPoses, farthest_s: float = 0.5
+    references: Sequence[ReferencePose], poses: PlanarPoses
 ) -> tuple[list[PoseError], list[Refused]]:
     """Errors of a ground truth at reference poses.
 
@@ -201,9 +202,8 @@ def pose_errors(
         In order of time.
     poses : PlanarPoses
         The ground truth. The pose nearest in time is used, as the robot is at rest: the covariance
-        of an interpolated pose would depend on the unknown correlation of their errors.
-    farthest_s : float
-        But not one farther away in time (s).
+        of an interpolated pose would depend on the unknown correlation of their errors; but not
+        one more than half a second away.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def pose_errors(
         References at whose time there is no ground truth.
     """
     stream = stream_of(references)
-    at_times, known = _nearest(poses, stream.times_s, farthest_s)
+    at_times, known = _nearest(poses, stream.times_s)
     without = [
         Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")
         for r, there in zip(references, known)
@@ -239,15 +239,13 @@ def pose_errors(
     return errors, without
 
 
-def _nearest(
-    poses: PlanarPoses, times_s: FloatArray, farthest_s: float
-) -> tuple[PlanarPoses, BoolArray]:
+def _nearest(poses: PlanarPoses, times_s: FloatArray) -> tuple[PlanarPoses, BoolArray]:
     """The poses nearest to times, and which times have one."""
     after = np.clip(np.searchsorted(poses.times_s, times_s), 0, len(poses) - 1)
     before = np.maximum(after - 1, 0)
     earlier = np.abs(times_s - poses.times_s[before]) <= np.abs(poses.times_s[after] - times_s)
     index = np.where(earlier, before, after)
-    known = np.abs(poses.times_s[index] - times_s) <= farthest_s
+    known = np.abs(poses.times_s[index] - times_s) <= _FARTHEST_S
     return poses.only(index[known]), known
 
 
