@@ -68,8 +68,8 @@ def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Pa
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
     """The markers found in a run's images, in the file's order, and the images' times.
 
-    The run folder has ``detected.markers`` and ``<name>.times``. Frames are numbered instead if they
-    need not be `timed`.
+    The run folder has ``detected.markers`` and ``<name>.times``. Frames are numbered instead if
+    they need not be `timed`.
     """
     times_path = run / f"{run.resolve().name}.times"
     times = _times_by_name(times_path) if timed else {}
