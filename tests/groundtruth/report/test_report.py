@@ -246,7 +246,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     page = Page(output.read_bytes())
     assert_harmless(page)
     warnings = capsys.readouterr().err
-    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected a JSON object",
+    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected a JSON",
                   "clock.json: no list", "laser.jsonl:2: expected", "building.csv:1:"):  # fmt: skip
         assert words in page.text
         assert words in warnings
