@@ -17,7 +17,7 @@ from pathlib import Path
 from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.bounded import read_bounded
 
 CLASS_NAME = "SmRadialDistortedCamera"
@@ -141,8 +141,7 @@ def format_camera(camera: Camera) -> str:
 
 def write_camera(camera: Camera, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Write a ``.cam`` file, whole or not at all; an existing one only with `overwrite`."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_camera(camera).encode())
+    write_bytes(path, format_camera(camera).encode(), overwrite=overwrite)
 
 
 def _split(text: str, name: str) -> _Entries:

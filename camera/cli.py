@@ -16,12 +16,12 @@ PROGRAM = Program(
     "Print boards, calibrate a camera, place it on the floor, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
-        Board: "camera.commands.board",
-        Calibrate: "camera.commands.calibrate",
-        Floor: "camera.commands.floor",
+        Board: "camera.boards.board",
+        Calibrate: "camera.calibration.command",
+        Floor: "camera.calibration.floor",
         # Needs detection, so the command is implemented in `detect`.
         Level: "detect.mounting",
-        Convert: "camera.commands.convert",
+        Convert: "camera.formats.command",
     },
 )
 

@@ -15,8 +15,6 @@ from camera.model import Camera
 
 FloatArray = NDArray[np.float64]
 
-#: Length of the vector that `camera_numbers` returns.
-NUMBERS = 27
 
 _NEWTON_STEPS = 100
 _LAST_STEP = 1e-9

@@ -332,7 +332,7 @@ class Camera:
         point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
         in_camera = (point - self.centre) @ camera_from_robot.T
         pixels_per_metre = self.project_jacobian(in_camera) @ camera_from_robot[:, :2]
-        return _inverse_2x2(pixels_per_metre)
+        return inverse_2x2(pixels_per_metre)
 
 
 def _read_only(array: FloatArray) -> FloatArray:
@@ -340,7 +340,7 @@ def _read_only(array: FloatArray) -> FloatArray:
     return array
 
 
-def _inverse_2x2(m: FloatArray) -> FloatArray:
+def inverse_2x2(m: FloatArray) -> FloatArray:
     """Inverse over the last two axes; NaN passes through (np.linalg.inv may raise on it)."""
     determinant = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
     adjugate = np.stack(

@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 Format = Literal["auto", "cam", "opencv", "ros", "kalibr", "colmap"]
@@ -266,6 +265,3 @@ class Level:
     camera: MaybePath = None
     radius_m: float = 0.10
     force: bool = False
-
-
-Command = Board | Calibrate | Floor | Level | Convert

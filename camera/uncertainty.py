@@ -1,4 +1,4 @@
-"""How well a calibration is known, and what its errors do to positions and tilts.
+"""How well a calibration is known, and what its errors do to projections, positions and tilts.
 
 The parameters are the intrinsics (`camera.calibration.model.INTRINSICS`) and the pose: position (m)
 and a small rotation from the left about the robot's axes (rad). Errors of a calibration are the
@@ -9,15 +9,71 @@ out.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.calibration.model import COUNT, cross_matrices, project_points
-from camera.calibration.projection import intrinsics_of
-from camera.model import PARAMETERS, Camera
+from camera.model import PARAMETERS, Camera, Pose
 
 FloatArray = NDArray[np.float64]
+
+IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+#: A camera without a pose, to be given intrinsics.
+UNPOSED = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, (0.0,) * 5, IDENTITY, IDENTITY)
+
+_COLUMNS, _ROWS = 49, 37
+
+
+def pixel_grid(width: int, height: int, columns: int = _COLUMNS, rows: int = _ROWS) -> FloatArray:
+    """(rows * columns, 2) pixels from corner to corner of an image."""
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, columns), np.linspace(0.0, height - 1.0, rows))
+    return np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def intrinsics_of(camera: Camera) -> FloatArray:
+    """(14,) numbers of a camera (`camera.calibration.model.INTRINSICS`)."""
+    pinhole = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
+    return np.array([*pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
+
+
+def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> Camera:
+    """The camera with other intrinsics, an array as of `intrinsics_of`, and other changes."""
+    sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in intrinsics)
+    return replace(
+        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
+        tangential=(p1, p2), polynomial=(k1, k2, k3), **changes,
+    )  # fmt: skip
+
+
+def with_pose(camera: Camera, pose: FloatArray) -> Camera:
+    """The camera at a (3, 4) pose `robot_from_camera`.
+
+    A ``sensor2Tcp`` that it has stays: it belongs to its mount. One that has none gets the
+    identity, which says that the sensor is its own tool.
+    """
+    rows: Pose = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
+    return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
+
+
+def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
+    """Standard deviation of where directions are projected, whatever the camera's rotation.
+
+    A small rotation has the same effect as a shift of the principal point, and the pose absorbs it;
+    so the component common with a rotation is removed, as in mrcal.
+
+    Root of the trace of each pixel's covariance (u and v together) over the image, (37, 49) pixels,
+    by the (14, 14) covariance of the intrinsics.
+    """
+    rays = camera.unproject(pixel_grid(camera.width, camera.height))
+    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
+    J = by_intrinsics.reshape(-1, COUNT)
+    turn = (-by_point @ cross_matrices(rays)).reshape(-1, 3)
+    J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
+    variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(_ROWS, _COLUMNS))
+
 
 _LOWER = np.tril_indices(PARAMETERS)
 #: Directions in which verticals are imagined: bearings and elevations (rad).

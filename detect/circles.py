@@ -31,8 +31,7 @@ from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import DiscSearch, FoundDiscs, Scene, search_discs
 from detect.discs.second_look import SecondLooks, Sought, second_looks
 from detect.errors import FrameError
-from detect.margins import blank_margins
-from detect.noise import estimate_noise
+from detect.grey_values import blank_margins, estimate_noise
 from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable, cached_disc_table
 from lut.outlines import floor_positions

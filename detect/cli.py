@@ -16,15 +16,12 @@ from collections.abc import Sequence
 
 from tyro import MISSING
 
-from detect.interrupts import interrupts_noted
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.markers.settings import PRESETS as MARKER_PRESETS
-from detect.markers.settings import MarkerSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
+from detect.settings import MARKER_PRESETS, CircleSettings, MarkerSettings
 from detect.settings import PRESETS as CIRCLE_PRESETS
-from detect.settings import CircleSettings
-from detect.terminal import show_announcements
+from detect.terminal import interrupts_noted, show_announcements
 from detect.viewing_options import (
     Compare,
     CompareOptions,

@@ -2,43 +2,38 @@
 
 from __future__ import annotations
 
-import cv2
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from camera import Camera, read_camera
 from detect.discs.unfound import DiscExplanation, explain_discs
-from detect.drawing.frame import draw_disc_candidates
+from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.errors import DetectError
-from detect.run import camera_in, read_image
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, camera_in, read_image, still
 from detect.viewing_options import Explain
-from redetect.landmarks import Step
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_bytes
 
 
 def perform(command: Explain) -> int:
     """Carry the command out; returns the exit code."""
     for path in (command.output, command.json):
-        if path is not None and path.exists() and not command.force:
-            raise OutputExistsError(path)
+        if path is not None:
+            demand_place(path, overwrite=command.force)
     if not command.image.is_file():
         raise DetectError(f"{command.image}: no such image: expected one image of a run")
     camera = _camera(command)
-    image = read_image(RunFrame(Step("image", *[0.0] * 9), command.image), camera)
+    image = read_image(RunFrame(still("image"), command.image), camera)
     found = explain_discs(image, camera, command.settings, command.at)
     _print(found)
     if command.output is not None:
         picture = draw_disc_candidates(
             image, camera, command.settings.radius_m, found.candidates, command.at
         )
-        with write_whole(command.output, overwrite=command.force) as stream:
-            stream.write(cv2.imencode(".png", picture)[1].tobytes())
+        write_bytes(command.output, png_of(picture), overwrite=command.force)
         print(f"{command.output}: {len(found.candidates)} candidates")
     if command.json is not None:
-        with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(f"{found.to_json()}\n".encode())
+        write_bytes(command.json, f"{found.to_json()}\n".encode(), overwrite=command.force)
     return 0
 
 

@@ -27,7 +27,7 @@ from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_whole
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -60,7 +60,7 @@ def perform(command: Export) -> int:
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
     if to == "parquet":
-        demand_pyarrow()
+        required_pyarrow()
     rows = partial(table_rows, file, _times(command), rate_hz)
     named = [_TABLES[file.suffix]] if file.suffix in _TABLES else []
     tables = list(dict.fromkeys([*named, *sorted({row.table for row in rows()})]))
@@ -71,8 +71,7 @@ def perform(command: Export) -> int:
     for path in places.values():
         if path.exists() and path.samefile(file):
             raise DetectError(f"{path}: is the file to export: expected another output")
-        if path.exists() and not command.force:
-            raise OutputExistsError(path)
+        demand_place(path, overwrite=command.force)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
             if to == "mcap":
@@ -178,22 +177,21 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> i
     return count
 
 
-def demand_pyarrow() -> None:
-    """Refuse to begin where the package is not installed."""
+def required_pyarrow() -> Any:
+    """The package; a DetectError where it is not installed."""
     try:
-        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+        import pyarrow.parquet  # type: ignore[import-untyped]
     except ImportError:
         raise DetectError(
             "Parquet is written by the package pyarrow: install it by "
             "pip install 'redetect[parquet]', or write --to csv"
         ) from None
+    return pyarrow
 
 
 def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], source: str) -> int:
     """Write a table as `write_csv`; `source` is for the file's own description."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa = required_pyarrow()
     types: dict[str, Any] = {
         "text": pa.string(),
         "number": pa.float64(),
@@ -207,7 +205,7 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], 
     schema = pa.schema(fields, metadata={"table": table, "source": source})
     own = (row.all_values for row in rows if row.table == table)
     count = 0
-    with pq.ParquetWriter(stream, schema) as writer:
+    with pa.parquet.ParquetWriter(stream, schema) as writer:
         while part := list(islice(own, _ROWS_AT_ONCE)):
             try:
                 arrays = [pa.array(c, f.type) for c, f in zip(zip(*part), fields)]

@@ -1,4 +1,4 @@
-"""Disc positions corrected for the tilt of the robot.
+"""Errors that all discs of a frame share: the robot's tilt, and the camera's calibration.
 
 The robot tilts about the origin of its frame on the floor, by pitch and roll. Its camera, at c,
 believes the floor where it would be on a level robot: a disc seen at p lies on the ray
@@ -7,19 +7,30 @@ c + s (p - c). Turned level by R, that ray meets the floor at
     q = R (c + s (p - c)),    s = -(R c)_z / (R (p - c))_z    (`detect.seen.level_seen`).
 
 The covariance of q is J diag(C_p, C_tilt) J^T, J = dq / d(p, pitch, roll).
+
+The part of a covariance that is the calibration's is the same error in all rows. With the
+covariance C of the calibration's parameters (`camera.uncertainty`) and the derivatives J of a
+position by them, it is J C J^T. Where positions are levelled by verticals, the tilt that the same
+camera sees in these follows its errors, too: what its mounting leans by falls out, and what the
+lens does to verticals comes in. A calibration that does not state C is taken to be wrong by a part
+of a pixel everywhere (`CircleSettings.calibration_px`).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections
+from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
+from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
-from redetect.landmarks import FrameTilt
+from detect.settings import CircleSettings
+from redetect.landmarks import FrameTilt, read_frames
 
 FloatArray = NDArray[np.float64]
 
@@ -63,3 +74,74 @@ def level_discs(
     level_covariance = jacobian @ of_all @ jacobian.swapaxes(1, 2)
     down = np.isfinite(level_xy).all(axis=1) & np.isfinite(level_covariance).all(axis=(1, 2))
     return level_xy, level_covariance, np.asarray(down)
+
+
+def common_covariance(
+    camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool
+) -> FloatArray:
+    """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
+
+    `unstated_px` is the standard deviation of the pixels of a camera that doesn't state its
+    covariance; `by_verticals`: the positions are levelled by the verticals that the camera sees.
+    """
+    nothing = np.zeros((len(floor_xy), 2, 2))
+    covariance = covariance_of(camera)
+    if covariance is None:
+        return refined_covariance(camera, floor_xy, nothing, _wrong_by(unstated_px))
+    if len(floor_xy) == 0 or not covariance.any():
+        return nothing
+    jacobian = floor_by_parameters(camera, floor_xy)
+    if by_verticals:
+        steps = _STEP * np.vstack([np.eye(2), -np.eye(2)])
+        p, r, minus_p, minus_r = level_seen(
+            camera, np.broadcast_to(floor_xy, (4, *floor_xy.shape)), steps
+        )
+        by_tilt = np.stack([p - minus_p, r - minus_r], axis=-1) / (2.0 * _STEP)
+        jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)
+    return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
+
+
+@lru_cache(maxsize=4)
+def _wrong_by(pixels: float) -> CircleSettings:
+    return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
+
+
+@lru_cache(maxsize=4)
+def _tilt_by_parameters(camera: Camera) -> FloatArray:
+    return tilt_by_parameters(camera)
+
+
+def common_tilt_variance(camera: Camera) -> FloatArray | None:
+    """(2,) variances of pitch and roll that all frames' verticals share, if the camera knows them.
+
+    Square radians.
+    """
+    covariance = covariance_of(camera)
+    if covariance is None:
+        return None
+    jacobian = _tilt_by_parameters(camera)
+    return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
+
+
+def with_common(
+    found: CircleDetections, camera: Camera, unstated_px: float, *, by_verticals: bool
+) -> CircleDetections:
+    """The same discs, their covariances with what the calibration contributes."""
+    common = common_covariance(camera, found.floor_xy, unstated_px, by_verticals=by_verticals)
+    return replace(found, covariance=found.covariance + common)
+
+
+def sentence_of(circles: Path, camera: Camera) -> str:
+    """How much of the variances of the rows of a file is the calibration's own."""
+    shares = []
+    for frame in read_frames(circles):
+        rows = frame.circles
+        xy = np.array([(row.px, row.py) for row in rows]).reshape(-1, 2)
+        by_verticals = frame.levelled_by is not None and any(frame.levelled_by)
+        common = common_covariance(camera, xy, 0.0, by_verticals=by_verticals)
+        shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
+    share = 100.0 * float(np.median(shares)) if shares else 0.0
+    return (
+        f"{share:.0f} % of the discs' variance (median) are the calibration's, as its file states: "
+        "the same error in all rows"
+    )

@@ -28,7 +28,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar
-from redetect.storage.parts import demand_place
+from redetect.storage import demand_place
 
 FloatArray = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.markers.settings import MarkerSettings
-from detect.settings import CircleSettings, Levelling
+from detect.settings import CircleSettings, Levelling, MarkerSettings
 from redetect.storage.bounds import NotNegative, demand_fields, whole
 
 # For `X | None` tyro imports another library that takes a tenth of a second.

@@ -56,5 +56,6 @@ def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -
         unit[j] = 1.0
         if not solve_positive(matrix, unit, column):
             return False
-        inverse[:, j] = column
+        for i in range(n):  # an assignment to the slice would compile five times as long
+            inverse[i, j] = column[i]
     return True

@@ -1,19 +1,81 @@
-"""What the terminal shows of long work: announcements, progress, failures.
+"""What the terminal shows of long work, and how it is interrupted from there.
 
 Compilation of kernels and computation of tables are announced through the logger ``redetect``, so
 that a program that uses the detectors decides who hears it; the command line shows it on stderr.
+
+Python raises an interrupt as an exception wherever it is executing. While a kernel is compiled, the
+exception may be swallowed: it is printed and ignored, or replaced by another one. So interrupts are
+recorded, and the record is checked after every frame. While processes are started or ended, an
+exception could leave a process half started: there an interrupt is deferred until that is done.
 """
 
 from __future__ import annotations
 
 import logging
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from typing import NoReturn
 
-from detect.interrupts import raise_if_interrupted
 from redetect.storage.messages import is_quiet
+
+_received = threading.Event()
+
+
+@contextmanager
+def interrupts_noted() -> Iterator[None]:
+    """Record interrupts during a block; whatever it raises after one becomes an interrupt."""
+    _received.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def note(*_: object) -> NoReturn:
+        _received.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    except BaseException:
+        raise_if_interrupted()
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Let interrupts wait until the end of a block, which is short, and raise them there.
+
+    Processes started meanwhile inherit a blocked interrupt. That alone would not do: an interrupt
+    that this thread blocks is taken by another one, and raised in this one all the same.
+    """
+    deferred = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+    handled = threading.current_thread() is threading.main_thread() and callable(before)
+    if handled:
+        signal.signal(signal.SIGINT, lambda *_: deferred.set())
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handled:
+            signal.signal(signal.SIGINT, before)
+    if deferred.is_set():
+        _received.set()
+        raise KeyboardInterrupt
+
+
+def raise_if_interrupted() -> None:
+    """Raise an interrupt that was lost, if there was one."""
+    if _received.is_set():
+        raise KeyboardInterrupt
+
 
 _log = logging.getLogger("redetect")
 
@@ -50,18 +112,20 @@ _SHOWN_FAILURES = 10
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields what to call after every frame.
 
-    Calling it raises an interrupt that was lost (see `detect.interrupts`). The bar appears with the
+    Calling it raises an interrupt that was lost (see `detect.terminal`). The bar appears with the
     first frame: until then, workers may have something to say.
     """
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted
         return
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich import console
+    from rich import progress as bars
 
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
-    rate = TextColumn("{task.fields[rate]}")
-    progress = Progress(*columns, rate, console=Console(stderr=True))
+    columns = (
+        *bars.Progress.get_default_columns(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(),
+    )  # fmt: skip
+    rate = bars.TextColumn("{task.fields[rate]}")
+    progress = bars.Progress(*columns, rate, console=console.Console(stderr=True))
     task = progress.add_task(label, total=total, rate="")
 
     def advance() -> None:

@@ -24,11 +24,10 @@ from detect.drawing.inputs import select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
-from detect.run import Run
 from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import PUBLISHED, CircleSettings, parameter_value
-from detect.sources.interface import RunFrame
+from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Tune
@@ -41,7 +40,7 @@ from redetect.landmarks import (
     read_tilts,
 )
 from redetect.reporting.page import figure_file
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_bytes
 
 
 def perform(options: Tune) -> int:
@@ -107,8 +106,7 @@ def perform(options: Tune) -> int:
     }
     output.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
-        with write_whole(outputs[name], overwrite=options.force) as stream:
-            stream.write(content)
+        write_bytes(outputs[name], content, overwrite=options.force)
     print(f"{output}: {title}: {', '.join(contents)}")
     for record in records:
         if record["knee"]:

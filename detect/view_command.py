@@ -17,14 +17,14 @@ from detect.comparison.compare import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
-from detect.run import read_image
 from detect.seen import circle_on_floor, image_positions, summed_steps
+from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_whole
 
 FloatArray = NDArray[np.float64]
 
@@ -41,8 +41,8 @@ def perform(options: View) -> int:
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
-    if options.output is not None and options.output.exists() and not options.force:
-        raise OutputExistsError(options.output)
+    if options.output is not None:
+        demand_place(options.output, overwrite=options.force)
     expected, selection = select_frames(run.frames, options.frames, options.every)
     radius_m = source.circle_settings.radius_m
     poses, known = _poses(options, [frame.step for frame in run.frames])

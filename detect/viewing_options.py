@@ -180,9 +180,6 @@ class Report(RowsFlags):
     """
 
     worst: int = 5  #: How many of the worst frames are shown.
-    #: Detect this many frames again, with the settings that the files name, and state how long that
-    #: takes besides decoding; 0: none.
-    time_frames: int = 0
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
     gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 

@@ -2,9 +2,9 @@
 
 A cached table is a file named by the hash of everything that decides its content. It begins with
 a hash of that name and of the bytes that follow, so damage of any kind is noticed, and so is a
-table under another's name; every index is checked, too. Tables that another user forged may pass,
-so only files and folders are used that belong to the user and that no one else can write to.
-Rejected tables are computed again, with a warning.
+table under another's name. Tables that another user forged would pass, so only files and folders
+are used that belong to the user and that no one else can write to. Rejected tables are computed
+again, with a warning.
 
 Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
 be written to is no error: the next run just computes again.
@@ -16,7 +16,6 @@ import errno
 import hashlib
 import io
 import logging
-import math
 import os
 from collections.abc import Callable
 from dataclasses import astuple, fields
@@ -58,14 +57,12 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     Equal to that of `lut.build_disc_table`, whose parameters and errors these are; `folder` is the
     cache, by default `cache_folder`.
     """
-    return _cached(DiscTable, "discs", (camera, shape), build_disc_table, disc_table_fits, folder)
+    return _cached(DiscTable, "discs", (camera, shape), build_disc_table, folder)
 
 
 def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
     """The table of verticals of a camera, equal to `lut.build_vertical_table`'s; as above."""
-    return _cached(
-        VerticalTable, "verticals", (camera,), build_vertical_table, vertical_table_fits, folder
-    )
+    return _cached(VerticalTable, "verticals", (camera,), build_vertical_table, folder)
 
 
 def _cached(
@@ -73,11 +70,10 @@ def _cached(
     name: str,
     of: tuple[Any, ...],
     build: Callable[..., Table],
-    fits: Callable[..., bool],
     folder: Path | None,
 ) -> Table:
     path = (folder or cache_folder()) / f"{name}-{_key(*of)}.table"
-    table = _read(path, kind, lambda found: fits(found, *of))
+    table = _read(path, kind)
     if table is None:
         _log.info("computing the table of %s, once for this calibration", name)
         table = build(*of)
@@ -92,7 +88,7 @@ def _key(camera: Camera, shape: DiscShape | None = None) -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def _read(path: Path, kind: type[Table], fits: Callable[[Table], bool]) -> Table | None:
+def _read(path: Path, kind: type[Table]) -> Table | None:
     """The table that a file holds; None if there is no file, or one that must not be used."""
     content = _own_content(path)
     if content is None:
@@ -103,61 +99,11 @@ def _read(path: Path, kind: type[Table], fits: Callable[[Table], bool]) -> Table
             with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
                 found: dict[str, Any] = {name: arrays[name] for name in arrays.files}
             # Numbers were stored as arrays without dimensions.
-            table = kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
-            if fits(table):
-                return table
+            return kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
     except Exception:
         pass  # a damaged or forged archive can raise anything
     _log.info("%s: is damaged: it is computed again", path)
     return None
-
-
-def disc_table_fits(table: DiscTable, camera: Camera, shape: DiscShape) -> bool:
-    """Whether a table's arrays are such that no loop leaves the image, or the arrays themselves."""
-    height, width, centres = camera.height, camera.width, len(table.pixels)
-    return (
-        _is_array(table.samples, np.uint32, (centres, shape.samples, 2))
-        and _is_array(table.pixels, np.int32, (centres, 2))
-        and _is_array(table.floor_xy, np.float32, (height, width, 2))
-        and bool(np.all(table.samples <= height * width))
-        and bool(np.all((table.pixels >= 0) & (table.pixels < [width, height])))
-    )
-
-
-def vertical_table_fits(table: VerticalTable, camera: Camera) -> bool:
-    """As `disc_table_fits`; that numbers are there where they are used, too."""
-    height, width = camera.height, camera.width
-    first, last, anchor = table.first_row, table.last_row, table.anchor_row
-    elevation = table.anchor_elevation_rad
-    if not (
-        all(_is_array(array, np.float64, (width,)) for array in (anchor, table.bearing_rad))
-        and all(_is_array(array, np.int32, (width,)) for array in (first, last))
-        and all(
-            _is_array(array, np.float32, (height, width)) and array.flags.f_contiguous
-            for array in (table.column, table.elevation_tan)
-        )
-        and np.array_equal(table.robot_from_camera, camera.rotation)
-        and table.row_aspect == camera.scale_x / camera.scale_y
-        and isinstance(elevation, float)
-        and abs(elevation) < 0.5 * math.pi
-    ):
-        return False
-    inside = (anchor >= 0.0) & (anchor <= height - 1.0)  # NaN is not
-    row = np.arange(height)[:, None]
-    followed = table.usable & (row >= first) & (row <= last)
-    seen = (table.column >= 0.0) & (table.column <= width - 1.0)
-    return bool(
-        np.all(inside == np.isfinite(table.bearing_rad))
-        and np.all(inside | np.isnan(anchor))
-        and np.all(inside[table.usable])
-        and np.all((first >= 0) & (last < height))
-        and np.all(seen == followed)
-        and np.all(np.isfinite(table.elevation_tan) == followed)
-    )
-
-
-def _is_array(array: object, dtype: type[np.generic], shape: tuple[int, ...]) -> bool:
-    return isinstance(array, np.ndarray) and array.dtype == dtype and array.shape == shape
 
 
 def _own_content(path: Path) -> bytes | None:

@@ -230,16 +230,10 @@ def _unbroken(
         seen = (column >= 0.0) & (column <= width - 1.0)
         slope = np.gradient(column, axis=0) if height > 1 else np.zeros_like(column)
         seen &= ~(np.abs(slope) > STEEPEST_SLOPE)
-    first = np.ones(width, np.int32)
-    last = np.zeros(width, np.int32)
-    kept = np.zeros(column.shape, np.bool_)
-    for c in np.flatnonzero(np.isfinite(anchor_row)):
-        start = round(float(anchor_row[c]))
-        if not seen[start, c]:
-            continue
-        above = np.flatnonzero(~seen[:start, c])
-        below = np.flatnonzero(~seen[start:, c])
-        first[c] = above[-1] + 1 if len(above) else 0
-        last[c] = start + below[0] - 1 if len(below) else height - 1
-        kept[first[c] : last[c] + 1, c] = True
-    return first, last, kept
+    row, columns = np.arange(height)[:, None], np.arange(width)
+    start = np.rint(np.where(np.isfinite(anchor_row), anchor_row, 0.0)).astype(np.int32)
+    there = np.isfinite(anchor_row) & seen[start, columns]
+    first = np.where(~seen & (row < start), row + 1, 0).max(axis=0)
+    last = np.where(~seen & (row >= start), row - 1, height - 1).min(axis=0)
+    first, last = np.where(there, first, 1), np.where(there, last, 0)
+    return first.astype(np.int32), last.astype(np.int32), (row >= first) & (row <= last)

@@ -4,6 +4,7 @@
 >>> camera = rd.Camera.read("images/e/e.cam")                                  # doctest: +SKIP
 >>> found = rd.detect("images/e/images/e.0000.png", camera, radius_m=0.10)     # doctest: +SKIP
 >>> found.discs.xy, found.discs.covariance                                     # doctest: +SKIP
+>>> found.to_dataframe()                                                       # doctest: +SKIP
 
 What is listed in `__all__` is the public interface; each name is imported when it is first used.
 """
@@ -13,15 +14,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from redetect.storage.version import __version__ as __version__
+from redetect.storage import __version__ as __version__
 
 if TYPE_CHECKING:
     from camera import Camera
     from detect.line_settings import LineSettings
     from detect.settings import CircleSettings
     from detect.viewing_options import CompareOptions
-    from redetect.interface.detection import Detection, detect
-    from redetect.interface.explanation import Explanation, explain
+    from redetect.interface.detection import Detection, Explanation, detect, explain
     from redetect.interface.maps import Localization, RunMap, localize
     from redetect.interface.maps import map_landmarks as map
     from redetect.interface.recordings import Recording, compare
@@ -34,14 +34,14 @@ _PLACES = {
     "CompareOptions": ("detect.viewing_options", "CompareOptions"),
     "Detection": ("redetect.interface.detection", "Detection"),
     "Error": ("redetect.storage.messages", "OneLineError"),
-    "Explanation": ("redetect.interface.explanation", "Explanation"),
+    "Explanation": ("redetect.interface.detection", "Explanation"),
     "LineSettings": ("detect.line_settings", "LineSettings"),
     "Localization": ("redetect.interface.maps", "Localization"),
     "Recording": ("redetect.interface.recordings", "Recording"),
     "RunMap": ("redetect.interface.maps", "RunMap"),
     "compare": ("redetect.interface.recordings", "compare"),
     "detect": ("redetect.interface.detection", "detect"),
-    "explain": ("redetect.interface.explanation", "explain"),
+    "explain": ("redetect.interface.detection", "explain"),
     "localize": ("redetect.interface.maps", "localize"),
     "map": ("redetect.interface.maps", "map_landmarks"),
     "open": ("redetect.interface.recordings", "open_recording"),

@@ -11,8 +11,8 @@ from dataclasses import make_dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union
 
+from redetect.storage import __version__
 from redetect.storage.command_line import FOR_ALL, end_with, no_such
-from redetect.storage.version import __version__
 
 PROGRAMS = {
     "camera": "camera.cli",

@@ -11,8 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
-from camera.boards.board import Board
+from camera.boards.board import Board, dictionary_of
 from camera.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]
@@ -51,24 +52,6 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     grid = measured_corners(image, grid, board.marker_m / board.square_m)
     found = np.flatnonzero(np.isfinite(grid[..., 0]).ravel())
     return found, grid.reshape(-1, 2)[found]
-
-
-def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """The dictionary that a ChArUco board's markers are of."""
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or number is None:
-        raise CalibrationError(
-            f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
-            "DICT_5X5_100"
-        )
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
-    markers, most = board.columns * board.rows // 2, len(dictionary.bytesList)
-    if markers > most:
-        raise CalibrationError(
-            f"dictionary {board.dictionary} has {most} markers, and a {board} {markers}: expected "
-            "the dictionary that the board was printed with"
-        )
-    return dictionary
 
 
 def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
@@ -116,7 +99,8 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
         # First the given corners, then, ring by ring, the neighbours of those found.
         known = rough if not tried.any() else result
         present = np.isfinite(known[..., 0])
-        wanted = (present if not tried.any() else _bordering(present)) & ~tried
+        wanted = present if not tried.any() else binary_dilation(present, np.ones((3, 3)))
+        wanted = wanted & ~tried
         if not wanted.any() or present.sum() < _FEWEST_FOUND:
             return result
         homography = _homography(known, present)
@@ -131,17 +115,6 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
             parity = int(row + column) % 2
             found[row, column] = _measured(grey, gradient, at, axes, white, parity)
         result = found
-
-
-def _bordering(present: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Places that touch a present one, also across a corner."""
-    padded = np.pad(present, 1)
-    rows, columns = present.shape
-    near = np.zeros_like(present)
-    for down in range(3):
-        for right in range(3):
-            near |= padded[down : down + rows, right : right + columns]
-    return near & ~present
 
 
 def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | None:

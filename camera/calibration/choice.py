@@ -9,13 +9,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust
-from camera.calibration.fit import fit_points
-from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL
-from camera.calibration.settings import CalibrationSettings, FreeLens
+from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, fit_points
+from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
 from redetect.least_squares.solver import StartError
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FOLDS = 8

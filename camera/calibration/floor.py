@@ -1,4 +1,4 @@
-"""Where a calibrated camera is with respect to the floor, from known places on it.
+"""``camera floor``: where a calibrated camera is, from known places on the floor.
 
 The robot's axes are given by where the board lies: its middle at (X, Y) of the robot frame (X left,
 Y backward, Z up), its x axis turned from the robot's X axis.
@@ -8,19 +8,34 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass, replace
+from math import degrees, radians
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, project_estimate
-from camera.calibration.fit import fit_to_centres
+from camera.boards.board import Board, board_of
+from camera.boards.points import find_board
+from camera.calibration.adjustment import (
+    Adjusted,
+    Estimate,
+    Points,
+    adjust,
+    fit_to_centres,
+    project_estimate,
+)
+from camera.calibration.images import read_grey
 from camera.calibration.model import COUNT, cross_matrices
-from camera.calibration.projection import IDENTITY, intrinsics_of
+from camera.calibration.pictures import drawn_floor, rectified_floor
 from camera.calibration.start import best_poses, board_poses
+from camera.camfile import read_camera, write_camera
 from camera.errors import CalibrationError
-from camera.model import Camera, Pose
-from camera.uncertainty import with_covariance
+from camera.model import Camera
+from camera.options import Calibrate, Floor
+from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
+from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt
 
@@ -31,6 +46,30 @@ FLOOR_COLUMNS = ("u", "v", "x", "y")
 
 _FEWEST_POINTS = 4
 _LARGEST_FILE_BYTES = 1 << 24
+
+
+def perform(options: Floor) -> int:
+    """Carry the command out; returns the exit code."""
+    demand_place(options.output, overwrite=options.force)
+    camera = read_camera(options.camera)
+    is_picture = options.floor.suffix.lower() != ".csv"
+    if is_picture and 0 in (options.columns, options.rows, options.square_m):
+        raise CalibrationError(
+            "a picture of a board needs --columns, --rows and --square-m of the board; a .csv "
+            "of places on the floor (u,v,x,y) needs none"
+        )
+    seen = floor_points(options, None, options.floor, (camera.width, camera.height))
+    known = covariance_of(camera)
+    lens = None if known is None else known[:COUNT, :COUNT]
+    placed = place_on_floor(camera, seen.pixels, seen.xy, lens, seen.radius_m)
+    print(describe_pose(placed))
+    if lens is None:
+        print("the lens's covariance is not in the .cam file: neither will the pose's be")
+    camera = placed_camera(camera, placed, lens)
+    write_floor_pictures(options, options.floor, camera)
+    write_camera(camera, options.output, overwrite=options.force)
+    print(f"written: {options.output}")
+    return 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +170,39 @@ def placed_camera(
     )
 
 
-def with_pose(camera: Camera, pose: FloatArray) -> Camera:
-    """The camera at a (3, 4) pose `robot_from_camera`.
+class FloorPoints(NamedTuple):
+    """(N, 2) pixels, (N, 2) places (robot X, Y in m), radius of the circles seen there (m) or 0."""
 
-    A ``sensor2Tcp`` that it has stays: it belongs to its mount. One that has none gets the
-    identity, which says that the sensor is its own tool.
-    """
-    rows: Pose = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
-    return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
+    pixels: FloatArray
+    xy: FloatArray
+    radius_m: float = 0.0
+
+
+def floor_points(
+    options: Calibrate | Floor, board: Board | None, path: Path, size: tuple[int, int]
+) -> FloorPoints:
+    """Points on the floor of a .csv file, or of a picture of the board."""
+    if path.suffix.lower() == ".csv":
+        return FloorPoints(*read_floor_points(path))
+    board = board or board_of(options)
+    if board.looks_turned:
+        raise CalibrationError(
+            f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
+            "axes point: use one with one even and one odd number, or a .csv of places u,v,x,y"
+        )
+    image = read_grey(path)
+    if image.shape != size[::-1]:
+        raise CalibrationError(
+            f"{path}: {image.shape[1]} x {image.shape[0]} pixels: expected the calibrated camera's "
+            f"{size[0]} x {size[1]}"
+        )
+    try:
+        indices, pixels = find_board(image, board)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    yaw = radians(options.floor_yaw)
+    places = on_floor(board.points[indices], options.floor_origin, yaw)[:, :2]
+    return FloorPoints(pixels, places, 0.5 * board.circle_m)
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -196,3 +260,51 @@ def _check(pixels: FloatArray, floor: FloatArray) -> None:
                 f"all but one of the points lie in a line {what}: add another beside it, or poses "
                 "are ambiguous"
             )
+
+
+def describe_pose(pose: FloorPose) -> str:
+    """The pose with its standard deviations, for people."""
+    sigma = np.sqrt(np.diag(pose.covariance))
+    R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
+    down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
+    bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
+    return "\n".join(
+        [
+            f"pose from {len(pose.residuals)} points on the floor, RMS {pose.rms_px:.3f} px:",
+            *(
+                f"  {axis} {value:9.5f} m +- {s:.5f}"
+                for axis, value, s in zip(
+                    ("X (left)    ", "Y (backward)", "Z (up)      "), t, sigma
+                )
+            ),
+            f"  looking {down:.3f} deg down, {bearing:.3f} deg to the left; rotations about X, "
+            f"Y, Z +- {', '.join(f'{degrees(s):.4f}' for s in sigma[3:])} deg",
+            "  covariance (X Y Z in m, rotations about X Y Z in rad):",
+            *(f"    {' '.join(f'{value: .3e}' for value in row)}" for row in pose.covariance),
+        ]
+    )
+
+
+def write_floor_pictures(options: Calibrate | Floor, floor: Path, camera: Camera) -> None:
+    """The floor's grid in its photograph, and the floor from above; of a table, nothing."""
+    if options.pictures is None:
+        return
+    if floor.suffix.lower() == ".csv":
+        print(f"{floor}: no photograph, so there is no picture of the floor's grid")
+        return
+    image = read_grey(floor)
+    for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
+        place = options.pictures / f"{file_name(floor.name)}.{name}.png"
+        write_picture(draw(image, camera), place, force=options.force)
+
+
+def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> None:
+    """Write a PNG file, its folder if need be."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(place, cv2.imencode(".png", picture)[1].tobytes(), overwrite=force)
+    print(f"written: {place}")
+
+
+def file_name(name: str) -> str:
+    """Of a picture, or a frame of a video."""
+    return name.replace(":", "-")

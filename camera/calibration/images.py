@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
-from redetect.storage.bounded import read_bounded
-from redetect.storage.image_header import MOST_PIXELS, claimed_size, without_orientation
+from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded, without_orientation
 
 GreyImage = NDArray[np.uint8]
 
@@ -78,7 +77,7 @@ def read_grey(path: Path) -> GreyImage:
 def grey_of_content(content: bytes, name: object) -> GreyImage:
     """Decode the content of an image file as `read_grey` does; messages name it `name`.
 
-    The memory that the image takes is not checked here: see `redetect.storage.image_header`.
+    The memory that the image takes is not checked here: see `redetect.storage.bounded`.
     """
     image = None
     with suppress(cv2.error):

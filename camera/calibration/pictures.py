@@ -1,19 +1,19 @@
-"""Pictures of a calibration: residuals as arrows, by picture, and what of the image was covered."""
+"""Pictures of a calibration: residuals, coverage, corners, and the floor as the camera sees it."""
 
 from __future__ import annotations
 
-import io
+from functools import partial
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from camera.calibration.calibrate import Calibration
-from camera.calibration.checks import coverage
-from camera.calibration.projection import projection_sigma
+from camera.calibration.adjustment import project_estimate
+from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
+from camera.uncertainty import projection_sigma
+from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,29 +22,21 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _ARROW_SHARE = 0.05
-_DPI = 110
 
 
 def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
     """PNG files by name: `residuals`, `views`, `coverage`."""
-    return {
-        "residuals": _png(_residuals(calibration)),
-        "views": _png(_views(calibration)),
-        "coverage": _png(_coverage(calibration, camera)),
-    }
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    # Without a date, the same calibration gives the same bytes.
-    figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
-    return stream.getvalue()
+    shown = len(calibration.names) + len(calibration.outliers)
+    contents = {}
+    for name, size, draw in (
+        ("residuals", (13.0, 5.0), _draw_residuals),
+        ("views", (max(6.0, 0.22 * shown + 2.0), 4.2), _draw_views),
+        ("coverage", (13.0, 4.6), partial(_draw_coverage, camera)),
+    ):
+        with figure_file(size, "png") as (figure, content):
+            draw(calibration, figure)
+        contents[name] = content.getvalue()
+    return contents
 
 
 def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: int) -> Axes:
@@ -58,9 +50,8 @@ def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: i
     return axes
 
 
-def _residuals(calibration: Calibration) -> Figure:
+def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
     points, residuals = calibration.points, calibration.adjusted.residuals
-    figure = _figure(13.0, 5.0)
     axes = _image_axes(figure, 1, calibration, 2)
     typical = float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
     gain = _ARROW_SHARE * points.width / max(3.0 * typical, 1e-9)
@@ -83,13 +74,11 @@ def _residuals(calibration: Calibration) -> Figure:
         f"RMS {calibration.adjusted.rms_px:.3f} px; rings: 1 and 2 times "
         f"{calibration.adjusted.sigma_px:.3f} px"
     )
-    return figure
 
 
-def _views(calibration: Calibration) -> Figure:
+def _draw_views(calibration: Calibration, figure: Figure) -> None:
     rms = calibration.view_rms_px
     shown = len(rms) + len(calibration.outliers)
-    figure = _figure(max(6.0, 0.22 * shown + 2.0), 4.2)
     axes = figure.add_subplot()
     names = [*calibration.names, *(name for name, _ in calibration.outliers)]
     values = [*rms, *(value for _, value in calibration.outliers)]
@@ -99,12 +88,10 @@ def _views(calibration: Calibration) -> Figure:
     axes.set_xticks(np.arange(shown), names, rotation=90, fontsize=6)
     axes.set_ylabel("RMS residual (px)")
     axes.set_title("Each picture; red: left out" if calibration.outliers else "Each picture")
-    return figure
 
 
-def _coverage(calibration: Calibration, camera: Camera) -> Figure:
+def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:
     points = calibration.points
-    figure = _figure(13.0, 4.6)
     axes = _image_axes(figure, 1, calibration, 2)
     counts = coverage(points)
     extent = (-0.5, points.width - 0.5, points.height - 0.5, -0.5)
@@ -125,4 +112,118 @@ def _coverage(calibration: Calibration, camera: Camera) -> Figure:
     bar = figure.colorbar(shown, ax=axes, shrink=0.8)
     bar.set_label("px")
     axes.set_title("Standard deviation of the projection")
-    return figure
+
+
+Picture = NDArray[np.uint8]
+
+#: Blue, green, red.
+_FOUND, _PROJECTED, _GRID, _HORIZON = (0, 200, 0), (0, 0, 255), (0, 200, 255), (255, 120, 0)
+#: Width that small pictures are enlarged to (px), and of the rectified floor.
+_LEAST_WIDTH_PX, _RECTIFIED_PX = 900, 800
+#: Floor that is drawn: to the left and right, and ahead (m), and from one line to the next.
+_ASIDE_M, _AHEAD_M, _GRID_M = 3.0, 6.0, 0.5
+_STEPS = 400
+
+
+def drawn_corners(image: Picture, calibration: Calibration, view: int) -> Picture:
+    """A board's points where they were found (circles) and where they project (crosses)."""
+    points, estimate = calibration.points, calibration.adjusted.estimate
+    first = int(points.starts[view])
+    rows = slice(first, first + int(points.counts[view]))
+    found = points.pixels[rows]
+    projected = project_estimate(estimate, points)[0][rows]
+    picture, scale = _enlarged(image)
+    for place in found:
+        cv2.circle(picture, _dot(place, scale), 7 * 8, _FOUND, 1, cv2.LINE_AA, 3)
+    for place in projected:
+        cv2.drawMarker(
+            picture, _whole(place, scale), _PROJECTED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA
+        )
+    rms = float(np.sqrt(np.mean(np.sum((found - projected) ** 2, axis=1))))
+    return _captioned(
+        picture, f"{calibration.names[view]}: found (o), projected (+), RMS {rms:.2f} px"
+    )
+
+
+def drawn_floor(image: Picture, camera: Camera) -> Picture:
+    """The floor's grid and the horizon in a photograph."""
+    picture, scale = _enlarged(image)
+    along = np.linspace(-_ASIDE_M, _ASIDE_M, _STEPS)
+    ahead = -np.linspace(0.0, _AHEAD_M, _STEPS)
+    for y in -np.arange(0.0, _AHEAD_M + 0.01, _GRID_M):
+        line = camera.project_floor(np.column_stack([along, np.full(_STEPS, y)]))
+        _polyline(picture, line, scale, _GRID, 2 if y % 1.0 == 0.0 else 1)
+    for x in np.arange(-_ASIDE_M, _ASIDE_M + 0.01, _GRID_M):
+        line = camera.project_floor(np.column_stack([np.full(_STEPS, x), ahead]))
+        _polyline(picture, line, scale, _GRID, 2 if x % 1.0 == 0.0 else 1)
+    for y in range(1, int(_AHEAD_M) + 1):
+        _label(picture, camera.project_floor([0.0, -float(y)]), scale, f"{y} m", _GRID)
+    bearing = np.linspace(-np.pi, np.pi, 4 * _STEPS)
+    level = np.column_stack([np.sin(bearing), -np.cos(bearing), np.zeros(4 * _STEPS)])
+    _polyline(picture, camera.project_robot(camera.centre + 1e6 * level), scale, _HORIZON, 2)
+    return _captioned(
+        picture, f"floor: a line every {_GRID_M:g} m, whole metres thick; blue: the horizon"
+    )
+
+
+def rectified_floor(image: Picture, camera: Camera) -> Picture:
+    """The floor from above, ahead is up: what lies flat on it has its true shape."""
+    per_metre = _RECTIFIED_PX / (2.0 * _ASIDE_M)
+    height = round(_AHEAD_M * per_metre)
+    u, v = np.meshgrid(np.arange(_RECTIFIED_PX), np.arange(height))
+    # X is to the left, Y backward.
+    xy = np.stack([_ASIDE_M - (u + 0.5) / per_metre, (v + 0.5) / per_metre - _AHEAD_M], axis=-1)
+    pixels = np.nan_to_num(camera.project_floor(xy), nan=-1e4).astype(np.float32)
+    seen = cv2.remap(image, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderValue=0)
+    picture = np.asarray(cv2.cvtColor(seen, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    for y in range(int(_AHEAD_M) + 1):
+        row = round((_AHEAD_M - y) * per_metre)
+        cv2.line(picture, (0, row), (_RECTIFIED_PX, row), _GRID, 1)
+        cv2.putText(picture, f"{y} m", (4, row - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _GRID, 1)
+    for x in np.arange(-_ASIDE_M, _ASIDE_M + 0.01):
+        column = round((_ASIDE_M - float(x)) * per_metre)
+        cv2.line(picture, (column, 0), (column, height), _GRID, 1)
+    return _captioned(picture, "the floor from above; ahead is up, a line every metre")
+
+
+def _enlarged(image: Picture) -> tuple[Picture, float]:
+    """The image in colour and large enough to draw into, and how much it is enlarged."""
+    scale = float(max(1, round(_LEAST_WIDTH_PX / image.shape[1])))
+    size = int(scale * image.shape[1]), int(scale * image.shape[0])
+    large = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(large, cv2.COLOR_GRAY2BGR), dtype=np.uint8), scale
+
+
+def _dot(place: FloatArray, scale: float) -> tuple[int, int]:
+    """A place in eighths of the enlarged picture's pixels."""
+    u, v = np.rint(8.0 * ((place + 0.5) * scale - 0.5)).astype(int).tolist()
+    return u, v
+
+
+def _whole(place: FloatArray, scale: float) -> tuple[int, int]:
+    u, v = np.rint((place + 0.5) * scale - 0.5).astype(int).tolist()
+    return u, v
+
+
+def _polyline(
+    picture: Picture, line: FloatArray, scale: float, colour: tuple[int, int, int], width: int
+) -> None:
+    """Draw what of a line is seen, in pieces."""
+    reach = 2.0 * max(picture.shape)
+    near = np.isfinite(line).all(axis=1) & (np.abs(np.nan_to_num(line)) < reach).all(axis=1)
+    for first, last in zip(line[:-1][near[:-1] & near[1:]], line[1:][near[:-1] & near[1:]]):
+        cv2.line(picture, _dot(first, scale), _dot(last, scale), colour, width, cv2.LINE_AA, 3)
+
+
+def _label(
+    picture: Picture, place: FloatArray, scale: float, text: str, colour: tuple[int, int, int]
+) -> None:
+    if np.isfinite(place).all() and np.abs(place).max() < 1e4:
+        u, v = _whole(place, scale)
+        cv2.putText(picture, text, (u + 4, v - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
+
+
+def _captioned(picture: Picture, text: str) -> Picture:
+    band = np.full((24, picture.shape[1], 3), 255, np.uint8)
+    cv2.putText(band, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.vstack([picture, band])

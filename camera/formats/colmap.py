@@ -1,7 +1,8 @@
 """COLMAP's cameras.txt and cameras.bin, and ``pycolmap.Camera``.
 
 COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
-principal point is moved by half a pixel on the way in and out.
+principal point is moved by half a pixel on the way in and out. For programs that use pycolmap,
+`camera_from_pycolmap` and `pycolmap_from_camera` do without a file.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ import pycolmap
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from camera.formats.opencv import foreign
-from camera.formats.plain_yaml import shortest
+from camera.formats.yaml_files import foreign, shortest
 from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5

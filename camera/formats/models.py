@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.errors import ConversionError
+from camera.model import inverse_2x2
 from redetect.storage.messages import excerpt
 
 FloatArray = NDArray[np.float64]
@@ -121,11 +122,11 @@ class ForeignCamera:
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
                 for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
                     error = share * target - distorted(self.model, self.distortion, xy)
-                    xy = xy + _solved(self._jacobian(xy), error)
+                    xy = xy + (inverse_2x2(self._jacobian(xy)) @ error[..., None])[..., 0]
                     if np.abs(error).max() < 1e-15:
                         break
             off = np.abs(self.distort(xy) - pixels).max(axis=-1)
-            determinant = _determinant(self._jacobian(xy))
+            determinant = np.linalg.det(self._jacobian(xy))
         bad = ~(off < _CONVERGED_PX) | ~(determinant > 0.0)
         if bad.any():
             u, v = pixels[int(np.argmax(bad))]
@@ -145,17 +146,6 @@ class ForeignCamera:
             for axis in np.eye(2)
         ]
         return np.stack([difference / (2.0 * step) for difference in differences], axis=-1)
-
-
-def _determinant(m: FloatArray) -> FloatArray:
-    return np.asarray(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
-
-
-def _solved(m: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions of 2 x 2 systems; not finite where there is none."""
-    x, y = right[..., 0], right[..., 1]
-    solution = [m[..., 1, 1] * x - m[..., 0, 1] * y, m[..., 0, 0] * y - m[..., 1, 0] * x]
-    return np.stack(solution, axis=-1) / _determinant(m)[..., None]
 
 
 def distorted(

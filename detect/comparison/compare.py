@@ -76,11 +76,13 @@ def compare_runs(
     detected: str | os.PathLike[str] | None = None,
     options: CompareOptions | None = None,
     sight: Sight | None = None,
+    unlisted: Path | None = None,
+    lookalikes: Path | None = None,
 ) -> DiscComparison:
     """Compare the discs of two files, by default ``detected`` and ``map.circles`` in a run folder.
 
-    The rest as in `compare_frames`; unlisted discs and look-alikes are taken from the reference's
-    folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
+    The rest as in `compare_frames`; unlisted discs and look-alikes are by default those in the
+    reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
     reference = Path(run) / "map.circles" if reference is None else reference
     detected = Path(run) / "detected.circles" if detected is None else detected
@@ -89,8 +91,8 @@ def compare_runs(
         read_frames(detected),
         options,
         sight=sight,
-        unlisted=rows_beside(reference, "unlisted.circles"),
-        lookalikes=rows_beside(reference, "lookalikes.circles"),
+        unlisted=rows_beside(reference, "unlisted.circles", unlisted),
+        lookalikes=rows_beside(reference, "lookalikes.circles", lookalikes),
         names=(os.fspath(reference), os.fspath(detected)),
     )
 

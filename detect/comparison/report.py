@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, read_camera
-from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
+from detect.comparison.compare import compare_line_frames, compare_runs, rows_beside
 from detect.comparison.result import (
     WORST_FRAMES,
     CommonLean,
@@ -28,11 +28,11 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.run import camera_in
 from detect.seen import Sight
+from detect.sources.interface import camera_in
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
 
 
@@ -43,8 +43,7 @@ def perform(command: Compare) -> int:
         print("no calibration: positions are compared on the floor; --camera names one")
     Console().print(comparison_tables(result))
     if command.json is not None:
-        with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(result.to_json().encode())
+        write_bytes(command.json, result.to_json().encode(), overwrite=command.force)
     unmet = unmet_demands(
         result, min_recall=command.min_recall, min_precision=command.min_precision
     )
@@ -80,14 +79,14 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     if camera is not None:
         radius_m = read_head(detected).circle_settings.radius_m
         sight = Sight(camera, radius_m, read_head(reference).level)
-    return compare_frames(
-        read_frames(reference),
-        read_frames(detected),
-        command.matching,
+    return compare_runs(
+        command.run,
+        reference=reference,
+        detected=detected,
+        options=command.matching,
         sight=sight,
-        unlisted=rows_beside(reference, "unlisted.circles", command.unlisted),
-        lookalikes=rows_beside(reference, "lookalikes.circles", command.lookalikes),
-        names=(str(reference), str(detected)),
+        unlisted=command.unlisted,
+        lookalikes=command.lookalikes,
     )
 
 

@@ -204,7 +204,7 @@ class Comparison(ABC):
 
     @property
     def lookalikes_found(self) -> int | None:
-        """Extra rows on what is known to look like a landmark; None if nothing is known to."""
+        """Extra rows on known look-alikes; None where no look-alikes are listed."""
         return None
 
     @abstractmethod

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.drawing.frame import draw_rows
+from detect.drawing.frame import draw_rows, png_of
 from detect.drawing.inputs import open_rows, picture_name, select_frames
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
-from detect.run import Run, read_image
+from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Draw
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_bytes, write_whole
 
 
 def perform(options: Draw) -> int:
@@ -38,8 +38,8 @@ def perform(options: Draw) -> int:
             f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
             "only markers can be drawn without"
         )
-    if options.video is not None and options.video.exists() and not options.force:
-        raise OutputExistsError(options.video)
+    if options.video is not None:
+        demand_place(options.video, overwrite=options.force)
     expected, selection = select_frames(run.frames, options.frames, options.every)
     gates = CompareOptions(**vars(options.gates))
     if options.output is not None:
@@ -63,8 +63,7 @@ def perform(options: Draw) -> int:
             picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, gates, name)
             if options.output is not None:
                 path = options.output / f"{name}.png"
-                with write_whole(path, overwrite=options.force) as stream:
-                    stream.write(cv2.imencode(".png", picture)[1].tobytes())
+                write_bytes(path, png_of(picture), overwrite=options.force)
             if video is not None:
                 video(picture)
             drawn += 1

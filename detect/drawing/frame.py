@@ -221,6 +221,11 @@ def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray
     return canvas
 
 
+def png_of(picture: NDArray[np.uint8]) -> bytes:
+    """A picture, blue, green, red, as a PNG file."""
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
 @lru_cache(maxsize=2)
 def _unseen(camera: Camera) -> NDArray[np.bool_]:
     u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)

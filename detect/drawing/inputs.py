@@ -13,13 +13,12 @@ from typing import Any, TypeVar, get_origin, get_type_hints
 from camera import Camera
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.run import ImageRun
 from detect.runs.outputs import LEVEL, LEVELLED
 from detect.runs.plan import FramesByImage
 from detect.seen import Sight
 from detect.settings import CircleSettings, parameter_value
 from detect.sources.image_files import image_name
-from detect.sources.interface import Frames, RunFrame
+from detect.sources.interface import Frames, ImageRun, RunFrame
 from detect.viewing_options import RowFiles
 from redetect.landmarks import Frame, FrameTilt, read_tilts
 from redetect.storage.messages import excerpt

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary
-from detect.markers.settings import Darkness, MarkerSettings
+from detect.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 GreyImage = NDArray[np.uint8]
@@ -143,17 +143,18 @@ def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Gre
     for threshold in settings.thresholds:
         soft = threshold < _SMOOTH_BELOW and smooth is not plain
         source, least = (smooth, 0.5 * gate) if soft else (plain, gate)
-        yield dark_pixels(*source, threshold, least, settings.darkness)
+        yield dark_pixels(*source, threshold, least)
 
 
-def dark_pixels(
-    grey: GreyImage, closed: GreyImage, threshold: float, gate: float, darkness: Darkness
-) -> GreyImage:
-    """1 where an image is darker than its closing by the threshold and by `gate` grey levels."""
+def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: float) -> GreyImage:
+    """1 where an image is darker than its closing by the threshold and by `gate` grey levels.
+
+    The darkness of I1 under its closing I2 is 1 - I1/I2.
+    """
     levels = np.arange(256.0)
-    limit = levels * (1.0 - threshold) if darkness == "ratio" else levels - 255.0 * threshold
     # I1 < limit(I2), for whole grey levels; the limit itself is not dark.
-    table = np.clip(np.ceil(np.minimum(limit, levels - gate)), 0, 255).astype(np.uint8)
+    limit = np.minimum(levels * (1.0 - threshold), levels - gate)
+    table = np.clip(np.ceil(limit), 0, 255).astype(np.uint8)
     dark = cv2.compare(grey, cv2.LUT(closed, table), cv2.CMP_LT)
     return np.asarray(dark, np.uint8) & np.uint8(1)
 

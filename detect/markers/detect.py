@@ -38,7 +38,7 @@ from detect.markers.geometry import (
     square_homography,
 )
 from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
-from detect.markers.settings import MarkerSettings
+from detect.settings import MarkerSettings
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 
 FloatArray = NDArray[np.float64]
@@ -201,7 +201,7 @@ def detect_markers(
 
 def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
     """Rough corners of a region by its straight hull, or the cause of there being none."""
-    corners = rough_corners(hull, settings.corners)
+    corners = rough_corners(hull)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
     if signed_area(corners) < settings.least_square * cv2.contourArea(hull.astype(np.float32)):

@@ -4,16 +4,15 @@ Edges of markers are straight in a pinhole image only. Everything that is fitted
 therefore fitted at *straight* positions, ``(scale x + offset)`` of the undistorted normalised
 coordinates, and what comes out is bent back. Without a camera both are the same.
 
-RAWSEEDS deliverable D2.1 part 2 has two algorithms for rough corners of a region. A takes the local
-maxima of the distance from the barycentre, and needs exactly four. B takes the quadrangle of
-largest area, which the report looks for by coordinate ascent, and which is found here among all
-diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right, (0, 1).
+The rough corners of a region are those of the quadrangle of largest area in its hull (algorithm B
+of RAWSEEDS deliverable D2.1 part 2), which the report looks for by coordinate ascent, and which is
+found here among all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
+(0, 1).
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -23,8 +22,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.markers.settings import CornerAlgorithm
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 
 FloatArray = NDArray[np.float64]
 
@@ -100,26 +98,20 @@ def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
 NOT_FOUR_CORNERS = "not four corners"
 NO_QUADRANGLE = "no quadrangle"
 
-#: Algorithm A: corners are this far apart as seen from the barycentre.
-_CORNER_SPACING_RAD = math.radians(25.0)
-#: Algorithm A: number of points along the perimeter, beside the hull's own.
-_CHAIN_POINTS = 160
 #: Quadrangles whose corners are all this near (pixels, and in widths) are one and the same.
 _SAME_PX, _SAME_WIDTHS = 1.0, 0.08
 _NEXT = np.array([1, 2, 3, 0])
 _SQUARE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 
 
-def rough_corners(hull: FloatArray, algorithm: CornerAlgorithm) -> FloatArray | None:
-    """Four corners (4, 2) of a region by its convex hull (N, 2); None if there are not just four.
+def rough_corners(hull: FloatArray) -> FloatArray | None:
+    """Four corners (4, 2) of a region by its convex hull (N, 2); None if that has fewer.
 
     From the top left clockwise as seen in the image, up to a rotation.
     """
     if len(hull) < 4:
         return None
-    corners = hull[largest_quadrangle(hull)] if algorithm == "B" else _farthest_points(hull)
-    if len(corners) != 4:
-        return None
+    corners = hull[largest_quadrangle(hull)]
     return np.ascontiguousarray(corners if signed_area(corners) > 0.0 else corners[::-1])
 
 
@@ -144,20 +136,6 @@ def largest_quadrangle(points: FloatArray) -> NDArray[np.int64]:
             if high - low > largest:
                 largest, best = high - low, (i, at_low, k, at_high)
     return np.sort(np.array(best))
-
-
-def _farthest_points(hull: FloatArray) -> FloatArray:
-    """Points of a closed polygon farther from its barycentre than all in similar directions."""
-    closed = np.concatenate([hull, hull[:1]])
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
-    at = np.union1d(np.linspace(0.0, along[-1], _CHAIN_POINTS, endpoint=False), along[:-1])
-    chain = np.stack([np.interp(at, along, closed[:, k]) for k in range(2)], axis=-1)
-    # With this many points, their mean is the barycentre of the outline.
-    x, y = (chain - chain.mean(axis=0)).T
-    angle = np.arctan2(y, x)
-    apart = np.abs(np.remainder(angle[:, None] - angle + np.pi, 2.0 * np.pi) - np.pi)
-    rivals = np.where(apart < _CORNER_SPACING_RAD, np.hypot(x, y), 0.0)
-    return np.asarray(chain[rivals.argmax(axis=1) == np.arange(len(chain))])
 
 
 def signed_area(corners: FloatArray) -> float:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from detect import __version__
+from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
 from detect.comparison.report import (
     floor_table,
     summary_rows,
     worst_frames_table,
 )
 from detect.comparison.result import Comparison, DiscComparison, LineComparison, number
-from detect.drawing.inputs import picture_name
-from detect.errors import DetectError
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
+from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
-from detect.markers.settings import MarkerSettings
 from detect.report.figures import (
     RateCurve,
     bearings_figure,
@@ -32,12 +35,82 @@ from detect.report.figures import (
     whitened,
     whitened_figure,
 )
-from detect.report.inputs import ReportInputs, frame_picture, gallery, gather
-from detect.settings import CircleSettings
+from detect.seen import Sight
+from detect.settings import CircleSettings, MarkerSettings
+from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import Report
-from redetect.reporting.page import Part, Section, page_of
-from redetect.storage import OutputExistsError, write_whole
+from detect.viewing_options import CompareOptions, Gates, Report, RowFiles
+from redetect.reporting.page import Part, Section, image_part, page_of
+from redetect.storage import demand_place, write_bytes
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """A run's rows, and how they compare with the reference.
+
+    `names` are the prefixes of its frames in their order, `rows` the rows of each. `sight` is None
+    without a calibration, comparisons without reference rows.
+    """
+
+    run: ImageRun
+    files: RunRows
+    names: tuple[str, ...]
+    rows: tuple[SeenRows, ...]
+    options: CompareOptions
+    sight: Sight | None
+    discs: DiscComparison | None
+    lines: LineComparison | None
+
+
+def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
+    """Read and compare all rows of a run.
+
+    Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
+    """
+    files = open_rows(run, options)
+    names = tuple(frame.step.prefix for frame in run.frames)
+    if not names:
+        raise DetectError(f"{run.folder}: no frames: expected some of them")
+    rows = tuple(files.of(name) for name in names)
+    compare = CompareOptions(**vars(gates))
+    sight = files.sight(run.camera) if isinstance(run, Run) else None
+    discs, lines = None, None
+    if both := [seen for seen in rows if seen.circles and seen.reference_circles]:
+        path = files.reference["circles"]
+        discs = compare_frames(
+            [seen.reference_circles for seen in both if seen.reference_circles],
+            [seen.circles for seen in both if seen.circles],
+            compare,
+            sight=sight,
+            unlisted=rows_beside(path, "unlisted.circles"),
+            lookalikes=rows_beside(path, "lookalikes.circles"),
+            names=(path.name, files.detected["circles"].name),
+        )
+    if both := [seen for seen in rows if seen.lines and seen.reference_lines]:
+        lines = compare_line_frames(
+            [seen.reference_lines for seen in both if seen.reference_lines],
+            [seen.lines for seen in both if seen.lines],
+            compare,
+            unlisted=rows_beside(files.reference["lines"], "unlisted.lines"),
+            names=(files.reference["lines"].name, files.detected["lines"].name),
+        )
+    return ReportInputs(run, files, names, rows, compare, sight, discs, lines)
+
+
+_JPEG_QUALITY = 88
+
+
+def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
+    """The picture of a frame with its rows; or a note that says why there is none."""
+    frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
+    try:
+        image = read_image(frame, None if inputs.sight is None else inputs.sight.camera)
+    except FrameError as error:
+        return Part("note", f"{words}: {error}")
+    rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
+    picture = draw_rows(image, inputs.sight, rows, settings, inputs.options)
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
 
 def perform(options: Report) -> int:
@@ -47,12 +120,10 @@ def perform(options: Report) -> int:
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
-    if output.exists() and not options.force:
-        raise OutputExistsError(output)
-    inputs = gather(run, options.files, options.gates, options.time_frames)
+    demand_place(output, overwrite=options.force)
+    inputs = gather(run, options.files, options.gates)
     page = report_page(inputs, options.worst)
-    with write_whole(output, overwrite=options.force) as stream:
-        stream.write(page)
+    write_bytes(output, page, overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
@@ -78,7 +149,6 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
     sections.append(_frames(inputs, worst))
     if "tilt" in detected:
         sections.append(Section("tilt", "Tilt", _tilt(inputs)))
-    sections.append(Section("timing", "Timing", [_timing(inputs)]))
     sections.append(Section("settings", "Effective configuration", _settings(inputs)))
     return page_of(f"Detections of {inputs.run.name}", sections)
 
@@ -116,7 +186,7 @@ def _summary(inputs: ReportInputs) -> list[Part]:
 
 
 def _discs(inputs: ReportInputs) -> list[Part]:
-    """Rates and errors of discs, whether covariances are right, and discs cut out."""
+    """Rates and errors of discs, and whether covariances are right."""
     result = inputs.discs
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
@@ -132,8 +202,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result.lean is not None:
         what += ", after the common lean"
         parts.append(Part("table", *floor_table(result)))
-    parts += _honesty(result, what)
-    return [*parts, *gallery(inputs, "missed"), *gallery(inputs, "extra")]
+    return [*parts, *_honesty(result, what)]
 
 
 def _lines(inputs: ReportInputs) -> list[Part]:
@@ -194,7 +263,7 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     return [whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
-# -- frames, tilt, time, settings -------------------------------------------------------------
+# -- frames, tilt, settings -------------------------------------------------------------
 
 
 def _frames(inputs: ReportInputs, worst: int) -> Section:
@@ -252,22 +321,6 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
     caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
     figure = [tilt_figure(inputs.rows)] if len(tilts) > 1 else []
     return [*figure, Part("table", caption, head, tuple(rows))]
-
-
-def _timing(inputs: ReportInputs) -> Part:
-    timing = inputs.timing
-    if timing is None:
-        words = "Not measured: --time-frames 20 detects 20 of the frames again and states it."
-        return Part("note", words)
-    rows = tuple(
-        (what, f"{ms:.2f}", f"{ms / timing.decoding_ms:.2f}")
-        for what, ms in (
-            ("decoding the image", timing.decoding_ms),
-            (f"detecting {timing.what}", timing.detecting_ms),
-        )
-    )
-    caption = f"Processor time, medians of {timing.frames} frames, on the machine of this report"
-    return Part("table", caption, ("", "ms", "x decoding"), rows)
 
 
 def _settings(inputs: ReportInputs) -> list[Part]:

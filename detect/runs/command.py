@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from detect.drawing.inputs import read_head
 from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
-from detect.run import ImageRun, Run, read_image
 from detect.runs.outputs import frames_tilt_place
 from detect.runs.plan import Drawing, FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
+from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import open_run, open_source
 from detect.terminal import print_failures, progress_bar
 from redetect.landmarks import read_tilts
@@ -200,7 +200,7 @@ def _print_results(job: Job, summary: RunSummary) -> None:
             f"{circles.calibration_px:g} px (--calibration-px)"
         )
     elif circles and circles.refine and camera and any(camera.covariance or ()):
-        from detect.calibration_error import sentence_of  # loads the compiler
+        from detect.levelling import sentence_of  # loads the compiler
 
         print(sentence_of(places["circles"], camera))
     if summary.rejected:

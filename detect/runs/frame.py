@@ -17,22 +17,25 @@ from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.calibration_error import common_covariance, common_tilt_variance, with_common
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
-from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks
+from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
-from detect.levelling import level_discs, levelled
+from detect.levelling import (
+    common_covariance,
+    common_tilt_variance,
+    level_discs,
+    levelled,
+    with_common,
+)
 from detect.lines import LineDetections, detect_lines
 from detect.markers.detect import MarkerDetections, detect_markers
-from detect.run import read_image
 from detect.run_tilt import frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
@@ -47,6 +50,7 @@ from detect.runs.plan import (
 )
 from detect.seen import Sight
 from detect.settings import CircleSettings
+from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
 from detect.verticals.response import line_response
 from detect.viewing_options import CompareOptions
@@ -212,10 +216,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
             pictures=tuple(
-                (
-                    f"{Path(task.frame.step.prefix).name}{ending}",
-                    cv2.imencode(".png", picture)[1].tobytes(),
-                )
+                (f"{Path(task.frame.step.prefix).name}{ending}", png_of(picture))
                 for ending, picture in _drawn(rows, found, plan)
             ),
         )

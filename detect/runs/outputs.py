@@ -17,10 +17,9 @@ from typing import Any
 from camera import Camera
 from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
-from detect.run import ImageRun
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.settings import CircleSettings
-from detect.sources.interface import TIMES_HEAD
+from detect.sources.interface import TIMES_HEAD, ImageRun
 from redetect.landmarks import format_head
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.

@@ -18,11 +18,9 @@ import numpy as np
 from camera import Camera
 from detect.discs.identity import MappedDisc
 from detect.line_settings import LineSettings
-from detect.markers.settings import MarkerSettings
-from detect.run import ImageRun
-from detect.settings import CircleSettings, Levelling
+from detect.settings import CircleSettings, Levelling, MarkerSettings
 from detect.sources.image_files import image_name
-from detect.sources.interface import RunFrame, format_time
+from detect.sources.interface import ImageRun, RunFrame, format_time
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

@@ -5,33 +5,161 @@
 The files have the same bytes with any number of workers; they appear together at the end, or not at
 all.
 
-The rows of each frame that is done go to the journal (`detect.runs.journal`). However a run ends,
-by a signal, a full disk, workers that are gone, they are there, and a run that resumes goes on
-after them, as long as program, settings, camera and frames are the same. When all frames are done,
-the results are written from the journal to parts (`redetect.storage.parts`) and brought to the
-disk; the journal says so; they take their places. A process killed in between leaves this last step
-to the next run.
+The rows of each frame that is done go to the journal, an append-only text file beside the results,
+locked while the run lasts (`redetect.storage.parts`). Each of its lines has a digest, of its record
+and all before it, and the record in JSON: what made the rows, then one for each frame, and finally
+one that says that the results are written. Lines that do not fit their digest, and all that follow,
+are ignored.
+
+However a run ends, by a signal, a full disk, workers that are gone, the journal is there, and a run
+that resumes goes on after its frames, as long as program, settings, camera and frames are the same.
+When all frames are done, the results are written from the journal to parts and brought to the disk;
+the journal says so; they take their places. A process killed in between leaves this last step to
+the next run.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import logging
 import os
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
+
+from detect import __version__
 from detect.errors import DetectError
-from detect.runs.journal import Journal, made_by, task_digest
 from detect.runs.outputs import Output, is_log, log_text, outputs_of
-from detect.runs.plan import FrameRows, FrameTask, Job, RunSummary
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
-from redetect.storage import OutputExistsError, write_whole
+from detect.sources.interface import RunFrame
+from redetect.storage import OutputExistsError, write_bytes
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
+
+#: Incremented with every change of the format of a journal or of the rows in it.
+_JOURNAL_VERSION = 6
+
+_DIGITS = 16
+_LONGEST_LINE = 1 << 26
+_COMPLETE = "complete"
+
+
+class Journal:
+    """A journal that this process has locked; whoever opened its file closes or removes it."""
+
+    def __init__(self, file: PartFile) -> None:
+        self.file = file
+        self._digest, self._end = hashlib.sha256(), 0
+
+    def write(self, *records: object) -> None:
+        """Append records to those that were taken over or written."""
+        self.file.stream.seek(self._end)
+        for record in records:
+            line = json.dumps(record, separators=(",", ":")).encode()
+            self._digest.update(line)
+            self._end += self.file.stream.write(self._check(self._digest) + line + b"\n")
+        self.file.stream.flush()
+
+    def write_frames(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
+        """Write the rows of frames that are done, without their pictures."""
+        self.write(*([task_digest(task), *rows[:-1]] for task, rows in frames))
+
+    def write_complete(self, parts: Sequence[int], *, overwrite: bool) -> None:
+        """Note that the results are on the disk, in these parts, and only have to be renamed."""
+        self.write([_COMPLETE, parts, overwrite])
+        self.file.sync()
+
+    def is_by(self, made_by: str) -> bool:
+        """Whether its first record says so."""
+        return next(self._records(), None) == [made_by]
+
+    def frames(self) -> Iterator[tuple[str, FrameRows]]:
+        """The digest of the task and the rows of each frame.
+
+        Requesting the next one takes it over; `cut` discards the last one and all that follow.
+        """
+        records = self._records()
+        next(records, None)
+        for record in records:
+            if record[0] != _COMPLETE:
+                yield record[0], FrameRows(*record[1:])
+
+    def complete(self) -> tuple[Sequence[int], bool] | None:
+        """What `write_complete` noted, if it did."""
+        (last,) = deque(self._records(), maxlen=1) or [None]
+        return (last[1], last[2]) if last and last[0] == _COMPLETE else None
+
+    def cut(self) -> None:
+        """Discard the records that were not taken over; the next one is written there."""
+        self.file.stream.truncate(self._end)
+
+    def _records(self) -> Iterator[list[Any]]:
+        self._digest, self._end = hashlib.sha256(), 0
+        self.file.stream.seek(0)
+        while line := self.file.stream.readline(_LONGEST_LINE):
+            digest = self._digest.copy()
+            digest.update(line[_DIGITS + 1 : -1])
+            if not line.endswith(b"\n") or not line.startswith(self._check(digest)):
+                return
+            record = json.loads(line[_DIGITS + 1 :])
+            if not isinstance(record, list) or not record:
+                return
+            yield record
+            self._digest, self._end = digest, self._end + len(line)
+
+    @staticmethod
+    def _check(digest: Any) -> bytes:
+        return f"{digest.hexdigest()[:_DIGITS]} ".encode()
+
+
+def made_by(outputs: Sequence[Output], plan: FramePlan) -> str:
+    """A digest of whatever decides the rows, besides the frames themselves."""
+    values = (
+        _JOURNAL_VERSION,
+        __version__,
+        # A process that has others do the work does not load the compiler, which takes long.
+        (np.__version__, cv2.__version__, version("numba")),
+        replace(plan, camera=None, working_folder=Path()),
+        plan.camera and (plan.camera.content_hash, plan.camera.covariance),
+        [(output.kind, output.head, output.tail, output.crlf) for output in outputs],
+    )
+    return _digest_of(repr(values))
+
+
+def task_digest(task: FrameTask) -> str:
+    """A digest of the work on a frame: its step, its image and the prior data on it.
+
+    Of an image file, name, size and time of change count.
+    """
+    frame = task.frame
+    beside = (frame.step, _file_of(frame), frame.time_s, frame.bits, frame.failure, task.known)
+    return _digest_of(repr(beside), b"" if frame.content is None else bytes(frame.content))
+
+
+def _digest_of(text: str, content: bytes = b"") -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape") + content).hexdigest()[:_DIGITS]
+
+
+def _file_of(frame: RunFrame) -> object:
+    """What identifies the current state of a frame's image file."""
+    if frame.image is None:
+        return None
+    try:
+        status = frame.image.stat()
+    except (OSError, ValueError):
+        return frame.image.name  # nothing there: that counts as well
+    return frame.image.name, status.st_size, status.st_mtime_ns
+
 
 _log = logging.getLogger("redetect")
 
@@ -45,10 +173,14 @@ def detect_run(
     levelled by, and those of single frames are in another one (`outputs.frames_tilt_place`).
     Workers are by default this process; `on_progress` is called once after every frame.
 
-    Raises ------ DetectError If another run is writing the same files, a frame fails where every
-    frame is demanded, or there is no such dictionary of markers. lut.TableError,
-    redetect.storage.OutputExistsError, WorkerError If there can be no table for the camera, an
-    output exists and must not be replaced, or there are no workers.
+    Raises
+    ------
+    DetectError
+        If another run is writing the same files, a frame fails where every frame is demanded, or
+        there is no such dictionary of markers.
+    lut.TableError, redetect.storage.OutputExistsError, WorkerError
+        If there can be no table for the camera, an output exists and must not be replaced, or there
+        are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
     if job.pictures is None:
@@ -104,8 +236,7 @@ def _write_pictures(
 ) -> None:
     for _, rows in frames:
         for name, picture in rows.pictures:
-            with write_whole(folder / name, overwrite=overwrite) as stream:
-                stream.write(picture)
+            write_bytes(folder / name, picture, overwrite=overwrite)
 
 
 class RunFiles:

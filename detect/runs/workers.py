@@ -31,10 +31,10 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 import cv2
 
 from detect.errors import WorkerError
-from detect.interrupts import interrupts_deferred
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 from detect.terminal import (
     announcements_are_shown,
+    interrupts_deferred,
     on_compilation,
     say_compiling,
     show_announcements,

@@ -26,12 +26,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from camera.calibration.floor import with_pose
 from camera.formats.conversion import convert_to_camera
-from camera.formats.ros import camera_from_message
+from camera.formats.yaml_files import camera_from_message
+from camera.uncertainty import with_pose
 from detect.errors import DetectError, FrameError
-from detect.sources.gray import gray_of_pixels, significant_bits
-from detect.sources.interface import RunFrame, Source, numbered_prefix, still
+from detect.sources.interface import (
+    RunFrame,
+    Source,
+    gray_of_pixels,
+    numbered_prefix,
+    significant_bits,
+    still,
+)
 from detect.sources.poses import (
     DATASET_FROM_ROBOTICS,
     FARTHEST,

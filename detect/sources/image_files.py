@@ -1,29 +1,25 @@
 """Image files as a source, and which of them belongs to a step: never one outside the run.
 
-A run may have a million frames: the memory per frame is the name of its image and 12 bytes.
+Of a frame its image's name is kept in memory, and nothing else.
 """
 
 from __future__ import annotations
 
 import fnmatch
-import hashlib
 import os
 import re
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from detect.errors import DetectError, FrameError
-from detect.sources.gray import significant_bits_of_file
 from detect.sources.interface import (
     Frames,
     RunFrame,
     Source,
     frame_prefix,
     read_image_times,
+    significant_bits_of_file,
     still,
 )
 from redetect.landmarks import read_steps
@@ -61,24 +57,21 @@ class ImageNames:
                 for entry in entries
                 if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
             )
-        names.sort(key=_natural_order)
-        encoded = [os.fsencode(name) for name in names]
-        self._names: NDArray[np.bytes_] = np.array(encoded, dtype=np.bytes_)
-        self._index = NameIndex(encoded)
-        self._suffixes = sorted({name[name.rindex(b".") :] for name in encoded})
+        self._names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
+        self._places = {name: place for place, name in enumerate(self._names)}
+        self._suffixes = sorted({name[name.rindex(".") :] for name in names})
 
     def __len__(self) -> int:
         return len(self._names)
 
     def path(self, index: int) -> Path:
         """The image at a place in the order."""
-        return self.folder / os.fsdecode(self._names[index])
+        return self.folder / self._names[index]
 
     def find(self, name: str) -> int | None:
         """The place of the image of a name, with or without its ending; the first of several."""
-        stem = name.encode("utf-8", "surrogateescape")
-        places = [self._index.find(stem + suffix) for suffix in (b"", *self._suffixes)]
-        return min((place for place in places if place is not None), default=None)
+        named = [name + suffix for suffix in ("", *self._suffixes)]
+        return min((self._places[each] for each in named if each in self._places), default=None)
 
     def place_of(self, prefix: str) -> int | None:
         """The place of a step's image, by its name alone; None if there is none.
@@ -116,28 +109,6 @@ def images_of_folder(folder: Path) -> ImageNames:
     )
 
 
-class NameIndex:
-    """Finds the place of a name in a sequence; of equal names the last one. 12 bytes per name."""
-
-    def __init__(self, names: Iterable[bytes]) -> None:
-        keys = np.array([_key(name) for name in names], dtype=np.uint64)
-        self._places = np.argsort(keys, kind="stable").astype(np.uint32)
-        self._keys = keys[self._places]
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-    def find(self, name: bytes) -> int | None:
-        """The place of a name in the sequence; None if it is not there."""
-        key = _key(name)
-        after = int(self._keys.searchsorted(key, side="right"))
-        return int(self._places[after - 1]) if after and self._keys[after - 1] == key else None
-
-
-def _key(name: bytes) -> np.uint64:
-    return np.uint64(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest()))
-
-
 def _suffix(name: str) -> str:
     return os.path.splitext(name)[1].lower()  # noqa: PTH122 - a Path for each name is slow
 
@@ -167,7 +138,7 @@ class RunFrames(Frames):
     def __init__(self, images: ImageNames, odometry: Path, bits: int) -> None:
         self._images, self._odometry, self._bits = images, odometry, bits
         # Errors in the odometry are raised here, before any work is done.
-        named = np.zeros(len(images), bool)
+        named = set()
         self.expected = 0
         for step in read_steps(odometry):
             self.expected += 1
@@ -175,8 +146,8 @@ class RunFrames(Frames):
                 found = images.place_of(step.prefix)
                 if found is not None:
                     images.checked(found)
-                    named[found] = True
-        self.left_out = int(np.count_nonzero(~named))
+                    named.add(found)
+        self.left_out = len(images) - len(named)
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         for step in read_steps(self._odometry):

@@ -1,7 +1,4 @@
-"""A run from the name of whatever holds its images.
-
-Readers of sources other than folders are imported on demand.
-"""
+"""A run from the name of whatever holds its images."""
 
 from __future__ import annotations
 
@@ -9,12 +6,10 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import ImageRun, Run, camera_in
 from detect.sources.image_files import (
     IMAGE_SUFFIXES,
     WILDCARDS,
@@ -23,10 +18,16 @@ from detect.sources.image_files import (
     bits_of_images,
     images_of_folder,
 )
-from detect.sources.interface import Frames
-
-if TYPE_CHECKING:
-    from detect.sources.interface import Source
+from detect.sources.interface import Frames, ImageRun, Run, Source, camera_in
+from detect.sources.poses import (
+    FirstFrames,
+    PoseStream,
+    frames_along_poses,
+    frames_along_rows,
+    tick_poses,
+    tum_poses,
+)
+from detect.sources.video import LiveCamera, VideoFile
 
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
@@ -111,8 +112,7 @@ def _own_odometry(folder: Path) -> Path | None:
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
-    from detect.sources.bag import BAG_SUFFIXES, Bag
-    from detect.sources.video import LiveCamera, VideoFile
+    from detect.sources.bag import BAG_SUFFIXES, Bag  # takes long, and most sources are no bags
 
     bits = options.bits or None
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
@@ -136,14 +136,6 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the odometry that was named, and the file of that."""
-    from detect.sources.poses import (
-        PoseStream,
-        frames_along_poses,
-        frames_along_rows,
-        tick_poses,
-        tum_poses,
-    )
-
     named = options.odometry
     poses: PoseStream | None
     if options.times and source.times_own:
@@ -177,8 +169,6 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
 def _shortened(run: ImageRun, count: int) -> ImageRun:
     if not count:
         return run
-    from detect.sources.poses import FirstFrames
-
     return replace(run, frames=FirstFrames(run.frames, count))
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.options import Axes
-from detect.sources.image_files import NameIndex, last_part
+from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source, text_rows
 from redetect.landmarks import Step, read_steps, wrap_angle
 
@@ -255,13 +255,13 @@ def frames_along_rows(source: Source, path: Path) -> FramesAlong:
     A row belongs to the image whose name is the last part of its prefix. Images without a row are
     no part of the run; rows without an image are frames that cannot be worked on.
     """
-    names = NameIndex(_encoded(_image_name(step)) for step in read_steps(path))
+    names = {_image_name(step) for step in read_steps(path)}
 
     def framed(images: Iterator[RunFrame]) -> Generator[RunFrame | None, None, None]:
         steps = read_steps(path)
         for image in images:
             prefix = image.step.prefix
-            if names.find(_encoded(prefix)) is None:
+            if prefix not in names:
                 yield None
                 continue
             for step in steps:
@@ -296,7 +296,3 @@ class FirstFrames(Frames):
 
 def _image_name(step: Step) -> str:
     return last_part(step.prefix.strip('"'))
-
-
-def _encoded(text: str) -> bytes:
-    return text.encode("utf-8", "surrogateescape")

@@ -19,14 +19,13 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
-from detect.sources.gray import gray_of_pixels
-from detect.sources.interface import RunFrame, Source, numbered_prefix, still
+from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 
 _log = logging.getLogger("redetect")
 
@@ -100,14 +99,6 @@ PATIENCE_S = 10.0
 _LOOK_S = 0.002
 
 
-class Capture(Protocol):
-    """The interface of an OpenCV capture that is used."""
-
-    def read(self) -> tuple[bool, NDArray[Any] | None]: ...
-
-    def release(self) -> None: ...
-
-
 class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
 
@@ -136,7 +127,7 @@ class LiveCamera(Source):
 class _Newest:
     """The newest image of a camera that a thread reads."""
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: cv2.VideoCapture) -> None:
         self._capture = capture
         self._image: deque[tuple[float, NDArray[Any]]] = deque(maxlen=1)
         self._ended = threading.Event()
@@ -193,7 +184,7 @@ def _stoppable() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _open_camera(index: int) -> Capture:
+def _open_camera(index: int) -> cv2.VideoCapture:
     with quiet_opencv():
         capture = cv2.VideoCapture(index)
     if not capture.isOpened():

@@ -16,4 +16,4 @@ its x axis' angle in the world, counter-clockwise; *cameras* and *markers* as in
 `landmarks`. A transform `a_from_b` takes points of frame b to frame a. Metres, radians, seconds.
 """
 
-from redetect.storage.version import __version__ as __version__
+from redetect.storage import __version__ as __version__

@@ -1,4 +1,4 @@
-"""Discs, verticals and tilt in one image."""
+"""Discs, verticals and tilt in one image, and why discs were found in it, or not."""
 
 from __future__ import annotations
 
@@ -14,15 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
+from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
+from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.line_settings import LineSettings
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, read_image, still
+from detect.viewing_options import CompareOptions
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
-from redetect.landmarks import CircleLandmark, Frame, FrameTilt, Step
+from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.slam.formats.text import MEANING, Axes, covariance_from_dataset, from_dataset
 
 FloatArray = NDArray[np.float64]
@@ -188,10 +192,6 @@ class Detection(Table):
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
-        from detect.drawing.frame import draw_rows
-        from detect.drawing.inputs import SeenRows
-        from detect.viewing_options import CompareOptions
-
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
         sight = Sight(self.camera, self.settings.radius_m)
         return draw_rows(self.image, sight, rows, self.settings, CompareOptions(), self.name)
@@ -210,12 +210,8 @@ class Detection(Table):
         return png_of(self.picture())
 
     def _repr_html_(self) -> str:
-        picture = base64.b64encode(self._repr_png_()).decode()
-        return (
-            f"<p>{html.escape(str(self))}</p>"
-            f'<img alt="{html.escape(self.name)}" src="data:image/png;base64,{picture}"/>'
-            + html_table(self.discs.columns())
-        )
+        words, picture = html.escape(str(self)), html_picture(self.picture(), self.name)
+        return f"<p>{words}</p>{picture}{html_table(self.discs.columns())}"
 
 
 def detect(
@@ -325,22 +321,20 @@ def grey_image(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def png_of(picture: NDArray[np.uint8]) -> bytes:
-    """A picture as a PNG file."""
-    import cv2
-
-    return cv2.imencode(".png", picture)[1].tobytes()
+def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
+    """A picture as HTML, its content in it."""
+    content = base64.b64encode(png_of(picture)).decode()
+    return f'<img alt="{html.escape(name)}" src="data:image/png;base64,{content}"/>'
 
 
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
-        return RunFrame(Step("image", *[0.0] * 9), None, content=grey_image(image))
+        return RunFrame(still("image"), None, content=grey_image(image))
     path = Path(image)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
-    # A prefix is one word.
-    return RunFrame(Step("_".join(path.stem.split()) or "image", *[0.0] * 9), path)
+    return RunFrame(still("_".join(path.stem.split()) or "image"), path)  # a prefix is one word
 
 
 def _detection(
@@ -351,12 +345,8 @@ def _detection(
     assert found.lines is not None
     lines, discs = found.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
-    rows = [
-        CircleLandmark(x, y, q, cxx, cxy, cyy, (-1,))
-        for (x, y), ((cxx, cxy), (_, cyy)), q in zip(
-            discs.floor_xy.tolist(), discs.covariance.tolist(), discs.quality.tolist()
-        )
-    ]
+    unknown = np.full(len(discs), -1)
+    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     return Detection(
         discs=Discs(
             u=pixels[:, 0],
@@ -403,3 +393,97 @@ def _as_row(tilt: Tilt | None, axes: Axes) -> FrameTilt | None:
 def _records(table: Table) -> list[dict[str, Any]]:
     columns = plain(table.columns())
     return [dict(zip(columns, values)) for values in zip(*columns.values())]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(Table):
+    """Candidates of an image with the stage and the number that dropped them, and what to try.
+
+    Attributes
+    ----------
+    candidates : tuple of detect.discs.unfound.Candidate
+        Those that were found first, then by falling quality.
+    place : str
+        Of the pixel that was pointed at; empty without one.
+    suggestions : tuple of str
+        Flags or settings to try, and what they would find.
+    """
+
+    candidates: tuple[Candidate, ...]
+    place: str
+    suggestions: tuple[str, ...]
+    image: NDArray[np.uint8]
+    camera: Camera
+    settings: CircleSettings
+    at: tuple[float, float] | None
+
+    def columns(self) -> dict[str, Any]:
+        """One row per candidate, numbered as in the picture."""
+        rows = self.candidates
+        fields = ("u", "v", "x_m", "y_m", "quality", "contrast", "stage", "value", "limit")
+        return {
+            "number": list(range(1, len(rows) + 1)),
+            **{name: [getattr(row, name) for row in rows] for name in fields},
+            "reason": [row.reason() for row in rows],
+        }
+
+    def to_json(self) -> str:
+        """An object with `candidates` (a list of records), `place` and `suggestions`."""
+        return DiscExplanation(self.candidates, self.place, self.suggestions).to_json()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
+        return draw_disc_candidates(
+            self.image, self.camera, self.settings.radius_m, self.candidates, self.at
+        )
+
+    def __str__(self) -> str:
+        lines = [self.place] if self.place else []
+        lines += [
+            f"{number:3d}  ({row.u:.0f}, {row.v:.0f})  {row.reason()}"
+            for number, row in enumerate(self.candidates, start=1)
+        ]
+        return "\n".join([*lines, *self.suggestions])
+
+    def _repr_png_(self) -> bytes:
+        return png_of(self.picture())
+
+    def _repr_html_(self) -> str:
+        words = "".join(f"<p>{html.escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
+        return f"{words}{html_picture(self.picture())}{super()._repr_html_()}"
+
+
+def explain(
+    image: ImageLike,
+    camera: CameraLike,
+    at: tuple[float, float] | None = None,
+    radius_m: float | None = None,
+    polarity: Polarity | None = None,
+    *,
+    settings: CircleSettings | None = None,
+) -> Explanation:
+    """Explain what became of the candidates for discs in an image.
+
+    Parameters
+    ----------
+    image, camera, radius_m, polarity, settings
+        As of `redetect.interface.detection.detect`.
+    at : (float, float), optional
+        Pixel (u, v) of something that should have been found.
+
+    Returns
+    -------
+    Explanation
+
+    Raises
+    ------
+    detect.errors.FrameError
+        If the image cannot be read, is no grey image of 8 bits, or not of the camera's size.
+    camera.CameraError
+        If the calibration cannot be read.
+    """
+    frame, camera = frame_of_image(image), camera_of(camera)
+    chosen = settings_of(settings, radius_m, polarity)
+    pixels = read_image(frame, camera)
+    found = explain_discs(pixels, camera, chosen, at)
+    return Explanation(found.candidates, found.place, found.suggestions, pixels, camera, chosen, at)

@@ -20,10 +20,9 @@ from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.options import SourceOptions
-from detect.run import Run, read_image
 from detect.seen import Sight
 from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import RunFrame
+from detect.sources.interface import Run, RunFrame, read_image
 from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
@@ -39,7 +38,7 @@ class RecordedFrame:
 
     Attributes
     ----------
-    frame : detect.run.RunFrame
+    frame : detect.sources.interface.RunFrame
         Its odometry step, and where its image comes from.
     camera : Camera
     """

@@ -7,4 +7,4 @@ frame at the start of the run. A pose is (x, y, theta). Metres, radians.
 >>> recording = read_recording("images/e", circles=True, lines=True)    # doctest: +SKIP
 """
 
-from redetect.storage.version import __version__ as __version__
+from redetect.storage import __version__ as __version__

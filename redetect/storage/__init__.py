@@ -1,7 +1,12 @@
 """Writes results to disk: completely or not at all, and never over a user's files.
 
-All packages write their files with `write_whole`.
+All packages write their files with `write_whole`, or `write_bytes` where the content is in memory.
 """
 
 from redetect.storage.parts import OutputExistsError as OutputExistsError
+from redetect.storage.parts import demand_place as demand_place
+from redetect.storage.parts import write_bytes as write_bytes
 from redetect.storage.parts import write_whole as write_whole
+
+#: The version of this project, defined only here.
+__version__ = "0.1.0"

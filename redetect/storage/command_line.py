@@ -19,8 +19,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Union, get_type_hints
 
+import tyro
+from tyro.conf import OmitArgPrefixes, Suppress, arg, subcommand
+
+from redetect.storage import __version__
 from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
-from redetect.storage.version import __version__
 
 #: The command could not be carried out.
 EXIT_ERROR = 1
@@ -153,9 +156,6 @@ class Program:
 
         `defaults` are commands whose values the flags of these commands start from.
         """
-        import tyro
-        from tyro.conf import arg, subcommand
-
         words = list(arguments)
         if words == ["--version"]:
             print(f"{self.name} {__version__}")
@@ -243,8 +243,6 @@ def _quietly() -> Iterator[None]:
 
 def flags_of(kind: type, prefix: str = "") -> Iterator[str]:
     """The flags of a dataclass as tyro names them."""
-    from tyro.conf import OmitArgPrefixes
-
     (omitted,) = OmitArgPrefixes[int].__metadata__  # type: ignore[attr-defined]
     hints = get_type_hints(kind, include_extras=True)
     for each in fields(kind):
@@ -263,8 +261,6 @@ def flags_of(kind: type, prefix: str = "") -> Iterator[str]:
 
 def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> tuple[type, int]:
     """A dataclass whose fields for experts are no flags, and how many these are."""
-    from tyro.conf import Suppress
-
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
     changed: list[tuple[str, Any, Any]] = []

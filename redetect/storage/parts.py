@@ -163,6 +163,12 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
         part.replace(path, overwrite=overwrite)
 
 
+def write_bytes(path: str | os.PathLike[str], content: bytes, *, overwrite: bool) -> None:
+    """Write a file, whole or not at all: `write_whole` of content that is in memory."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write(content)
+
+
 @contextmanager
 def folder_locked(folder: Path) -> Iterator[None]:
     """Lock a folder for the duration of a block; waits for other processes that hold the lock."""

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera.boards.board import Board
+from camera.boards.board import PAGES, Board
 from camera.boards.points import find_board
-from camera.boards.printing import PAGES
 from camera.cli import main
 
 POINT_M = 0.0254 / 72.0

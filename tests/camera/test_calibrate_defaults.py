@@ -13,7 +13,7 @@ import pytest
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.calibration.calibrate import BoardView, Calibration, aspect_of, calibrate_freely
-from camera.calibration.settings import CalibrationSettings
+from camera.calibration.model import CalibrationSettings
 from camera.cli import main
 from camera.uncertainty import covariance_of
 from tools.evaluation.boards import Rays, board_poses, rays_of, render_board

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.calibration.images import calibration_images, read_grey
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
-from redetect.storage.image_header import without_orientation
+from redetect.storage.bounded import without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6

@@ -16,5 +16,5 @@ def test_held_out_photographs_are_explained_as_well_as_by_opencv(
 ) -> None:
     found = compare(shared_data / "discs" / "dev", group, free_aspect=True)
     assert found.views >= 5
-    for split, error in found.ours.items():
-        assert error <= found.rational[split], split
+    for split, errors in found.errors.items():
+        assert errors["ours"] <= errors["rational"], split

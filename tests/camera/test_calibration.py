@@ -10,28 +10,29 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.boards.board import Board
-from camera.calibration.adjustment import Estimate, Points, adjust, project_estimate
+from camera.calibration.adjustment import Estimate, Points, adjust, circle_shifts, project_estimate
 from camera.calibration.calibrate import (
     BoardView,
     calibrate,
+    coverage_warnings,
     points_of,
+    warnings_of,
 )
-from camera.calibration.checks import coverage_warnings, warnings_of
-from camera.calibration.fit import circle_shifts
 from camera.calibration.model import (
     COUNT,
+    CalibrationSettings,
+    FreeLens,
     free_span,
     is_possible,
     project_points,
     rotation_of,
 )
-from camera.calibration.projection import (
+from camera.errors import CalibrationError
+from camera.uncertainty import (
     intrinsics_of,
     projection_sigma,
     with_intrinsics,
 )
-from camera.calibration.settings import CalibrationSettings, FreeLens
-from camera.errors import CalibrationError
 from tools.evaluation.boards import board_poses, projection_difference
 from tools.evaluation.calibration import monte_carlo
 

@@ -10,8 +10,7 @@ import pytest
 from camera.calibration import choice as calibration_choice
 from camera.calibration.adjustment import Adjusted, Estimate, Points
 from camera.calibration.choice import Candidate, Candidates, choose_lens
-from camera.calibration.model import COUNT, INTRINSICS
-from camera.calibration.settings import CalibrationSettings, FreeLens
+from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings, FreeLens
 
 COUNTED = 756
 START = Estimate(np.zeros(COUNT), np.zeros((0, 3, 3)), np.zeros((0, 3)))

@@ -8,10 +8,9 @@ import numpy as np
 
 from camera import Camera
 from camera.boards.board import Board
-from camera.calibration.adjustment import Estimate, Points
-from camera.calibration.fit import circle_shifts
+from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.floor import on_floor, place_on_floor
-from camera.calibration.projection import intrinsics_of
+from camera.uncertainty import intrinsics_of
 
 
 def test_circles_on_the_floor_are_seen_through_perspective(published_camera: Camera) -> None:

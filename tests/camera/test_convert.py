@@ -21,11 +21,17 @@ from camera.formats.colmap import (
     pycolmap_from_camera,
 )
 from camera.formats.conversion import convert_to_camera, convert_to_foreign
-from camera.formats.kalibr import format_kalibr, parse_kalibr
 from camera.formats.models import ForeignCamera
-from camera.formats.opencv import format_opencv, parse_opencv
-from camera.formats.plain_yaml import parse_yaml
-from camera.formats.ros import camera_from_message, format_ros, parse_ros
+from camera.formats.yaml_files import (
+    camera_from_message,
+    format_kalibr,
+    format_opencv,
+    format_ros,
+    parse_kalibr,
+    parse_opencv,
+    parse_ros,
+    parse_yaml,
+)
 from tools.evaluation.boards import projection_difference
 
 FloatArray = NDArray[np.float64]

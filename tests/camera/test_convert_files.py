@@ -13,14 +13,12 @@ from hypothesis import strategies as st
 
 from camera import Camera
 from camera.cli import main
-from camera.commands.convert import convert, format_of, format_of_text, parse, read_text
 from camera.errors import ConversionError
 from camera.formats.colmap import text_of_binary
+from camera.formats.command import convert, format_of, format_of_text, parse, read_text
 from camera.formats.conversion import convert_to_camera
-from camera.formats.kalibr import format_kalibr, parse_kalibr
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.plain_yaml import parse_yaml
-from camera.formats.ros import format_ros, parse_ros
+from camera.formats.yaml_files import format_kalibr, format_ros, parse_kalibr, parse_ros, parse_yaml
 from camera.options import Convert, Format
 
 RADTAN = ForeignCamera(

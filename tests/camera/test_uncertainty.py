@@ -12,14 +12,15 @@ from hypothesis import strategies as st
 from camera import Camera, CameraError
 from camera.calibration.floor import place_on_floor, placed_camera
 from camera.calibration.model import COUNT, rotation_of
-from camera.calibration.projection import intrinsics_of, with_intrinsics
 from camera.camfile import format_camera, parse_camera
 from camera.model import PARAMETERS
 from camera.uncertainty import (
     covariance_of,
     floor_by_parameters,
+    intrinsics_of,
     tilt_by_parameters,
     with_covariance,
+    with_intrinsics,
 )
 
 #: Steps that move pixels by some tenths: scales, centre, coefficients, position, rotation.

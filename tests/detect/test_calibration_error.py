@@ -12,8 +12,8 @@ import pytest
 from camera import Camera, read_camera, write_camera
 from camera.model import PARAMETERS
 from camera.uncertainty import exact, with_covariance
-from detect.calibration_error import common_covariance
 from detect.cli import main
+from detect.levelling import common_covariance
 from detect.seen import level_seen
 from detect.verticals.tilt import Verticals, consensus
 from redetect.landmarks import read_frames

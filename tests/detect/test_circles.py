@@ -27,7 +27,7 @@ from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table, ring
 from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor, mirrored_camera
-from tools.evaluation.accuracy import measure_accuracy
+from tools.evaluation.accuracy import Scene, measure_accuracy
 
 FloatArray = NDArray[np.float64]
 
@@ -464,9 +464,7 @@ def test_tilt_jacobian_is_how_positions_move(published_camera: Camera) -> None:
 
 @pytest.mark.long
 def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera: Camera) -> None:
-    result = measure_accuracy(
-        published_camera, DEFAULT, discs=400, light=220.0, dark=60.0, blur_px=0.7, noise=2.0, seed=4
-    )
+    result = measure_accuracy(published_camera, DEFAULT, Scene(), discs=400, seed=4)
     assert result.failed == 0
     assert result.rms_px <= 0.02
     assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5

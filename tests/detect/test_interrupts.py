@@ -14,8 +14,12 @@ import pytest
 
 from detect import cli
 from detect.cli import main
-from detect.interrupts import interrupts_deferred, interrupts_noted, raise_if_interrupted
-from detect.terminal import progress_bar
+from detect.terminal import (
+    interrupts_deferred,
+    interrupts_noted,
+    progress_bar,
+    raise_if_interrupted,
+)
 
 
 @pytest.mark.parametrize("other", [SystemError, ValueError, OSError])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.margins import blank_margins
+from detect.grey_values import blank_margins
 from detect.settings import CircleSettings
 from lut import build_disc_table
 from tests.detect.painted_floor import PaintedFloor

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 
 SHAPE = (288, 768)
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, CameraError
 from detect.errors import DetectError, FrameError
-from detect.run import read_image
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, read_image
 from detect.sources.opening import open_run
 from redetect.landmarks import LandmarkFileError, Step
 

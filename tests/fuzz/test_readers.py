@@ -36,7 +36,7 @@ def folder(reader: Reader, tmp_path: Path) -> Path:
 def test_what_fuzzing_begins_with_is_accepted(reader: Reader, folder: Path) -> None:
     for content in reader.all_seeds():
         path = folder / reader.file
-        path.write_bytes(reader.content_of(content))
+        path.write_bytes(reader.content(content))
         assert attempt(reader, path) is None
 
 
@@ -69,14 +69,14 @@ def test_damaged_files(reader: Reader, folder: Path) -> None:
     path = folder / reader.file
     chance = random.Random(f"damage of {reader.name}")
     seeds = reader.all_seeds()
-    path.write_bytes(reader.content_of(seeds[0]))
+    path.write_bytes(reader.content(seeds[0]))
     attempt(reader, path)  # what is imported and compiled is no memory for a file
     before = _memory("VmRSS")
     if _CLEAR.exists():
         _CLEAR.write_text("5")  # the peak is counted from here
     for _ in range(reader.files):
         content = damaged(chance.choice(seeds), reader.words, chance)
-        path.write_bytes(reader.content_of(content))
+        path.write_bytes(reader.content(content))
         attempt(reader, path)
     assert _memory("VmHWM") - before < _MOST_BYTES
 
@@ -109,7 +109,7 @@ def test_files_of_a_reader_s_own_words(reader: Reader, folder: Path) -> None:
     def read(pieces: list[tuple[bytes, bytes]]) -> None:
         path = folder / reader.file
         content = b"".join(word + between for word, between in pieces)
-        path.write_bytes(reader.content_of(content))
+        path.write_bytes(reader.content(content))
         attempt(reader, path)
 
     read()
@@ -176,7 +176,7 @@ def test_what_fuzzing_found_or_might(
 ) -> None:
     (reader,) = [reader for reader in READERS if reader.name == name]
     path = tmp_path / reader.file
-    path.write_bytes(reader.content_of(content))
+    path.write_bytes(reader.content(content))
     error = attempt(reader, path)
     assert (error is None) == (message is None)
     assert message is None or message in str(error)

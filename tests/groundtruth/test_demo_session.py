@@ -17,8 +17,8 @@ from tests.groundtruth.comparison import compare_streams
 @pytest.mark.long
 def test_the_demo_sessions_poses_are_true(project_root: Path, tmp_path: Path) -> None:
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
-    from detect.run import read_image
+    from detect.settings import MarkerSettings
+    from detect.sources.interface import read_image
     from detect.sources.opening import open_run
 
     session = tmp_path / "m"

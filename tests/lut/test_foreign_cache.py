@@ -8,19 +8,15 @@ import io
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import lut.cache
 from camera import Camera
-from lut import DiscShape, build_disc_table, build_vertical_table
+from lut import DiscShape, build_disc_table
 from lut.cache import (
     cached_disc_table,
-    cached_vertical_table,
-    disc_table_fits,
-    vertical_table_fits,
 )
 
 SHAPE = DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2)
@@ -37,13 +33,14 @@ def camera(published_camera: Camera) -> Camera:
 
 @pytest.fixture
 def poisoned(tmp_path: Path, camera: Camera) -> Path:
-    """A cache whose table is sound as far as hashes and ranges can tell, and wrong."""
+    """A cache whose table is sound as far as its hash can tell, and wrong."""
     folder = tmp_path / "cache"
     table = cached_disc_table(camera, SHAPE, folder)
     (path,) = folder.iterdir()
     # Its first sample is the image's first pixel.
-    wrong = dataclasses.replace(table, samples=changed(table.samples, 0, 0))
-    assert disc_table_fits(wrong, camera, SHAPE)
+    samples = table.samples.copy()
+    samples[0] = 0
+    wrong = dataclasses.replace(table, samples=samples)
     fields = {field.name: getattr(wrong, field.name) for field in dataclasses.fields(wrong)}
     buffer = io.BytesIO()
     np.savez(buffer, **fields)
@@ -124,63 +121,3 @@ def test_a_table_under_another_s_name(tmp_path: Path, camera: Camera) -> None:
     assert lut.cache._own_content(second) == stolen
     found = cached_disc_table(camera, other, tmp_path)
     np.testing.assert_array_equal(found.samples, build_disc_table(camera, other).samples)
-
-
-def changed(array: Any, index: Any, value: Any) -> Any:
-    copy = array.copy(order="K")
-    copy[index] = value
-    return copy
-
-
-DISC_DAMAGE: list[tuple[str, Callable[[Any], Any]]] = [
-    ("samples", lambda table: 6),
-    ("samples", lambda table: changed(table.samples, 0, 36 * 96 + 1)),
-    ("samples", lambda table: table.samples.astype(np.int32)),
-    ("samples", lambda table: table.samples[:-4].copy()),
-    ("samples", lambda table: table.samples[:, :, :1].copy()),
-    ("pixels", lambda table: changed(table.pixels, (0, 1), 36)),
-    ("pixels", lambda table: changed(table.pixels, (0, 1), -1)),
-    ("pixels", lambda table: table.pixels[:-1].copy()),
-    ("pixels", lambda table: changed(table.pixels, (0, 0), 96)),
-    ("pixels", lambda table: table.pixels.astype(np.int64)),
-    ("floor_xy", lambda table: table.floor_xy[:-1].copy()),
-]
-
-
-@pytest.mark.parametrize(("name", "damage"), DISC_DAMAGE)
-def test_impossible_disc_tables(camera: Camera, name: str, damage: Callable[[Any], Any]) -> None:
-    table = build_disc_table(camera, SHAPE)
-    assert disc_table_fits(table, camera, SHAPE)
-    changes: Any = {name: damage(table)}
-    assert not disc_table_fits(dataclasses.replace(table, **changes), camera, SHAPE)
-
-
-VERTICAL_DAMAGE: list[tuple[str, Callable[[Any], Any]]] = [
-    ("first_row", lambda table: changed(table.first_row, 48, -1)),
-    ("last_row", lambda table: changed(table.last_row, 48, 36)),
-    ("last_row", lambda table: changed(table.last_row, 48, table.last_row[48] - 1)),
-    ("column", lambda table: changed(table.column, (table.first_row[48], 48), 96.5)),
-    ("column", lambda table: changed(table.column, (table.first_row[48], 48), np.nan)),
-    ("column", lambda table: np.ascontiguousarray(table.column)),
-    ("column", lambda table: table.column[:-1]),
-    ("elevation_tan", lambda table: np.full_like(table.elevation_tan, np.nan)),
-    ("anchor_row", lambda table: changed(table.anchor_row, 48, 1e9)),
-    ("anchor_row", lambda table: changed(table.anchor_row, 48, np.inf)),
-    ("bearing_rad", lambda table: changed(table.bearing_rad, 48, np.nan)),
-    ("robot_from_camera", lambda table: -table.robot_from_camera),
-    ("row_aspect", lambda table: 1.0),
-]
-
-
-@pytest.mark.parametrize(("name", "damage"), VERTICAL_DAMAGE)
-def test_impossible_tables_of_verticals(
-    camera: Camera, name: str, damage: Callable[[Any], Any], tmp_path: Path
-) -> None:
-    table = cached_vertical_table(camera, tmp_path)
-    assert vertical_table_fits(table, camera)
-    assert table.usable[48]
-    changes: Any = {name: damage(table)}
-    assert not vertical_table_fits(dataclasses.replace(table, **changes), camera)
-    np.testing.assert_array_equal(
-        cached_vertical_table(camera, tmp_path).column, build_vertical_table(camera).column
-    )

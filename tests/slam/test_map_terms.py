@@ -6,6 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect.least_squares.covariance import inverse_blocks
@@ -138,3 +143,15 @@ def test_first_sight_places_each_disc_where_its_first_row_does() -> None:
     seen = np.unique(run.recording.circles.ids)
     np.testing.assert_allclose(start.disc_xy, run.disc_xy[seen - 1], atol=1e-9)
     np.testing.assert_allclose(start.poses, run.poses, atol=1e-9)
+
+
+@given(arrays(np.float64, 3, elements=st.floats(-1.5, 1.5)))
+def test_rotation_vectors_as_scipy_has_them(vector: NDArray[np.float64]) -> None:
+    rotation, left = rotation_exp(vector)
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+    for axis in 1e-6 * np.eye(3):
+        ahead, behind = (Rotation.from_rotvec(vector + s * axis).as_matrix() for s in (1, -1))
+        spin = (ahead - behind) / 2e-6 @ rotation.T
+        np.testing.assert_allclose(
+            [spin[2, 1], spin[0, 2], spin[1, 0]], left @ axis / 1e-6, rtol=1e-6, atol=1e-8
+        )

@@ -12,10 +12,10 @@ import pytest
 from camera import Camera, CameraError
 from camera.calibration.images import read_grey
 from detect.errors import FrameError
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, Checkerboard, find_boards
-from redetect.storage.image_header import MOST_PIXELS, claimed_size
+from redetect.storage.bounded import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
 CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import tyro
-from tyro.conf import OmitArgPrefixes
 
-from detect.run import Run
+from detect.sources.interface import Run
 from detect.sources.opening import open_run
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
+from tools.arrays import ByteArray
 from tools.benchmark import functions as f
 from tools.benchmark.material import (
     Picture,
     contents_of,
+    decode,
     disc_places,
     floor_with_discs,
     jpeg_picture,
@@ -36,7 +38,6 @@ from tools.benchmark.report import (
     Result,
     RunTime,
     Time,
-    format_json,
     format_markdown,
     plot_png,
     run_time,
@@ -44,6 +45,8 @@ from tools.benchmark.report import (
     times_of,
 )
 from tools.benchmark.timing import measure_in_turn
+from tools.evaluation.tables import write_json
+from tools.simulator.files import write_bytes
 
 #: Pictures of each point of the growth curves.
 _GROWTH_PICTURES = 2
@@ -52,8 +55,12 @@ _RUN_BUDGET_S = 15.0
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What decides how it is measured."""
+class Benchmark:
+    """Time the detectors, their parts and peers side by side, in one process.
+
+    Prints Markdown tables.
+    Example: python -m tools.benchmark --photographs ../shared/data/discs --plot /tmp/speed.png
+    """
 
     run: Path = Path("images/e")  # The demo run: camera, pictures, and whole passes.
     photographs: Path | None = None  # Folder with photographs; without it they are left out.
@@ -67,46 +74,34 @@ class Settings:
     frames: tuple[int, ...] = (80, 320, 1600, 6400)  # Lengths of the growing runs.
     jobs: tuple[int, ...] = (1, 2)  # Numbers of jobs, for the growing runs.
     seed: int = 0  # Of noise and places.
-
-
-@dataclass(frozen=True)
-class Benchmark:
-    """Time the detectors, their parts and peers side by side, in one process.
-
-    Prints Markdown tables.
-    Example: python -m tools.benchmark --photographs ../shared/data/discs --plot /tmp/speed.png
-    """
-
     json: Path | None = None  # Write everything as JSON.
     plot: Path | None = None  # Draw the ratios and the growth curves into a PNG.
     markdown: Path | None = None  # Write the tables as Markdown.
     force: bool = False  # Replace existing files.
-    settings: OmitArgPrefixes[Settings] = field(default_factory=Settings)
+
+    def __call__(self) -> int:
+        for path in (self.json, self.plot, self.markdown):
+            if path is not None and path.exists() and not self.force:
+                raise OutputExistsError(path)
+        result = benchmark(self)
+        text = format_markdown(result)
+        print(text)
+        if self.json is not None:
+            write_json(self.json, asdict(result), overwrite=self.force)
+        if self.plot is not None:
+            write_bytes(self.plot, plot_png(result), overwrite=self.force)
+        if self.markdown is not None:
+            write_bytes(self.markdown, text.encode(), overwrite=self.force)
+        return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(Benchmark, prog="python -m tools.benchmark", args=arguments)
-    return exit_code_of(lambda: _carry_out(command))
+    return exit_code_of(command)
 
 
-def _carry_out(command: Benchmark) -> int:
-    for path in (command.json, command.plot, command.markdown):
-        if path is not None and path.exists() and not command.force:
-            raise OutputExistsError(path)
-    result = benchmark(command.settings)
-    print(format_markdown(result))
-    files = {command.json: format_json(result).encode(),
-             command.markdown: format_markdown(result).encode(),
-             command.plot: b"" if command.plot is None else plot_png(result)}  # fmt: skip
-    for path, content in files.items():
-        if path is not None:
-            with write_whole(path, overwrite=command.force) as stream:
-                stream.write(content)
-    return 0
-
-
-def benchmark(settings: Settings) -> Result:
+def benchmark(settings: Benchmark) -> Result:
     """Measure everything.
 
     Raises
@@ -142,12 +137,13 @@ def benchmark(settings: Settings) -> Result:
         times += _timed("verticals", str(count), walls, detectors, settings)
     described = {
         key: str(value) if isinstance(value, Path) else value
-        for key, value in dataclasses.asdict(settings).items()
+        for key, value in vars(settings).items()
+        if key not in ("json", "plot", "markdown", "force")
     }
     return Result(this_machine(), described, tuple(times), tuple(_runs(run, settings)))
 
 
-def _kinds(run: Run, settings: Settings) -> Iterator[tuple[str, list[Picture]]]:
+def _kinds(run: Run, settings: Benchmark) -> Iterator[tuple[str, list[Picture]]]:
     """Name and pictures of each kind."""
     yield "demo", run_pictures(run, settings.pictures)
     yield "noise", noise_pictures(run.camera, settings.pictures, settings.seed)
@@ -161,16 +157,21 @@ def _timed(
     case: str,
     pictures: Sequence[Picture],
     functions: dict[str, f.Function],
-    settings: Settings,
+    settings: Benchmark,
 ) -> list[Time]:
     """Times of functions, in turn with decoding."""
     print(f"{part} {case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
-    bound = f.of_pictures({f.DECODING: f.decoding, **functions}, pictures)
+    decoding: dict[str, f.Function] = {f.DECODING: lambda picture: decode(picture.encoded)}
+
+    def of_pictures(function: f.Function) -> Callable[[int], object]:
+        return lambda number: function(pictures[number])
+
+    bound = {name: of_pictures(each) for name, each in {**decoding, **functions}.items()}
     seconds = measure_in_turn(bound, len(pictures), settings.rounds, settings.budget_s)
     return times_of(part, case, seconds, f.DECODING)
 
 
-def _runs(run: Run, settings: Settings) -> Iterator[RunTime]:
+def _runs(run: Run, settings: Benchmark) -> Iterator[RunTime]:
     """Whole runs: all commands once, and `detect all` over growing lengths and numbers of jobs."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -180,7 +181,7 @@ def _runs(run: Run, settings: Settings) -> Iterator[RunTime]:
         every = [(command, 1) for command in f.commands(whole, folder)]
         yield from measure_runs(whole, every, folder, settings.run_rounds)
         for frames in settings.frames:
-            growing = repeated_run(run, folder, frames)
+            growing = repeated_run(run, folder / f"frames{frames}", frames)
             by_jobs = [("detect all", jobs) for jobs in settings.jobs]
             yield from measure_runs(growing, by_jobs, folder, settings.run_rounds)
 
@@ -193,15 +194,18 @@ def measure_runs(
     paths = [frame.image for frame in open_run(run).frames if frame.image is not None]
     files = contents_of(paths)
 
-    def performing(command: f.Command) -> Callable[[int], object]:
-        return lambda _: f.perform(command)
+    def decode_all(contents: Iterable[ByteArray]) -> None:
+        for content in contents:
+            decode(content)
+
+    def perform(name: str, jobs: int, _: int) -> None:
+        f.perform(f.commands(run, folder, jobs)[name])
 
     functions: dict[str, Callable[[int], object]] = {
-        "decoding": lambda _: f.decode_files(files),
-        "reading": lambda _: f.read_and_decode_files(paths),
+        "decoding": lambda _: decode_all(files),
+        "reading": lambda _: decode_all(np.fromfile(path, np.uint8) for path in paths),
+        **{f"{name} {jobs}": partial(perform, name, jobs) for name, jobs in chosen},
     }
-    for name, jobs in chosen:
-        functions[f"{name} {jobs}"] = performing(f.commands(run, folder, jobs)[name])
     # By the clock on the wall, since jobs are processes of their own.
     seconds = measure_in_turn(
         functions, 1, rounds, _RUN_BUDGET_S, time.perf_counter, warm_up=False, least_calls=1

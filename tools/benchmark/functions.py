@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +13,16 @@ from camera import Camera
 from detect.circles import detect_circles, disc_shape
 from detect.cli import carry_out
 from detect.discs.quality import Limits, centres_of, quality_of_centres
+from detect.grey_values import estimate_noise
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
 from detect.lines import detect_lines
-from detect.noise import estimate_noise
 from detect.options import All, Circles, Lines
 from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
-from tools.arrays import ByteArray
-from tools.benchmark.material import BenchmarkError, Picture, decode
+from tools.benchmark.material import BenchmarkError, Picture
 
 #: What everything else is compared with.
 DECODING = "decoding"
@@ -36,11 +35,6 @@ _HOUGH_STEP_PX = 6
 
 Function = Callable[[Picture], object]
 Command = All | Circles | Lines
-
-
-def decoding(picture: Picture) -> object:
-    """Decode an image file's content, already in memory."""
-    return decode(picture.encoded)
 
 
 def whole_detectors(camera: Camera) -> dict[str, Function]:
@@ -114,25 +108,13 @@ def peers() -> dict[str, Function]:
     return found
 
 
-def of_pictures(
-    functions: Mapping[str, Function], pictures: Sequence[Picture]
-) -> dict[str, Callable[[int], object]]:
-    """The functions by name, taking a picture's number instead of the picture."""
-
-    def bound(function: Function) -> Callable[[int], object]:
-        return lambda number: function(pictures[number])
-
-    return {name: bound(function) for name, function in functions.items()}
-
-
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
     """The commands that are measured on a run, by name; their files go into a folder."""
-    circles = Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs)
     return {
         "detect circles --preset published": Circles(
             run=run, output=output / "published.circles", force=True, jobs=jobs, settings=PUBLISHED
         ),
-        "detect circles": circles,
+        "detect circles": Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs),
         "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),
         "detect all": All(run=run, output=output, force=True, jobs=jobs),
     }
@@ -152,16 +134,3 @@ def perform(command: Command) -> None:
     if code != 0:
         report = " ".join(said.getvalue().split())
         raise BenchmarkError(f"detect ended with {code}: expected 0: {report}")
-
-
-def decode_files(files: Sequence[ByteArray]) -> None:
-    """Decode all of a run's files, already in memory."""
-    for content in files:
-        decode(content)
-
-
-def read_and_decode_files(paths: Sequence[Path]) -> None:
-    """Read and decode all of a run's files."""
-    for path in paths:
-        with path.open("rb", buffering=0) as stream:
-            decode(np.frombuffer(stream.readall(), np.uint8))

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera, write_camera
-from detect.run import Run
+from detect.sources.interface import Run
 from redetect.landmarks import Frame, write_frames
 from tools.arrays import ByteArray, FloatArray
+from tools.simulator.markers.things import photograph_files
 from tools.simulator.single_disc import render_disc
 
 
@@ -25,7 +26,6 @@ _JPEG_QUALITY = 90
 
 #: A long run has so many files of its own: more than a processor's caches hold.
 _MOST_COPIES = 1600
-_PHOTOGRAPHS = frozenset({".jpg", ".jpeg", ".png"})
 
 #: Noise that scaled images get (grey levels): enlarged ones have none of their own.
 _SENSOR_NOISE = 2.0
@@ -77,12 +77,9 @@ def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Pictur
     """Photographs found anywhere below a folder, scaled to the camera's size."""
     import cv2
 
-    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTOGRAPHS)
-    if not found:
-        raise BenchmarkError(f"{folder}: no images in it or below: expected photographs")
     pictures = []
-    for path in _spread_out(found, count):
-        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    for path in _spread_out(list(photograph_files(folder)), count):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if grey is None:
             raise BenchmarkError(f"{path}: cannot be decoded: expected an image")
         scaled = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
@@ -118,27 +115,29 @@ def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
     return jpeg_picture(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
 
 
-def repeated_run(run: Run, folder: Path, frames: int) -> Path:
-    """A run folder of any number of frames: those of a run over and over."""
+def repeated_run(run: Run, folder: Path, frames: int, most_copies: int | None = None) -> Path:
+    """A run folder of any number of frames: those of a run over and over.
+
+    So many images at most (by default `_MOST_COPIES`, and those of the run at least) are copies,
+    the others are further names of these.
+    """
     sources = [(frame.image, frame.step) for frame in run.frames if frame.image is not None]
     if not sources:
         raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
-    target = folder / f"frames{frames}"
-    (target / "images").mkdir(parents=True)
-    write_camera(run.camera, target / f"{target.name}.cam")
-    steps = []
-    copies: list[Path] = []
+    (folder / "images").mkdir(parents=True)
+    write_camera(run.camera, folder / f"{folder.name}.cam")
+    count = max(_MOST_COPIES if most_copies is None else most_copies, len(sources))
+    steps, images = [], []
     for number in range(frames):
         source, step = sources[number % len(sources)]
-        image = target / "images" / f"e.{number:06d}{source.suffix}"
-        if number < max(_MOST_COPIES, len(sources)):
-            shutil.copyfile(source, image)
-            copies.append(image)
+        images.append(folder / "images" / f"e.{number:07d}{source.suffix}")
+        if number < count:
+            shutil.copyfile(source, images[-1])
         else:
-            os.link(copies[number % len(copies)], image)
-        steps.append(Frame(replace(step, prefix=f"e.{number:06d}")))
-    write_frames(target / f"{target.name}.txt", steps)
-    return target
+            os.link(images[number % count], images[-1])
+        steps.append(Frame(replace(step, prefix=images[-1].stem)))
+    write_frames(folder / f"{folder.name}.txt", steps)
+    return folder
 
 
 def _spread_out(paths: list[Path], count: int) -> list[Path]:

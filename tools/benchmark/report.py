@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
 import platform
 from collections.abc import Sequence
@@ -92,11 +90,6 @@ def cpu_model(cpuinfo: str) -> str:
     """The processor's name in the text of ``/proc/cpuinfo``; empty if it is not there."""
     rows = (line.partition(":") for line in cpuinfo.splitlines())
     return next((value.strip() for key, _, value in rows if key.strip() == "model name"), "")
-
-
-def format_json(result: Result) -> str:
-    """The result as JSON, ending with a line end."""
-    return json.dumps(dataclasses.asdict(result), indent=1) + "\n"
 
 
 _PARTS = {

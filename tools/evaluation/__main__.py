@@ -41,7 +41,7 @@ STUDIES = {
     "tilt": "detection.Tilt",
     "tilt-of-discs": "tilt_of_discs.TiltOfDiscs",
     "train-rim-network": "rim_network_training.TrainRimNetwork",
-    "tutorial-photographs": "tutorial.TutorialPhotographs",
+    "tutorial-photographs": "boards.TutorialPhotographs",
 }
 
 

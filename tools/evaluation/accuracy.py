@@ -15,9 +15,10 @@ import numpy as np
 from camera import Camera, read_camera
 from detect.circles import disc_shape, refined_covariance
 from detect.discs.fit import blur_ratio_of, fit_discs
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
-from lut import DiscTable, cached_disc_table
+from lut import cached_disc_table
+from redetect.landmarks import squared_mahalanobis
 from tools.arrays import ByteArray, FloatArray
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
@@ -42,16 +43,18 @@ class Accuracy:
         return float(np.sqrt(np.mean(self.error_px**2)))
 
 
+@dataclass(frozen=True)
+class Scene:
+    """A light disc on a floor, as the camera takes it."""
+
+    light: float = 220.0  # Grey value of the discs.
+    dark: float = 60.0  # Grey value of the floor.
+    blur_px: float = 0.7  # Standard deviation of the optics' blur along u.
+    noise: float = 2.0  # Standard deviation of the noise, grey levels.
+
+
 def measure_accuracy(
-    camera: Camera,
-    settings: CircleSettings,
-    *,
-    discs: int,
-    light: float,
-    dark: float,
-    blur_px: float,
-    noise: float,
-    seed: int,
+    camera: Camera, settings: CircleSettings, scene: Scene, *, discs: int, seed: int
 ) -> Accuracy:
     """Render and fit discs."""
     table = cached_disc_table(camera, disc_shape(replace(settings, rows_apart=0.0)))
@@ -60,52 +63,35 @@ def measure_accuracy(
     distance, error, normalised = [], [], []
     failed = 0
     for index in rng.integers(len(rows), size=discs):
-        pixel = np.array([columns[index], rows[index]]) + rng.uniform(-0.5, 0.5, 2)
-        true_xy = camera.floor_from_pixel(pixel)
-        image = _render(camera, table, true_xy, settings, light, dark, blur_px, noise, rng)
-        nearest = np.array([[columns[index], rows[index]]], np.int64)
+        nearest = np.array([columns[index], rows[index]], np.int64)
+        true_xy = camera.floor_from_pixel(nearest + rng.uniform(-0.5, 0.5, 2))
+        image = _render(camera, scene, true_xy, settings.radius_m, rng)
         fit = fit_discs(
-            image,
-            table.floor_xy,
-            nearest,
-            settings.radius_m,
-            estimate_noise(image),
+            image, table.floor_xy, nearest[None], settings.radius_m, estimate_noise(image),
             blur_ratio=blur_ratio_of(camera),
-        )
+        )  # fmt: skip
         if not fit.fitted[0]:
             failed += 1
             continue
         covariance = refined_covariance(camera, fit.floor_xy, fit.covariance, settings)[0]
-        off = fit.floor_xy[0] - true_xy
         distance.append(float(np.hypot(*true_xy)))
         error.append(camera.project_floor(fit.floor_xy[0]) - camera.project_floor(true_xy))
-        normalised.append(float(off @ np.linalg.solve(covariance, off)) / 2.0)
+        normalised.append(squared_mahalanobis(fit.floor_xy[0] - true_xy, covariance) / 2.0)
     return Accuracy(np.array(distance), np.array(error), np.array(normalised), failed)
 
 
 def _render(
-    camera: Camera,
-    table: DiscTable,
-    true_xy: FloatArray,
-    settings: CircleSettings,
-    light: float,
-    dark: float,
-    blur_px: float,
-    noise: float,
-    rng: np.random.Generator,
+    camera: Camera, scene: Scene, true_xy: FloatArray, radius_m: float, rng: np.random.Generator
 ) -> ByteArray:
     """An image of the bare floor with one disc on it."""
-    height, width = table.usable.shape
-    floor = dark + rng.normal(0.0, noise, (height, width))
+    floor = scene.dark + rng.normal(0.0, scene.noise, (camera.height, camera.width))
     image = np.clip(np.rint(floor), 0, 255).astype(np.uint8)
-    blur = (blur_px, blur_px * camera.scale_y / camera.scale_x)
-    crop = render_disc(camera, true_xy, settings.radius_m, light, dark, blur, noise, rng=rng)
-    top, left = max(crop.v0, 0), max(crop.u0, 0)
-    bottom = min(crop.v0 + crop.grey.shape[0], height)
-    right = min(crop.u0 + crop.grey.shape[1], width)
-    image[top:bottom, left:right] = crop.grey[
-        top - crop.v0 : bottom - crop.v0, left - crop.u0 : right - crop.u0
-    ]
+    blur = (scene.blur_px, scene.blur_px * camera.scale_y / camera.scale_x)
+    crop = render_disc(
+        camera, true_xy, radius_m, scene.light, scene.dark, blur, scene.noise, rng=rng
+    )
+    height, width = crop.grey.shape
+    image[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width] = crop.grey
     return image
 
 
@@ -115,9 +101,6 @@ class AccuracyStudy:
 
     camera: Path = Path("images/e/e.cam")  # Calibration to render and fit through.
     discs: int = 400  # Discs per blur.
-    light: float = 220.0  # Grey value of the discs.
-    dark: float = 60.0  # Grey value of the floor.
-    noise: float = 2.0  # Standard deviation of the noise, grey levels.
     seed: int = 1  # Of places and noise.
 
     def __call__(self) -> int:
@@ -127,10 +110,8 @@ class AccuracyStudy:
              "rms v px": "9.4f", "normalised error^2 / dof": ".3f"}
         )  # fmt: skip
         for blur_px in _BLURS_PX:
-            result = measure_accuracy(
-                camera, CircleSettings(tilt_sigma_deg=0.0), discs=self.discs, light=self.light,
-                dark=self.dark, blur_px=blur_px, noise=self.noise, seed=self.seed,
-            )  # fmt: skip
+            settings, scene = CircleSettings(tilt_sigma_deg=0.0), Scene(blur_px=blur_px)
+            result = measure_accuracy(camera, settings, scene, discs=self.discs, seed=self.seed)
             bins = [(f"{low:.1f}-{high:.1f}", low, high) for low, high in _BINS_M]
             for label, low, high in [*bins, ("all", 0.0, np.inf)]:
                 chosen = (result.distance_m >= low) & (result.distance_m < high)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, associate_run
@@ -15,7 +15,7 @@ from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import read_recording
-from tools.evaluation.tables import Table, write_json
+from tools.evaluation.tables import Table
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,8 @@ class Association:
     """Added noise as a factor on the rows' own standard deviations."""
     sigma_scale: float = 1.4  # Factor on the discs' standard deviations in all gates.
     seed: int = 1  # Of the noise.
-    output: Annotated[Path | None, arg(aliases=["-o"])] = None  # Write all numbers there as JSON.
-    force: bool = False  # Replace an existing file.
 
     def __call__(self) -> int:
-        results: list[dict[str, Any]] = []
         table = Table(
             {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
              "precision": ".4f", "recall": ".4f", "rows right": ".4f", "landmarks": "d",
@@ -66,12 +63,4 @@ class Association:
                             s.right_rows, s.found_landmarks, s.true_landmarks, s.wrong_merges,
                             s.splits, seconds,
                         )  # fmt: skip
-                        results.append(
-                            {"run": name, "noise": factor, "method": method, "kind": kind,
-                             "level": level, **asdict(s), "seconds": seconds,
-                             "loop_matches": len(found.matches),
-                             "incomplete_frames": found.incomplete_frames}
-                        )  # fmt: skip
-        if self.output is not None:
-            write_json(self.output, results, overwrite=self.force)
         return 0

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from tyro.conf import Positional
 
-from camera import Camera
+from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.calibration.model import cross_matrices, project_points, rotation_of
-from camera.calibration.projection import intrinsics_of, pixel_grid
+from camera.uncertainty import intrinsics_of, pixel_grid
+from redetect.storage import OutputExistsError
 from tools.arrays import ByteArray, FloatArray, IntArray
 
+#: Standard deviations of a board's turns about its axes.
+_TILTS_RAD = np.array([0.45, 0.45, 0.3])
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
 # Dots of a ChArUco board's print per square.
 _DOTS = 120
@@ -108,7 +113,6 @@ def board_poses(
     seed: int,
     *,
     distances_m: tuple[float, float],
-    tilt_rad: float = 0.45,
     margin_px: float = 8.0,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Poses `camera_from_board` in which all of a board is seen, spread over the image.
@@ -133,7 +137,7 @@ def board_poses(
             * np.array([-direction[1], direction[0], 0.0])
             / max(np.hypot(*direction[:2]), 1e-12)
         )
-        tilt = rotation_of(rng.normal(size=3) * np.array([tilt_rad, tilt_rad, 0.3]))
+        tilt = rotation_of(rng.normal(size=3) * _TILTS_RAD)
         rotation = towards @ tilt @ facing
         translation = distance * direction
         if rotation[:, 2] @ translation >= 0.0:
@@ -156,14 +160,12 @@ def _corner_distance(pixels: FloatArray, size: IntArray) -> float:
     return float(away.min())
 
 
-def projection_difference(
-    camera: Camera, other: Camera, *, rotate: bool = True, columns: int = 49, rows: int = 37
-) -> FloatArray:
-    """How far apart two cameras project the same directions, (rows, columns) pixels.
+def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True) -> FloatArray:
+    """How far apart two cameras project the same directions, (37, 49) pixels over the image.
 
     NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
     """
-    pixels = pixel_grid(camera.width, camera.height, columns, rows)
+    pixels = pixel_grid(camera.width, camera.height, 49, 37)
     rays = camera.unproject(pixels)
     rotation = np.eye(3)
     intrinsics = intrinsics_of(other)
@@ -178,4 +180,47 @@ def projection_difference(
         if np.abs(step).max() < 1e-12:
             break
     found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
-    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(rows, columns))
+    return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(37, 49))
+
+
+#: The board in the hand, and the one that lies on the floor: squares of 4 cm and 12 cm.
+IN_HAND = Board("checkerboard", 9, 6, 0.04)
+ON_FLOOR = Board("checkerboard", 9, 6, 0.12)
+#: Where the middle of the latter lies: X (left) and Y (backward) of the robot, metres.
+FLOOR_ORIGIN = (0.0, -1.3)
+
+
+@dataclass(frozen=True)
+class TutorialPhotographs:
+    """Render the tutorial's photographs through the demo run's camera, so that truth is known."""
+
+    output: Positional[Path]  # Folder for `boards/*.png` and `floor.png`.
+    camera: Path = Path("images/e/e.cam")  # The camera that takes them.
+    count: int = 14  # Photographs of the board in the hand.
+    seed: int = 3  # Of the board's places, and the noise.
+
+    def __call__(self) -> int:
+        import cv2
+
+        camera = read_camera(self.camera)
+        boards = self.output / "boards"
+        if boards.exists():
+            raise OutputExistsError(boards)
+        boards.mkdir(parents=True)
+        rays = rays_of(camera, 3)
+        poses = board_poses(camera, IN_HAND, self.count, self.seed, distances_m=(0.25, 0.5))
+        for number, (rotation, translation) in enumerate(poses):
+            image = render_board(rays, IN_HAND, rotation, translation, seed=self.seed + number)
+            cv2.imwrite(str(boards / f"{number:02}.png"), image)
+        # It lies like a page before somebody who looks ahead: x to the right, which is -X; z up.
+        robot_from_board = np.diag([-1.0, -1.0, 1.0])
+        robot_from_camera = np.asarray(camera.robot_from_camera)
+        camera_from_robot = robot_from_camera[:, :3].T
+        origin = np.array([*FLOOR_ORIGIN, 0.0]) - robot_from_camera[:, 3]
+        image = render_board(
+            rays, ON_FLOOR, camera_from_robot @ robot_from_board, camera_from_robot @ origin
+        )
+        cv2.imwrite(str(self.output / "floor.png"), image)
+        print(f"{boards}: {self.count} photographs of a board")
+        print(f"{self.output / 'floor.png'}: it lies {-FLOOR_ORIGIN[1]:g} m ahead")
+        return 0

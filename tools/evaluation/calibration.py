@@ -12,23 +12,21 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.boards.points import circle_centroids, find_board
-from camera.calibration.adjustment import Estimate, Points
+from camera.calibration.adjustment import Estimate, Points, circle_shifts, fit_points
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
-from camera.calibration.fit import circle_shifts, fit_points
 from camera.calibration.images import read_grey
-from camera.calibration.model import INTRINSICS
-from camera.calibration.projection import (
+from camera.calibration.model import INTRINSICS, CalibrationSettings, FreeLens
+from camera.errors import CalibrationError
+from camera.formats.command import MODELS
+from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
+from camera.formats.models import ForeignCamera, Model
+from camera.uncertainty import (
     intrinsics_of,
     pixel_grid,
     projection_sigma,
     with_intrinsics,
 )
-from camera.calibration.settings import CalibrationSettings, FreeLens
-from camera.commands.convert import MODELS
-from camera.errors import CalibrationError
-from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
-from camera.formats.models import ForeignCamera, Model
 from tools.arrays import FloatArray, IntArray
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.tables import Table
@@ -75,9 +73,7 @@ def calibrate_rendered(
     settings = CalibrationSettings(aspect=camera.scale_y / camera.scale_x)
     calibration = calibrate(seen, board, size, settings)
     points = points_of(seen, board, size)
-    truth = Estimate(
-        intrinsics_of(camera), np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
-    )
+    truth = Estimate(intrinsics_of(camera), *map(np.stack, zip(*poses)))
     expected = np.concatenate(
         [camera.project(board.points[v.indices] @ R.T + t) for v, (R, t) in zip(seen, poses)]
     )
@@ -117,9 +113,7 @@ def monte_carlo(
 ) -> Trials:
     """Calibrate again and again from the same poses with new noise."""
     poses = board_poses(camera, board, views, seed, distances_m=distances_m)
-    truth = Estimate(
-        intrinsics_of(camera), np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
-    )
+    truth = Estimate(intrinsics_of(camera), *map(np.stack, zip(*poses)))
     rng = np.random.default_rng(seed + 1)
     count = max(round(seen * len(board.points)), 6)
     chosen = np.stack([np.sort(rng.choice(len(board.points), count, replace=False)) for _ in poses])
@@ -159,19 +153,16 @@ DISC_RADIUS_M = 0.1
 
 
 class FixedBoard(Board):
-    """A board whose points are what was measured: places by their number, not a regular print."""
+    """Discs at places that were measured: all of all photographs, one after the other."""
+
+    def __init__(self, places: FloatArray) -> None:
+        super().__init__("circles", 3, 3, 1.0, circle_m=2.0 * DISC_RADIUS_M)
+        object.__setattr__(self, "places", places)
 
     @property
     def points(self) -> FloatArray:
-        """(N, 3) all discs of all photographs, one after the other."""
-        return np.asarray(self.__dict__["_places"])
-
-
-def fixed_board(places: FloatArray) -> Board:
-    """A board of discs at given places, (N, 3) in metres."""
-    board = FixedBoard("circles", 3, 3, 1.0, circle_m=2.0 * DISC_RADIUS_M)
-    board.__dict__["_places"] = places
-    return board
+        """(N, 3) in metres."""
+        return np.asarray(vars(self)["places"])
 
 
 def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[int, int]]:
@@ -196,7 +187,7 @@ def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[
         offset += len(uv)
     if not views:
         raise CalibrationError(f"{folder}: no photographs there, expected {group}_*/truth.json")
-    return views, fixed_board(np.concatenate(places)), size
+    return views, FixedBoard(np.concatenate(places)), size
 
 
 def splits(views: int) -> dict[str, list[IntArray]]:
@@ -243,40 +234,32 @@ class Comparison:
     views: int  # Photographs; points in all of them.
     points: int
     lens: FreeLens  # Coefficients that are free here.
-    ours: dict[str, float]
-    """By split: this project; OpenCV's rational model (k1 to k6, p1, p2), the
-    same without p1 and p2, and its k1 k2 p1 p2 k3."""
-    rational: dict[str, float]
-    radial: dict[str, float]
-    five: dict[str, float]
+    errors: dict[str, dict[str, float]]
+    """By split: of this project (`ours`); of OpenCV's rational model (k1 to k6, p1, p2), the same
+    without p1 and p2 (`radial`), and its k1 k2 p1 p2 k3 (`five`)."""
 
 
 def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = False) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`."""
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
-        aspect=None if free_aspect else 1.0,
-        polynomial=True if polynomial else None,
-        robust=False,
+        aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
         keep_outliers=True,
-    )
+    )  # fmt: skip
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
     points, lens = result.points, result.lens
     estimate = result.adjusted.estimate
-    ways = splits(len(points.starts))
-    return Comparison(
-        views=len(points.starts),
-        points=len(points.board),
-        lens=lens,
-        ours={name: holdout_error(estimate, points, settings, lens, w) for name, w in ways.items()},
-        rational={name: opencv_holdout(points, w, rational=True) for name, w in ways.items()},
-        radial={
-            name: opencv_holdout(points, w, rational=True, tangential=False)
-            for name, w in ways.items()
-        },
-        five={name: opencv_holdout(points, w, rational=False) for name, w in ways.items()},
-    )
+    errors = {
+        name: {
+            "ours": holdout_error(estimate, points, settings, lens, folds),
+            "rational": opencv_holdout(points, folds, rational=True),
+            "radial": opencv_holdout(points, folds, rational=True, tangential=False),
+            "five": opencv_holdout(points, folds, rational=False),
+        }
+        for name, folds in splits(len(points.starts)).items()
+    }
+    return Comparison(len(points.starts), len(points.board), lens, errors)
 
 
 def _square(*distortion: float) -> ForeignCamera:
@@ -410,9 +393,8 @@ class CameraPhotographs:
             r = compare(
                 self.folder, group, free_aspect=self.free_aspect, polynomial=self.polynomial
             )
-            for name in r.ours:
-                found = (getattr(r, way)[name] for way in errors)
-                table.row(group, r.views, r.points, name, *found, str(r.lens))
+            for name, found in r.errors.items():
+                table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
         return 0
 
 

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import FilterRun, run_filter
@@ -161,13 +162,10 @@ class Consistency:
         return float(np.mean(self.mean))
 
 
-def band(runs: int, numbers: int = POSE_NUMBERS, probability: float = 0.95) -> tuple[float, float]:
-    """Where the mean of `runs` normalised errors squared of `numbers` numbers lies."""
-    from scipy.special import chdtri
-
-    outside = 0.5 * (1.0 - probability)
-    freedom = runs * numbers
-    return (float(chdtri(freedom, 1.0 - outside)) / runs, float(chdtri(freedom, outside)) / runs)
+def band(runs: int) -> tuple[float, float]:
+    """Where 95 % of the means of `runs` normalised errors squared of poses lie."""
+    low, high = chi2.interval(0.95, POSE_NUMBERS * runs)
+    return float(low) / runs, float(high) / runs
 
 
 def normalised_errors(run: FilterRun, truth: FloatArray) -> tuple[FloatArray, float]:
@@ -177,8 +175,8 @@ def normalised_errors(run: FilterRun, truth: FloatArray) -> tuple[FloatArray, fl
     assert run.path.covariance is not None
     error = run.path.poses[1:] - truth[1:]
     error[:, 2] = wrap_angle(error[:, 2])
-    solved = np.linalg.solve(run.path.covariance[1:], error[..., None])[..., 0]
-    return np.sum(error * solved, axis=1), float(np.max(np.abs(error[:, 2])))
+    squared = squared_mahalanobis(error, run.path.covariance[1:])
+    return squared, float(np.max(np.abs(error[:, 2])))
 
 
 def assess(
@@ -196,23 +194,17 @@ def assess(
 
 def localized(sigma_m: float, map_errors: MapErrors) -> Callable[[SimulatedRun, int], FilterRun]:
     """Localisation in the true map, or in one with errors of a standard deviation."""
-
-    def estimate(run: SimulatedRun, seed: int) -> FilterRun:
-        some_map = true_map(run, sigma_m, seed + 1_000_000)
-        localizer = Localizer(some_map, camera_xy=CAMERA_XY, map_errors=map_errors)
-        return run_filter(run.recording, localizer)
-
-    return estimate
+    return lambda run, seed: run_filter(
+        run.recording,
+        Localizer(
+            true_map(run, sigma_m, seed + 1_000_000), camera_xy=CAMERA_XY, map_errors=map_errors
+        ),
+    )
 
 
 def mapped(jacobians: JacobiansAt) -> Callable[[SimulatedRun, int], FilterRun]:
     """EKF-SLAM."""
-
-    def estimate(run: SimulatedRun, seed: int) -> FilterRun:
-        ekf = EkfSlam(camera_xy=CAMERA_XY, jacobians=jacobians)
-        return run_ekf(run.recording, ekf)
-
-    return estimate
+    return lambda run, _: run_ekf(run.recording, EkfSlam(camera_xy=CAMERA_XY, jacobians=jacobians))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from detect.runs.stream import detect_run
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from detect.viewing_options import CompareOptions
-from redetect.landmarks import FrameTilt, read_tilts
+from redetect.landmarks import FrameTilt, read_tilts, squared_mahalanobis
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
@@ -50,6 +50,16 @@ def _score(script: Path, *arguments: object, folder: str | None = None) -> int:
     return subprocess.run(words, check=False, cwd=folder).returncode
 
 
+def _score_photographs(data: Path, kind: str, settings: Any) -> int:
+    """Detect one kind of landmarks in every folder below `data`/dev, and score the files."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = []
+        for run in sorted(path.parent for path in data.glob("dev/*/truth.json")):
+            files.append(Path(folder) / f"{run.name}.{kind}")
+            _detect(run, {kind: files[-1]}, **{kind: settings})
+        return _score(data / "evaluate.py", f"--{kind}", *files)
+
+
 @dataclass(frozen=True)
 class Photographs:
     """Detect the discs of every folder below DATA/dev and score them with DATA/evaluate.py."""
@@ -57,12 +67,7 @@ class Photographs:
     data: Positional[Path] = Path("../shared/data/discs")  # Folder with `evaluate.py` and `dev`.
 
     def __call__(self) -> int:
-        with tempfile.TemporaryDirectory() as folder:
-            files = []
-            for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
-                files.append(Path(folder) / f"{run.name}.circles")
-                _detect(run, {"circles": files[-1]}, circles=CircleSettings())
-            return _score(self.data / "evaluate.py", "--circles", *files)
+        return _score_photographs(self.data, "circles", CircleSettings())
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,7 @@ class Buildings:
     preset: Preset = "default"  # Of the line detector.
 
     def __call__(self) -> int:
-        with tempfile.TemporaryDirectory() as folder:
-            files = []
-            for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
-                files.append(Path(folder) / f"{run.name}.lines")
-                _detect_lines(run, LINE_PRESETS[self.preset], files[-1])
-            return _score(self.data / "evaluate.py", "--lines", *files)
+        return _score_photographs(self.data, "lines", LINE_PRESETS[self.preset])
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,10 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
     for frame in truth["frames"]:
         tilt = tilts.get(frame["prefix"])
         if tilt is not None and tilt.lines >= 5:
-            error = np.array([tilt.pitch, tilt.roll]) - np.array(frame["tilt"])
-            covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+            error = np.array([tilt.pitch, tilt.roll]) - frame["tilt"]
+            covariance = [[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]
             errors.append(np.degrees(error))
-            normalised.append(error @ np.linalg.solve(covariance, error) / 2.0)
+            normalised.append(squared_mahalanobis(error, covariance) / 2.0)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     print(
         f"tilt: {len(errors)} frames with 5 lines, rms error pitch {rms[0]:.3f} deg "

@@ -23,6 +23,7 @@ from lut import cached_disc_table
 from redetect.storage import write_whole
 from tools.arrays import ByteArray, FloatArray
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
+from tools.evaluation.tables import markdown_table
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -238,18 +239,17 @@ def _count(
 def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
     """Two tables in Markdown: what is found of disturbed discs, and what look-alikes give."""
     shares = sorted({share for _, share, _ in results if share > 0.0})
-    head = "".join(f" {100 * share:.0f} % |" for share in shares)
-    lines = [f"| family |{head}", "|---|" + "---|" * len(shares)]
     by_kind: dict[str, dict[float, Tally]] = {}
     for kind, share, tally in results:
         by_kind.setdefault(kind, {})[share] = tally
-    for kind in (*DISTURBANCES, BORDER):
-        cells = "".join(f" {_cell(by_kind[kind][share])} |" for share in shares)
-        lines.append(f"| {kind} |{cells}")
-    lines += ["", "| family | found, error, normalised |", "|---|---|"]
-    lines += [f"| {kind} | {_cell(by_kind[kind][0.0])} |" for kind in BLURRED]
-    lines += ["", "| look-alike | rows for each |", "|---|---|"]
-    lines += [f"| {kind} | {_digits(by_kind[kind][0.0].recall, 3)} |" for kind in LOOK_ALIKES]
+    lines = markdown_table(
+        ["family", *(f"{100 * share:.0f} %" for share in shares)],
+        ([kind, *(_cell(by_kind[kind][s]) for s in shares)] for kind in (*DISTURBANCES, BORDER)),
+    )
+    blurred = ((kind, _cell(by_kind[kind][0.0])) for kind in BLURRED)
+    lines += ["", *markdown_table(("family", "found, error, normalised"), blurred)]
+    others = ((kind, _digits(by_kind[kind][0.0].recall, 3)) for kind in LOOK_ALIKES)
+    lines += ["", *markdown_table(("look-alike", "rows for each"), others)]
     elsewhere = sum(tally.elsewhere for _, _, tally in results)
     scenes = sum(tally.shown for _, _, tally in results) / _PER_SCENE
     lines += ["", f"Rows elsewhere: {elsewhere} in some {scenes:.0f} images."]

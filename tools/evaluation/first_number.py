@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,9 +16,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from redetect.landmarks import read_frames
+from redetect.landmarks import read_frames, squared_mahalanobis
 from redetect.storage import write_whole
+from tools.evaluation.real_run import compare_rows, run_program
 from tools.evaluation.tables import markdown_table
+from tools.fuzz.bag_readers import Ros
 
 #: The table's place in a document, by comments.
 BEGIN, END = "<!-- first numbers -->", "<!-- end of first numbers -->"
@@ -68,22 +68,19 @@ def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]
         yield _compared("demo", f"`detect {command}`", demo, rows, reference)
 
     mine = folder / "mine"
-    _run("tools.evaluation", "tutorial-photographs", mine)
+    run_program("tools.evaluation", "tutorial-photographs", mine)
     boards = ("--half", *_BOARD, "--square-m", "0.04")
-    _run("camera", "calibrate", mine / "boards", *boards, "-o", mine / "lens.cam")
+    run_program("camera", "calibrate", mine / "boards", *boards, "-o", mine / "lens.cam")
     board = (*_BOARD, "--square-m", "0.12", "--floor-origin", "0", "-1.3", "--floor-yaw", "180")
-    _run("camera", "floor", mine / "lens.cam", mine / "floor.png", *board, "-o", mine / "my.cam")
+    run_program(
+        "camera", "floor", mine / "lens.cam", mine / "floor.png", *board, "-o", mine / "my.cam"
+    )
     drive = mine / "drive"
     shutil.copytree(demo / "images", drive)
     shutil.copy(mine / "my.cam", drive)
     rows = _detected("all", folder / "mine-all", drive, "--odometry", next(demo.glob("*.txt")))
-    yield _compared(
-        "own drive, own calibration",
-        "`camera calibrate`, `floor`, `detect all`",
-        drive,
-        rows,
-        reference,
-    )
+    commands = "`camera calibrate`, `floor`, `detect all`"
+    yield _compared("own drive, own calibration", commands, drive, rows, reference)
 
     bag = folder / "bag"
     bag.mkdir()
@@ -107,30 +104,16 @@ def first_numbers(demo: Path, data: Path, folder: Path) -> Iterator[FirstNumber]
 
 def write_bag(images: Path, place: Path) -> Path:
     """An MCAP file of the images of a folder, as ROS 2 writes them."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+    ros = Ros("mcap")
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    image, header, time = (
-        store.types[name]
-        for name in (
-            "sensor_msgs/msg/CompressedImage",
-            "std_msgs/msg/Header",
-            "builtin_interfaces/msg/Time",
-        )
-    )
-    with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        topic = bag.add_connection("/image", image.__msgtype__, typestore=store)
+    def recorded() -> Iterator[tuple[str, int, Any]]:
         for number, path in enumerate(sorted(images.iterdir())):
             nanoseconds = round(1e9 * (1.0 + number / _FRAMES_PER_SECOND))
-            stamp = time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-            message = image(
-                header=header(stamp=stamp, frame_id="camera"),
-                format="jpeg",
-                data=np.frombuffer(path.read_bytes(), np.uint8),
-            )
-            content = store.serialize_cdr(message, image.__msgtype__)
-            bag.write(topic, nanoseconds, content)
+            header, data = ros.header(nanoseconds), np.fromfile(path, np.uint8)
+            name = "sensor_msgs/msg/CompressedImage"
+            yield "/image", nanoseconds, ros.make(name, header=header, format="jpeg", data=data)
+
+    ros.write(place, recorded())
     return (place / f"{place.name}.mcap").rename(place.with_suffix(".mcap"))
 
 
@@ -160,10 +143,9 @@ def _photographs(runs: list[Path], folder: Path) -> FirstNumber:
         distance, nearest = KDTree(places).query([(row.px, row.py) for row in found])
         for row, apart, place in zip(found, distance, places[nearest]):
             if apart < 0.05:
-                covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
-                error = np.array([row.px, row.py]) - place
+                covariance = [[row.cxx, row.cxy], [row.cxy, row.cyy]]
                 errors.append(apart)
-                squared.append(float(error @ np.linalg.solve(covariance, error)) / 2.0)
+                squared.append(squared_mahalanobis(place - (row.px, row.py), covariance) / 2.0)
     return FirstNumber(
         f"{len(runs)} photographs of disc boards", "`detect circles`", len(errors), reference,
         float(np.median(errors)), float(np.mean(squared)),
@@ -174,14 +156,13 @@ def _detected(command: str, output: Path, *arguments: object) -> Path:
     """The file of discs of a command."""
     output.mkdir()
     rows = output / "detected.circles"
-    _run("detect", command, *arguments, "--output", rows if command == "circles" else output)
+    target = rows if command == "circles" else output
+    run_program("detect", command, *arguments, "--output", target)
     return rows
 
 
 def _compared(what: str, commands: str, run: Path, rows: Path, reference: Path) -> FirstNumber:
-    compared = rows.with_suffix(".json")
-    _run("detect", "compare", run, "--detected", rows, "--reference", reference, "--json", compared)
-    result: dict[str, Any] = json.loads(compared.read_text())
+    result = compare_rows(run, rows, "--reference", reference)
     return FirstNumber(
         what, commands, result["matched"], result["reference"], result["error_median_m"],
         result["normalised_error"]["per_dof"],
@@ -207,8 +188,3 @@ def put_into(document: Path, table: str) -> None:
         raise ValueError(f"{document}: lacks {BEGIN} and {END}")
     with write_whole(document, overwrite=True) as stream:
         stream.write(f"{before}{BEGIN}\n\n{table}\n\n{END}{after}".encode())
-
-
-def _run(program: str, *arguments: object) -> None:
-    words = [str(argument) for argument in arguments]
-    subprocess.run([sys.executable, "-m", program, *words], check=True, stdout=subprocess.DEVNULL)

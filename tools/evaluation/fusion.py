@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-import io
 import json
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2
 
-from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
 from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     matched_streams,
+    pose_differences,
     read_planar_poses,
 )
 from redetect.groundtruth.validation.scoring import score_poses
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from tools.arrays import BoolArray, FloatArray
+from tools.evaluation.lasers import run_groundtruth, table_of_sessions
 from tools.evaluation.tables import Table
 from tools.simulator.laser.motion import Route, measured_path
 from tools.simulator.laser.session_files import write_session
@@ -64,7 +62,6 @@ class FusionStudy:
 
     seeds: int = 20  # Seeds first, first + 1, ...
     first: int = 1
-    folder: Path | None = None  # Where sessions are kept; by default they are thrown away.
     fault: Fault = "none"
     """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
     a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
@@ -72,14 +69,14 @@ class FusionStudy:
     visits: int = 3
 
     def __call__(self) -> int:
-        table = Table({"seed": "<5", **_COLUMNS})
-        rows = []
-        with ExitStack() as stack:
-            folder = self.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            for seed in range(self.first, self.first + self.seeds):
-                row = one_session(folder / f"{self.fault}{self.visits}-{seed}", seed, self)
-                rows.append([row[key] for key in _COLUMNS])
-                table.row(str(seed), *rows[-1])
+        settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
+
+        def measured(session: Path, seed: int) -> dict[str, float]:
+            write_session(settings, session, seed=seed)
+            return errors_of_session(session)
+
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_COLUMNS, seeds, measured)
         table.row("mean", *np.nanmean(rows, axis=0))
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
@@ -87,28 +84,23 @@ class FusionStudy:
         return 0
 
 
-def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float]:
+def errors_of_session(session: Path) -> dict[str, float]:
     """Run the commands on one session and measure their results."""
-    if not (session / "truth.json").exists():
-        settings = replace(LaserSettings(), visits=study.visits, faults=_FAULTS[study.fault])
-        write_session(settings, session, seed=seed)
-    at = {name: str(session / f"{name}.csv") for name in ("odometry", "laser", "camera", "fused")}
-    clock = str(session / "clock.json")
-    _run("lasers", str(session))
-    _run("laser", str(session))
-    _run("sync", at["odometry"], at["laser"], "-o", clock)
+    at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
+    clock = session / "clock.json"
+    run_groundtruth("lasers", session)
+    run_groundtruth("laser", session)
+    run_groundtruth("sync", at["odometry"], at["laser"], "-o", clock)
     streams = ["--laser", at["laser"], "--camera", at["camera"]]
-    _run("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
+    run_groundtruth("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
 
     truth = read_planar_poses(session / "truth.csv")
-    laser, camera, fused = (
-        read_planar_poses(session / f"{name}.csv") for name in ("laser", "camera", "fused")
-    )
+    laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
     seen = _seen_by(laser, fused.times_s)
     alone = score_poses(*matched_streams(laser, truth))
-    inside = score_poses(*matched_streams(_some(fused, seen), truth))
-    bridged = score_poses(*matched_streams(_some(fused, ~seen), truth))
-    instant = _some(fused, np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
+    inside = score_poses(*matched_streams(fused.only(seen), truth))
+    bridged = score_poses(*matched_streams(fused.only(~seen), truth))
+    instant = fused.only(np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
     account = json.loads((session / "fused.json").read_text())
     return {
         **_clock_errors(session, list(read_clock(clock).segments)),
@@ -129,26 +121,12 @@ def one_session(session: Path, seed: int, study: FusionStudy) -> dict[str, float
     }
 
 
-def _run(*arguments: str) -> None:
-    """Run a command of `groundtruth`, and fail if it does."""
-    out = io.StringIO()
-    with redirect_stdout(out):
-        code = groundtruth([*arguments, "--force"])
-    if code != 0:
-        raise RuntimeError(f"groundtruth {' '.join(arguments)} ended with {code}: {out.getvalue()}")
-
-
 def _seen_by(laser: PlanarPoses, times_s: FloatArray) -> BoolArray:
     """Which times lie between poses of the laser that follow each other closely."""
     after = np.clip(np.searchsorted(laser.times_s, times_s), 1, len(laser) - 1)
     close = laser.times_s[after] - laser.times_s[after - 1] < _CONTINUOUS_S
     inside = (times_s >= laser.times_s[0]) & (times_s <= laser.times_s[-1])
     return np.asarray(close & inside)
-
-
-def _some(poses: PlanarPoses, which: BoolArray) -> PlanarPoses:
-    assert poses.covariances is not None
-    return PlanarPoses(poses.times_s[which], poses.poses[which], poses.covariances[which])
 
 
 def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, float]:
@@ -172,6 +150,9 @@ def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, floa
 Odometry = Callable[[FloatArray, np.random.Generator], FloatArray]
 
 _ODOMETRY_HZ = 50.0
+#: How long poses are measured before and after a gap, how often, and their errors (m, m, rad).
+_SEEN_S, _SEEN_HZ = 40.0, 25.0
+_SEEN_SIGMAS = np.array([0.001, 0.001, np.radians(0.2)])
 _TRACK_M = 0.4
 _WHEEL_SIGMA_M = 0.0015
 _WHEEL_SCALES = (1.006, 1.009)
@@ -189,10 +170,6 @@ class GapStudy:
 
     seeds: int = 60  # Drives of each kind.
     gaps_s: tuple[float, ...] = (2.0, 10.0, 30.0, 120.0)  # How long nothing is measured.
-    seen_s: float = 40.0  # How long poses are measured before and after.
-    rate_hz: float = 25.0  # Of the measured poses.
-    sigma_m: float = 0.001  # Of the measured poses.
-    sigma_deg: float = 0.2
     learn_noise: bool = True  # Let the fusion find how much odometry errs.
 
     def __call__(self) -> int:
@@ -207,7 +184,10 @@ class GapStudy:
         for name, odometry in _ODOMETRIES.items():
             for path in ("straight", "curved"):
                 for gap_s in self.gaps_s:
-                    rows = [one_drive(self, odometry, path, gap_s, s) for s in range(self.seeds)]
+                    settings = FuseSettings(learn_noise=self.learn_noise)
+                    rows = [
+                        one_drive(settings, odometry, path, gap_s, s) for s in range(self.seeds)
+                    ]
                     means.append(np.mean(rows, axis=0))
                     table.row(name, path, gap_s, *means[-1])
         table.row("all", "", np.nan, *np.mean(means, axis=0))
@@ -215,35 +195,29 @@ class GapStudy:
 
 
 def one_drive(
-    study: GapStudy, odometry: Odometry, path: str, gap_s: float, seed: int
+    settings: FuseSettings, odometry: Odometry, path: str, gap_s: float, seed: int
 ) -> list[float]:
     """Error in the middle (mm); NEES there, by direction, near the end, in the gap, outside."""
     rng = np.random.default_rng([seed, int(10 * gap_s), path == "curved"])
-    route = _route(rng, path, 2.0 * study.seen_s + gap_s)
-    times = np.arange(0.0, 2.0 * study.seen_s + gap_s, 1.0 / _ODOMETRY_HZ)
+    begin, end = _SEEN_S, _SEEN_S + gap_s
+    route = _route(rng, path, end + _SEEN_S)
+    times = np.arange(0.0, end + _SEEN_S, 1.0 / _ODOMETRY_HZ)
     own = odometry(route.poses(times), rng)
-    begin, end = study.seen_s, study.seen_s + gap_s
-    seen = np.arange(0.003, times[-1], 1.0 / study.rate_hz)
+    seen = np.arange(0.003, times[-1], 1.0 / _SEEN_HZ)
     seen = seen[(seen < begin) | (seen > end)]
-    sigmas = np.array([study.sigma_m, study.sigma_m, np.radians(study.sigma_deg)])
-    measured = route.poses(seen) + rng.normal(size=(len(seen), 3)) * sigmas
+    measured = route.poses(seen) + rng.normal(size=(len(seen), 3)) * _SEEN_SIGMAS
     measured[:, 2] = wrap_angle(measured[:, 2])
-    covariances = np.broadcast_to(np.diag(sigmas**2), (len(seen), 3, 3)).copy()
-    fusion = fuse(
-        PlanarPoses(times, own),
-        {"laser": PlanarPoses(seen, measured, covariances)},
-        FuseSettings(learn_noise=study.learn_noise),
-    )
-    return _figures(fusion, route, begin, end)
+    covariances = np.tile(np.diag(_SEEN_SIGMAS**2), (len(seen), 1, 1))
+    laser = PlanarPoses(seen, measured, covariances)
+    return _figures(fuse(PlanarPoses(times, own), {"laser": laser}, settings), route, begin, end)
 
 
 def _figures(fusion: Fusion, route: Route, begin: float, end: float) -> list[float]:
     found = fusion.poses
     assert found.covariances is not None
     exact = route.poses(found.times_s)
-    error = found.poses - exact
-    error[:, 2] = wrap_angle(error[:, 2])
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error) / 3.0
+    error = pose_differences(found.poses, exact)
+    squared = squared_mahalanobis(error, found.covariances) / 3.0
     inside = (found.times_s > begin) & (found.times_s < end)
     middle = int(np.argmin(np.abs(found.times_s - 0.5 * (begin + end))))
     late = int(np.argmin(np.abs(found.times_s - (0.1 * begin + 0.9 * end))))
@@ -279,14 +253,6 @@ def _route(rng: np.random.Generator, path: str, seconds: float) -> Route:
     return Route(waypoints, [], limits, -1.0)
 
 
-def _as_simulated(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return measured_path(poses, WheelErrors(), rng)
-
-
-def _slipping(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return measured_path(poses, WheelErrors(sigma_side_m=0.006), rng)
-
-
 def _wheel_by_wheel(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Two wheels that roll by shares too far and each slips by itself; summed up along arcs."""
     turn = np.diff(poses[:, 2])
@@ -307,8 +273,8 @@ def _wheel_by_wheel(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 _ODOMETRIES: dict[str, Odometry] = {
-    "simulated": _as_simulated,
-    "slipping": _slipping,
+    "simulated": lambda poses, rng: measured_path(poses, WheelErrors(), rng),
+    "slipping": lambda poses, rng: measured_path(poses, WheelErrors(sigma_side_m=0.006), rng),
     "wheels": _wheel_by_wheel,
 }
 
@@ -318,34 +284,28 @@ class FusionSpeed:
     """Fuse a made-up session and print the times."""
 
     hours: float = 1.0
-    odometry_hz: float = 50.0
-    laser_hz: float = 75.0
-    rounds: int = 4  # The least of so many times counts; the first compiles.
-    seed: int = 1
 
     def __call__(self) -> int:
-        rng = np.random.default_rng(self.seed)
-        times = np.arange(0.0, 3600.0 * self.hours, 1.0 / self.odometry_hz)
-        heading = np.cumsum(0.3 * np.sin(0.2 * times)) / self.odometry_hz
-        step = 0.5 / self.odometry_hz
+        rng = np.random.default_rng(1)
+        times = np.arange(0.0, 3600.0 * self.hours, 1.0 / _ODOMETRY_HZ)
+        heading = np.cumsum(0.3 * np.sin(0.2 * times)) / _ODOMETRY_HZ
+        step = 0.5 / _ODOMETRY_HZ
         path = np.column_stack(
             [np.cumsum(np.cos(heading)) * step, np.cumsum(np.sin(heading)) * step, heading]
         )
-        seen = np.arange(0.0, times[-1] - 1.0, 1.0 / self.laser_hz)
+        seen = np.arange(0.0, times[-1] - 1.0, 1.0 / 75.0)
         exact = np.column_stack([np.interp(seen, times, path[:, k]) for k in range(3)])
-        laser = PlanarPoses(
-            seen,
-            exact + rng.normal(0.0, 0.01, exact.shape),
-            np.broadcast_to(1e-4 * np.eye(3), (len(seen), 3, 3)).copy(),
-        )
+        noisy = exact + rng.normal(0.0, 0.01, exact.shape)
+        laser = PlanarPoses(seen, noisy, np.tile(1e-4 * np.eye(3), (len(seen), 1, 1)))
         spent = []
-        for _ in range(self.rounds):
+        for _ in range(4):
             begun = time.process_time()
             fusion = fuse(PlanarPoses(times, path), {"laser": laser})
             spent.append(time.process_time() - begun)
         print(
             f"{self.hours:g} h: {len(times)} steps of odometry, {len(laser)} poses of the laser, "
-            f"{len(fusion.poses)} poses fused: {min(spent[1:] or spent):.2f} s of the processor "
-            f"(median {np.median(spent[1:] or spent):.2f} s)"
+            # The first compiles.
+            f"{len(fusion.poses)} poses fused: {min(spent[1:]):.2f} s of the processor "
+            f"(median {np.median(spent[1:]):.2f} s)"
         )
         return 0

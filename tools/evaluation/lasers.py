@@ -8,14 +8,16 @@ import json
 import math
 import tempfile
 import time
-from contextlib import ExitStack, redirect_stdout
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
 
+from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
 from redetect.groundtruth.lasers.sets import load_session
@@ -28,12 +30,19 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.landmarks import wrap_angle
+from redetect.groundtruth.trajectories.streams import (
+    matched_streams,
+    pose_differences,
+    read_planar_poses,
+)
+from redetect.groundtruth.validation.scoring import score_poses
+from redetect.landmarks import squared_mahalanobis
 from redetect.plane import between
 from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table
+from tools.simulator.laser.session_files import write_session
+from tools.simulator.laser.settings import Faults, LaserSettings
 
 _COLUMNS = {
     "sets": ".0f", "found": ".4f", "mm": ".2f", "max_mm": ".1f", "deg": "7.4f", "abs_deg": ".3f",
@@ -42,13 +51,42 @@ _COLUMNS = {
 }  # fmt: skip
 
 
+def run_groundtruth(*arguments: object) -> None:
+    """Run a command of `groundtruth` quietly, and fail if it does."""
+    out = io.StringIO()
+    words = [*map(str, arguments), "--force"]
+    with redirect_stdout(out):
+        code = groundtruth(words)
+    if code != 0:
+        raise GroundTruthError(f"groundtruth {' '.join(words)} ended with {code}: {out.getvalue()}")
+
+
+def table_of_sessions(
+    columns: Mapping[str, str], seeds: range, measure: Callable[[Path, int], dict[str, float]]
+) -> tuple[Table, FloatArray]:
+    """Measure a session, in a folder of its own, for each seed, and print a row of it.
+
+    Returns the rows (N, columns), too.
+    """
+    table, rows = Table({"seed": "<5", **columns}), []
+    for seed in seeds:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                row = measure(Path(folder), seed)
+        except GroundTruthError as error:
+            print(f"{seed:4d} left out: {error}")
+            continue
+        rows.append([row[key] for key in columns])
+        table.row(str(seed), *rows[-1])
+    return table, np.array(rows)
+
+
 @dataclass(frozen=True)
 class LaserSessions:
     """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
 
     seeds: int = 20  # Seeds first, first + 1, ...
     first: int = 1
-    folder: Path | None = None  # Where sessions are kept; by default they are thrown away.
     scanners: Literal["aligned", "true"] = "aligned"
     """`aligned`: by `groundtruth lasers` from poses measured by hand; `true`: the exact ones."""
     fault: Literal["none", "crossing", "moved", "rectangle"] = "none"
@@ -59,138 +97,87 @@ class LaserSessions:
     average: int = 6  # Sets of scans per pose.
 
     def __call__(self) -> int:
-        table = Table({"seed": "<5", **_COLUMNS})
-        rows = []
-        with ExitStack() as stack:
-            folder = self.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            for seed in range(self.first, self.first + self.seeds):
-                try:
-                    session = _session(self, seed, folder)
-                except GroundTruthError as error:
-                    print(f"{seed:4d} not simulated: {error}")
-                    continue
-                row = one_session(session, self)
-                rows.append([row[key] for key in _COLUMNS])
-                table.row(str(seed), *rows[-1])
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_COLUMNS, seeds, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
         return 0
 
-
-def one_session(session: Path, options: LaserSessions) -> dict[str, float]:
-    """Errors of one session."""
-    calibration, scanner_errors = _calibration(session, options)
-    scanners, robot, tables, sets = load_session(session, calibration)
-    track_robot(_first(sets), tables, robot)  # compiles
-    began = time.process_time()
-    track, left_out = track_without_suspects(sets, tables, robot, scanners)
-    elapsed = time.process_time() - began
-    if left_out:
-        print(f"     left out: {', '.join(left_out)}")
-    disturbed = np.sum((track.beams[:, 3] + track.beams[:, 5]) >= 3)
-    span_s = float(sets.times_s[-1] - sets.times_s[0])
-    return {
-        "sets": float(len(sets)),
-        **errors_in_room(session, track, options.average),
-        **scanner_errors,
-        "disturbed": float(disturbed / len(sets)),
-        "set_ms": 1e3 * elapsed / len(sets),
-        "speed": span_s / elapsed,
-    }
+    def _measured(self, session: Path, seed: int) -> dict[str, float]:
+        """Errors of one session."""
+        faults = Faults(crossing=self.fault == "crossing")
+        if self.fault == "moved":
+            faults = Faults(moved_scanner="fixed2", by=(0.04, -0.03, 0.01))
+        settings = LaserSettings(
+            visits=self.visits, visit_s=self.visit_s, between_s=45.0, references=3 * self.visits,
+            onboard_hz=5.0, faults=faults,
+        )  # fmt: skip
+        if self.fault == "rectangle":
+            settings = replace(settings, front_cut_m=0.0)
+        write_session(settings, session, seed=seed)
+        exact, aligned = session / "scanners.truth.json", session / "aligned.json"
+        if self.scanners == "aligned":
+            run_groundtruth("lasers", session, "-o", aligned)
+        calibration = exact if self.scanners == "true" else aligned
+        scanners, robot, tables, sets = load_session(session, calibration)
+        rows = slice(0, 50)
+        first = replace(
+            sets, times_s=sets.times_s[rows], rows=sets.rows[rows], ages_s=sets.ages_s[rows]
+        )
+        track_robot(first, tables, robot)  # compiles
+        began = time.process_time()
+        track, left_out = track_without_suspects(sets, tables, robot, scanners)
+        elapsed = time.process_time() - began
+        if left_out:
+            print(f"     left out: {', '.join(left_out)}")
+        disturbed = np.sum((track.beams[:, 3] + track.beams[:, 5]) >= 3)
+        return {
+            "sets": float(len(sets)),
+            **errors_in_room(session, track, self.average),
+            **scanner_errors(read_scanners(calibration), read_scanners(exact)),
+            "disturbed": float(disturbed / len(sets)),
+            "set_ms": 1e3 * elapsed / len(sets),
+            "speed": float(sets.times_s[-1] - sets.times_s[0]) / elapsed,
+        }
 
 
 def errors_in_room(session: Path, track: LaserTrack, sets_per_pose: int) -> dict[str, float]:
     """Errors of the poses while the robot is in the room, and how many sets have one."""
-    truth = read_planar_poses(session / "truth.csv")
-    visits = json.loads((session / "truth.json").read_text())["visits"]
+    visits = np.array(json.loads((session / "truth.json").read_text())["visits"])
 
     def inside(times_s: FloatArray) -> BoolArray:
-        found = np.zeros(len(times_s), dtype=np.bool_)
-        for begin, end in visits:
-            found |= (times_s >= begin) & (times_s <= end)
-        return found
+        after, before = times_s >= visits[:, :1], times_s <= visits[:, 1:]
+        return np.asarray((after & before).any(axis=0))
 
     poses = combined_poses(track, sets_per_pose)
-    chosen = inside(poses.times_s)
+    poses = poses.only(inside(poses.times_s))
     wanted = inside(track.times_s)
     with_pose = wanted & np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
-    if not chosen.any() or poses.covariances is None:
-        return dict.fromkeys(
-            ("found", "mm", "max_mm", "deg", "abs_deg", "max_deg", "nees", "lost_s"), math.nan
-        )
-    t = poses.times_s[chosen]
-    heading = np.unwrap(truth.poses[:, 2])
-    columns = (truth.poses[:, 0], truth.poses[:, 1], heading)
-    error = poses.poses[chosen] - np.column_stack([np.interp(t, truth.times_s, v) for v in columns])
-    error[:, 2] = wrap_angle(error[:, 2])
-    shift, turn = 1e3 * np.hypot(error[:, 0], error[:, 1]), np.degrees(error[:, 2])
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariances[chosen]), error)
+    score = score_poses(*matched_streams(poses, read_planar_poses(session / "truth.csv")))
     return {
         "found": float(with_pose.sum() / wanted.sum()),
-        "mm": float(shift.mean()),
-        "max_mm": float(shift.max()),
-        "deg": float(turn.mean()),
-        "abs_deg": float(np.abs(turn).mean()),
-        "max_deg": float(np.abs(turn).max()),
-        "nees": float(squared.mean() / 3.0),
+        "mm": 1e3 * score.position_mean_m,
+        "max_mm": 1e3 * score.position_max_m,
+        "deg": math.degrees(score.angle_mean_rad),
+        "abs_deg": math.degrees(score.angle_abs_mean_rad),
+        "max_deg": math.degrees(score.angle_max_rad),
+        "nees": score.normalised_error,
         "lost_s": float((wanted & ~with_pose).sum() / 75.0),
     }
 
 
-def _session(options: LaserSessions, seed: int, folder: Path) -> Path:
-    from tools.simulator.laser.session_files import write_session
-    from tools.simulator.laser.settings import LaserSettings
-
-    session = folder / f"{options.fault}{seed}"
-    if (session / "truth.json").is_file():
-        return session
-    settings = LaserSettings(
-        visits=options.visits, visit_s=options.visit_s, between_s=45.0,
-        references=3 * options.visits, onboard_hz=5.0,
-    )  # fmt: skip
-    faults = settings.faults
-    if options.fault == "crossing":
-        faults = replace(faults, crossing=True)
-    if options.fault == "moved":
-        faults = replace(faults, moved_scanner="fixed2", by=(0.04, -0.03, 0.01))
-    cut = 0.0 if options.fault == "rectangle" else settings.front_cut_m
-    settings = replace(settings, faults=faults, front_cut_m=cut)
-    session.mkdir(parents=True, exist_ok=True)
-    write_session(settings, session, seed=seed, overwrite=True)
-    return session
-
-
-def _calibration(session: Path, options: LaserSessions) -> tuple[Path, dict[str, float]]:
-    """The scanners' file to track with, and its errors."""
-    exact = session / "scanners.truth.json"
-    if options.scanners == "true":
-        return exact, {"scanner_mm": 0.0, "scanner_deg": 0.0, "scanner_nees": 0.0}
-    from redetect.groundtruth.commands.lasers import perform as align
-    from redetect.groundtruth.commands.options import Lasers
-
-    output = session / "aligned.json"
-    with redirect_stdout(io.StringIO()):
-        align(Lasers(session, output=output, force=True))
-    return output, scanner_errors(read_scanners(output), read_scanners(exact))
-
-
 def scanner_errors(found: tuple[Scanner, ...], exact: tuple[Scanner, ...]) -> dict[str, float]:
     """Mean errors of the scanners' poses, and the mean normalised error squared."""
-    error = np.array([f.pose - e.pose for f, e in zip(found, exact)])
-    error[:, 2] = wrap_angle(error[:, 2])
-    nees = [float(e @ np.linalg.solve(f.covariance, e)) / 3.0 for e, f in zip(error, found)]
+    error = pose_differences(*(np.array([s.pose for s in of]) for of in (found, exact)))
+    covariances = np.array([scanner.covariance for scanner in found])
+    known = covariances.any()
+    nees = squared_mahalanobis(error, covariances).mean() / 3.0 if known else 0.0
     return {
         "scanner_mm": float(1e3 * np.hypot(error[:, 0], error[:, 1]).mean()),
         "scanner_deg": float(np.degrees(np.abs(error[:, 2])).mean()),
-        "scanner_nees": float(np.mean(nees)),
+        "scanner_nees": float(nees),
     }
-
-
-def _first(sets: Any) -> Any:
-    """A few sets."""
-    rows = slice(0, 50)
-    return replace(sets, times_s=sets.times_s[rows], rows=sets.rows[rows], ages_s=sets.ages_s[rows])
 
 
 def read_log(folder: Path, name: str, shortest_m: float) -> tuple[list[FloatArray], FloatArray]:
@@ -237,18 +224,15 @@ class LaserLog:
         covariances = np.tile(np.eye(3), (len(pairs), 1, 1))
         began = time.perf_counter()
         for row, i in enumerate(pairs):
-            try:
-                match = match_scans(
-                    points[i + 1], points[i], heading_step_deg=self.heading_step_deg
-                )
-            except GeometryError:
-                continue
-            ambiguous[row], covariances[row] = match.ambiguous, match.covariance
-            found[row], share[row] = match.pose, (match.explained, match.rival)
+            step_deg = self.heading_step_deg
+            with suppress(GeometryError):
+                match = match_scans(points[i + 1], points[i], heading_step_deg=step_deg)
+                ambiguous[row], covariances[row] = match.ambiguous, match.covariance
+                found[row], share[row] = match.pose, (match.explained, match.rival)
         elapsed = time.perf_counter() - began
         truth = between(poses[:-1], poses[1:])[pairs]
-        shift_m = np.hypot(*(found[:, :2] - truth[:, :2]).T)
-        turn_deg = np.degrees(np.abs(wrap_angle(found[:, 2] - truth[:, 2])))
+        error = pose_differences(found, truth)
+        shift_m, turn_deg = np.hypot(*error[:, :2].T), np.degrees(np.abs(error[:, 2]))
         shift_m, turn_deg = (np.where(np.isnan(e), np.inf, e) for e in (shift_m, turn_deg))
         gross = (shift_m > 0.15) | (turn_deg > 3.0)
         print(f"pairs {len(pairs)}, {1e3 * elapsed / len(pairs):.1f} ms each")
@@ -258,14 +242,10 @@ class LaserLog:
             f"({np.sum(gross & ~ambiguous)}); flagged: {np.sum(gross & ambiguous)} of them, "
             f"{np.sum(~gross & ambiguous)} of {np.sum(~gross)} others"
         )
-        if np.any(gross & ~np.isnan(found[:, 0])):
-            rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
-            error = found[rows] - truth[rows]
-            error[:, 2] = wrap_angle(error[:, 2])
-            normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariances[rows]), error)
-            print(
-                f"gross failures: median squared error, normalised, {np.median(normalised) / 3:.1f}"
-            )
+        rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
+        if rows.any():
+            normalised = np.median(squared_mahalanobis(error[rows], covariances[rows])) / 3
+            print(f"gross failures: median squared error, normalised, {normalised:.1f}")
         for percent in (50, 90, 95):
             print(
                 f"{percent:3d} %: {np.percentile(shift_m, percent):.4f} m "

@@ -46,7 +46,6 @@ class Distance:
     """Distances from the truth."""
 
     path_rms_m: float  # Of positions along the path.
-    path_most_m: float
     discs_rms_m: float
     discs_nees: float  # Mean normalised error squared of a disc; 2 where the covariances are right.
 
@@ -66,32 +65,32 @@ def read_truth(run: Path) -> Truth:
     )
 
 
-def path_distance(poses: FloatArray, truth: Truth) -> tuple[float, float]:
-    """Root mean square and largest distance of positions from the truth (m)."""
-    off = np.linalg.norm((poses - truth.poses)[:, :2], axis=1)
-    return float(np.sqrt(np.mean(off**2))), float(np.max(off))
+def path_distance(poses: FloatArray, truth: Truth) -> float:
+    """Root mean square distance of positions from the truth (m)."""
+    return float(np.sqrt(np.mean(np.sum((poses - truth.poses)[:, :2] ** 2, axis=1))))
 
 
 def distance(mapped: MappedRun, truth: Truth) -> Distance:
     """Compare a map with the truth."""
-    rms, most = path_distance(mapped.estimate.poses, truth)
+    rms = path_distance(mapped.estimate.poses, truth)
     true = np.array([truth.discs[int(i)] for i in mapped.graph.disc_ids])
     off = mapped.estimate.disc_xy - true
-    spread = np.linalg.inv(mapped.covariance.discs)
-    return Distance(
-        path_rms_m=rms,
-        path_most_m=most,
-        discs_rms_m=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-        discs_nees=float(np.mean(np.einsum("ni,nij,nj->n", off, spread, off))),
-    )
+    discs_rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    nees = float(np.mean(squared_mahalanobis(off, mapped.covariance.discs)))
+    return Distance(rms, discs_rms, nees)
+
+
+def drawn(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(n, d) errors drawn from covariances (n, d, d)."""
+    root = np.linalg.cholesky(covariance)
+    return np.asarray(np.einsum("nij,nj->ni", root, rng.standard_normal(root.shape[:2])))
 
 
 def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Recording:
     """A run whose wrong steps are measured anew, with errors as their covariances say."""
     rng = np.random.default_rng(seed)
     true = between(truth.poses[:-1], truth.poses[1:])
-    root = np.linalg.cholesky(step_covariance(true))
-    fresh = true + np.einsum("nij,nj->ni", root, rng.standard_normal(true.shape))
+    fresh = true + drawn(step_covariance(true), rng)
     wrong = truth.wrong_odometry
     steps, covariance = recording.steps.copy(), recording.step_covariance.copy()
     steps[wrong] = fresh[wrong]
@@ -137,7 +136,7 @@ class MapStudy:
                 begin = time.perf_counter()
                 mapped = map_run(variant, name=str(run))
                 seconds = time.perf_counter() - begin
-                before, _ = path_distance(mapped.start.poses, truth)
+                before = path_distance(mapped.start.poses, truth)
                 t, d = mapped.table, distance(mapped, truth)
                 table.row(
                     run.name, name, t.poses, t.landmarks, t.measurements, t.chi_squared,
@@ -177,10 +176,9 @@ def with_true_places(recording: Recording, ids: IntArray, truth: Truth, seed: in
     known = np.flatnonzero(ids != UNKNOWN_ID)
     rng = np.random.default_rng(seed)
     places = np.array([truth.discs[int(i)] for i in ids[known]])
-    root = np.linalg.cholesky(circles.covariance[known])
     xy = circles.xy.copy()
     xy[known] = disc_in_robot(truth.poses[circles.frame[known] + 1], places)
-    xy[known] += np.einsum("nij,nj->ni", root, rng.standard_normal((len(known), 2)))
+    xy[known] += drawn(circles.covariance[known], rng)
     return replace(recording, circles=replace(circles, xy=xy, ids=ids))
 
 
@@ -198,7 +196,7 @@ def errors_of(mapped: MappedRun, discs: IntArray, truth: Truth) -> FloatArray:
     often = (mapped.graph.disc_row_counts > 1) & (discs != UNKNOWN_ID)
     true = np.array([truth.discs[int(i)] for i in discs[often]])
     off = np.sum((mapped.estimate.disc_xy[often] - true) ** 2, axis=1)
-    path, _ = path_distance(mapped.estimate.poses, truth)
+    path = path_distance(mapped.estimate.poses, truth)
     return np.array([np.sqrt(np.mean(off)), path])
 
 
@@ -261,19 +259,12 @@ def miswritten(
     rays = np.column_stack([seen, np.zeros(len(seen))]) - mounted
     nominal = np.column_stack([camera.rotation, camera.centre])
     written, _ = rows_through_mounting(camera, rays @ turn.T, nominal)
-    rng = np.random.default_rng(seed)
-    root = np.linalg.cholesky(circles.covariance[known])
-    errors = np.einsum("nij,nj->ni", root, rng.standard_normal((len(known), 2)))
-    return replace(
-        recording,
-        circles=replace(
-            circles,
-            frame=circles.frame[known],
-            xy=written + errors,
-            covariance=circles.covariance[known],
-            ids=circles.ids[known],
-        ),
-    )
+    errors = drawn(circles.covariance[known], np.random.default_rng(seed))
+    rows = replace(
+        circles, frame=circles.frame[known], xy=written + errors,
+        covariance=circles.covariance[known], ids=circles.ids[known],
+    )  # fmt: skip
+    return replace(recording, circles=rows)
 
 
 @dataclass(frozen=True)
@@ -308,7 +299,7 @@ class MapCalibration:
                 assert mapped.mounting is not None
                 found = mapped.mounting.change
                 sigma = np.sqrt(np.diag(mapped.mounting.covariance))
-                path, _ = path_distance(mapped.estimate.poses, truth)
+                path = path_distance(mapped.estimate.poses, truth)
                 off = " ".join(f"{x:5.1f}" for x in (found - change) / sigma)
                 factor = mapped.table.factor
                 table.row(run.name, way, _row(found), _row(sigma), off, factor, path)
@@ -389,12 +380,11 @@ class MapModelling:
         return 0
 
 
-def _plain_gtsam(kind: str, most_steps: int, graph: Graph, start: Estimate) -> tuple[float, int]:
+def _plain_gtsam(kind: str, graph: Graph, start: Estimate) -> tuple[float, int]:
     """One of GTSAM's optimizers with its own default parameters: cost and number of steps."""
     gtsam = load_gtsam()
     factors, values = gtsam_problem(graph, start, Weighting())
     parameters: Any = getattr(gtsam, f"{kind}Params")()
-    parameters.setMaxIterations(most_steps)
     optimizer = getattr(gtsam, f"{kind}Optimizer")(factors, values, parameters)
     found = estimate_of_values(graph, optimizer.optimize(), start)
     return cost(graph, found, Weighting()), int(optimizer.iterations())
@@ -406,7 +396,6 @@ class MapSpeed:
 
     run: Positional[Path]  # Run folder or .circles file.
     repeats: int = 3  # Rounds, in each of which every solver has its turn.
-    most_steps: int = 100  # GTSAM's default.
 
     def __call__(self) -> int:
         graph = graph_of_recording(read_recording(self.run))
@@ -419,7 +408,7 @@ class MapSpeed:
         own = "separable (slam map)"
         solvers: dict[str, Callable[[], tuple[float, int]]] = {own: separable}
         for kind in ("LevenbergMarquardt", "Dogleg", "GaussNewton"):
-            solvers[f"GTSAM {kind}"] = partial(_plain_gtsam, kind, self.most_steps, graph, start)
+            solvers[f"GTSAM {kind}"] = partial(_plain_gtsam, kind, graph, start)
         seconds: dict[str, list[float]] = {name: [] for name in solvers}
         reached = {}
         for _ in range(self.repeats):

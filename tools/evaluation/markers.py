@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from redetect.storage import write_whole
 from tools.benchmark.material import decode, jpeg_picture
-from tools.benchmark.timing import Spread, measure_in_turn, paired_ratios, spread_of
+from tools.benchmark.report import Time, spread, times_of
+from tools.benchmark.timing import measure_in_turn
 from tools.evaluation.markers_statistics import (
     FOUND,
     MISIDENTIFIED,
@@ -25,12 +26,11 @@ from tools.evaluation.markers_statistics import (
     counts_lines,
     detector_of,
     known_to_opencv,
-    score_frame,
     scored_frame,
     statistics_picture,
     table_of,
 )
-from tools.evaluation.tables import progress, write_json
+from tools.evaluation.tables import write_json
 from tools.simulator.markers.samples import SampleFrame, SampleSettings, sample_frame
 from tools.simulator.markers.things import photograph_files
 from tools.simulator.parallel import in_order
@@ -55,8 +55,7 @@ _BUDGET_S = 20.0
 _WIDTH_WITHOUT_MARKER_PX = 60.0
 
 
-@dataclass(frozen=True, eq=False)
-class Offence:
+class Offence(NamedTuple):
     """Something that must not happen, and where it did."""
 
     detector: str
@@ -64,31 +63,11 @@ class Offence:
     place: str
 
 
-@dataclass(frozen=True)
-class Timed:
-    """Time of a function on many images."""
-
-    name: str
-    ratio: Spread  # To decoding the same image in the same round.
-    milliseconds: Spread
-
-
 def score_frames(
-    settings: SampleSettings,
-    detectors: tuple[str, ...],
-    *,
-    frames: int,
-    seed: int,
-    jobs: int = 1,
-    on_frame: Callable[[], None] | None = None,
+    settings: SampleSettings, detectors: tuple[str, ...], frames: int, seed: int, jobs: int = 1
 ) -> list[ScoredFrame]:
     """Render frames and let detectors search them."""
-    scored = []
-    for frame in in_order(_score, (settings, detectors, seed), range(frames), jobs):
-        scored.append(frame)
-        if on_frame is not None:
-            on_frame()
-    return scored
+    return list(in_order(_score, (settings, detectors, seed), range(frames), jobs))
 
 
 def _score(state: tuple[SampleSettings, tuple[str, ...], int], index: int) -> ScoredFrame:
@@ -96,8 +75,7 @@ def _score(state: tuple[SampleSettings, tuple[str, ...], int], index: int) -> Sc
     frame = sample_frame(settings, seed, index)
     found = {name: detector_of(name)(frame.image, frame.camera, frame.dictionary)
              for name in detectors}  # fmt: skip
-    outcomes = {name: score_frame(frame.markers, of) for name, of in found.items()}
-    return scored_frame(frame, outcomes)
+    return scored_frame(frame, found)
 
 
 def offences(frames: Sequence[ScoredFrame]) -> list[Offence]:
@@ -117,12 +95,7 @@ def offences(frames: Sequence[ScoredFrame]) -> list[Offence]:
 
 
 def search_photographs(
-    folders: Sequence[Path],
-    detectors: tuple[str, ...],
-    dictionaries: tuple[str, ...],
-    *,
-    jobs: int = 1,
-    on_photograph: Callable[[], None] | None = None,
+    folders: Sequence[Path], detector: str, dictionaries: tuple[str, ...], jobs: int = 1
 ) -> tuple[int, list[Offence]]:
     """Search photographs without markers: how many there were, and what was found.
 
@@ -131,39 +104,26 @@ def search_photographs(
     ValueError
         If a folder holds no images, or one cannot be read.
     """
-    files: list[Path] = []
-    for folder in folders:
-        files += (below := photograph_files(folder))
-        if not below:
-            raise ValueError(f"{folder}: holds no photographs (.jpg, .png)")
-    found: list[Offence] = []
-    for of_one in in_order(_search, (detectors, dictionaries), files, jobs):
-        found += of_one
-        if on_photograph is not None:
-            on_photograph()
-    return len(files), found
+    files = [file for folder in folders for file in photograph_files(folder)]
+    found = in_order(_search, (detector, dictionaries), files, jobs)
+    return len(files), [offence for of_one in found for offence in of_one]
 
 
-def _search(state: tuple[tuple[str, ...], tuple[str, ...]], path: Path) -> list[Offence]:
+def _search(state: tuple[str, tuple[str, ...]], path: Path) -> list[Offence]:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise ValueError(f"{path}: cannot be read as an image")
+    name, dictionaries = state
     return [
         Offence(name, "false", f"{path.name} {dictionary} id {i}")
-        for name in state[0]
-        for dictionary in state[1]
+        for dictionary in dictionaries
         for i in detector_of(name)(np.asarray(image, dtype=np.uint8), None, dictionary).ids
     ]
 
 
 def time_searches(
-    settings: SampleSettings,
-    frames: int,
-    seed: int,
-    *,
-    rounds: int = 5,
-    on_frame: Callable[[], None] | None = None,
-) -> list[Timed]:
+    settings: SampleSettings, frames: int, seed: int, *, rounds: int = 5
+) -> list[Time]:
     """Time the search of rendered frames, decoding them, and OpenCV's detectors, in turn.
 
     The frames are those of the statistics, stored as JPEG files of quality 90. Our detector is
@@ -171,7 +131,7 @@ def time_searches(
     """
     from detect.markers.candidates import closing
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
+    from detect.settings import MarkerSettings
 
     cv2.setNumThreads(1)
     (dictionary,) = settings.dictionaries
@@ -185,8 +145,6 @@ def time_searches(
         encoded.append(picture.encoded)
         widths = [marker.width_px for marker in frame.markers] or [_WIDTH_WITHOUT_MARKER_PX]
         given.append(replace(plain, width_px=float(np.median(widths))))
-        if on_frame is not None:
-            on_frame()
 
     def peer(name: str) -> Callable[[int], object]:
         detect = detector_of(name)
@@ -203,20 +161,15 @@ def time_searches(
         **{name: peer(name) for name in (_TIMED_PEERS if known_to_opencv(dictionary) else ())},
     }
     seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
-    return [
-        Timed(name, spread_of(paired_ratios(values, seconds[DECODING])), spread_of(1e3 * values))
-        for name, values in seconds.items()
-    ]
+    return times_of("markers", dictionary, seconds, DECODING)
 
 
-def timing_lines(times: Sequence[Timed]) -> list[str]:
+def timing_lines(times: Sequence[Time]) -> list[str]:
     """A table: times in decodings of the same image, with quartiles, and in milliseconds."""
-    width = max(len(timed.name) for timed in times)
+    width = max(len(time.function) for time in times)
     return [
-        f"{timed.name:>{width}}: {timed.ratio.median:.3g} x decoding "
-        f"({timed.ratio.lower_quartile:.3g} - {timed.ratio.upper_quartile:.3g}), "
-        f"{timed.milliseconds.median:.3g} ms"
-        for timed in times
+        f"{time.function:>{width}}: {spread(time.decodings)} x decoding, {time.ms.median:.3g} ms"
+        for time in times
     ]
 
 
@@ -238,7 +191,6 @@ class Markers:
     dictionaries: tuple[str, ...] = _SEARCHED  # Of that search, and of the photographs'.
     backgrounds: Path | None = None  # Photographs behind half the frames of that search.
     photographs: tuple[Path, ...] = ()  # Folders of photographs without markers to search.
-    peers: bool = False  # Let OpenCV's detector search as well; what it finds wrong is no failure.
     seed: int = 1  # Of all frames.
     jobs: int = 1  # Processes.
     output: Path | None = None  # Folder for markers.json and statistics.png.
@@ -247,27 +199,36 @@ class Markers:
     def __call__(self) -> int:
         content: dict[str, Any] = {
             "settings": {
-                "statistics": self.statistics,
-                "dictionary": self.dictionary,
-                "frames": self.frames,
-                "dictionaries": list(self.dictionaries),
-                "photographic_backgrounds": self.backgrounds is not None,
-                "seed": self.seed,
+                "statistics": self.statistics, "dictionary": self.dictionary,
+                "frames": self.frames, "dictionaries": list(self.dictionaries),
+                "photographic_backgrounds": self.backgrounds is not None, "seed": self.seed,
             }
-        }
+        }  # fmt: skip
         wrong: list[Offence] = []
         picture = b""
         if self.statistics:
-            found, picture = self._statistics(content)
+            content["statistics"], found, picture = self._statistics()
             wrong += found
             if self.spot:
-                self._spot(content)
+                content["spot"] = self._spot()
         if self.timing:
-            self._timing(content)
+            settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
+            times = time_searches(settings, self.timing, self.seed)
+            print(f"Processor time, {self.timing} frames of the statistics")
+            print("\n".join(timing_lines(times)))
+            content["timing"] = [asdict(time) for time in times]
         if self.frames:
-            wrong += self._search_frames(content)
+            content["search"], found = self._search_frames()
+            wrong += found
         if self.photographs:
-            wrong += self._search_photographs(content)
+            count, found = search_photographs(self.photographs, OURS, self.dictionaries, self.jobs)
+            print(
+                f"{count} photographs, each searched for {len(self.dictionaries)} dictionaries: "
+                f"{len(found)} false markers"
+            )
+            print("\n".join(_offence_lines(found)))
+            content["photographs"] = {"photographs": count, "offences": _offences_json(found)}
+            wrong += found
         if self.output is not None:
             self.output.mkdir(parents=True, exist_ok=True)
             if picture:
@@ -275,41 +236,34 @@ class Markers:
                 with write_whole(place, overwrite=self.force) as stream:
                     stream.write(picture)
             write_json(self.output / "markers.json", content, overwrite=self.force)
-        return 1 if any(offence.detector == OURS for offence in wrong) else 0
+        return 1 if wrong else 0
 
-    def _scored(
-        self, label: str, settings: SampleSettings, detectors: tuple[str, ...], frames: int
-    ) -> list[ScoredFrame]:
-        with progress(label, frames) as tick:
-            return score_frames(settings, detectors, frames=frames, seed=self.seed, jobs=self.jobs,
-                                on_frame=tick)  # fmt: skip
+    def _scored(self, settings: SampleSettings, frames: int) -> list[ScoredFrame]:
+        """Frames that all detectors have searched."""
+        detectors = (OURS, *(PEERS if known_to_opencv(self.dictionary) else ()))
+        return score_frames(settings, detectors, frames, self.seed, self.jobs)
 
-    @property
-    def _detectors(self) -> tuple[str, ...]:
-        return (OURS, *(PEERS if known_to_opencv(self.dictionary) else ()))
-
-    def _statistics(self, content: dict[str, Any]) -> tuple[list[Offence], bytes]:
+    def _statistics(self) -> tuple[dict[str, Any], list[Offence], bytes]:
         settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
-        frames = self._scored("statistics", settings, self._detectors, self.statistics)
-        table, found = table_of(frames), offences(frames)
-        bins = binned(table)
-        own = [offence for offence in found if offence.detector == OURS]
+        frames = self._scored(settings, self.statistics)
+        table, bins = table_of(frames), binned(table_of(frames))
+        own = [offence for offence in offences(frames) if offence.detector == OURS]
         print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
         print("\n".join([*counts_lines(table), *bins_lines(bins), *_offence_lines(own)]))
-        content["statistics"] = {
+        content = {
             "frames": table.frames,
             "false": {name: len(of.false) for name, of in table.outcomes.items()},
             "repeated": {name: of.repeated for name, of in table.outcomes.items()},
-            "bins": bins_json(bins), "offences": [asdict(offence) for offence in own],
+            "bins": bins_json(bins), "offences": _offences_json(own),
         }  # fmt: skip
         title = (
             f"{table.frames} rendered frames, {int(table.columns['clear'].sum())} markers of "
             f"{self.dictionary} clearly in view: widths 12-200 px, slant to 70 deg, blur 0.3-3 px, "
             "contrast 15-200, noise 1-5"
         )
-        return found, statistics_picture(bins, title)
+        return content, own, statistics_picture(bins, title)
 
-    def _spot(self, content: dict[str, Any]) -> None:
+    def _spot(self) -> dict[str, Any]:
         """Corners at a width of 60 px and a noise of 3: any light and blur, and good light."""
         common = SampleSettings(
             dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES, empty=0.0, markers=(2, 4),
@@ -317,31 +271,19 @@ class Markers:
         )  # fmt: skip
         good = replace(common, contrast_grey=(100.0, 200.0), blur_px=(0.5, 1.3), motion=0.0)
         cases = {"any light and blur": common, "contrast 100-200, blur 0.5-1.3 px, still": good}
-        content["spot"] = {}
+        content = {}
         for label, settings in cases.items():
-            count = max(20, self.statistics // 5)
-            everything = binned(
-                table_of(self._scored("width 60 px", settings, self._detectors, count))
-            )[:1]
+            frames = self._scored(settings, max(20, self.statistics // 5))
+            everything = binned(table_of(frames))[:1]
             print("\n".join([f"Width 58-62 px, noise 3, {label}", *bins_lines(everything)]))
-            content["spot"][label] = bins_json(everything)[0]
+            content[label] = bins_json(everything)[0]
+        return content
 
-    def _timing(self, content: dict[str, Any]) -> None:
-        settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
-        with progress("rendering", self.timing) as tick:
-            times = time_searches(settings, self.timing, self.seed, on_frame=tick)
-        print(f"Processor time, {self.timing} frames of the statistics")
-        print("\n".join(timing_lines(times)))
-        content["timing"] = [asdict(timed) for timed in times]
-
-    def _search_frames(self, content: dict[str, Any]) -> list[Offence]:
+    def _search_frames(self) -> tuple[dict[str, Any], list[Offence]]:
         settings = SampleSettings(
             dictionaries=self.dictionaries, samples=_SEARCHED_SAMPLES, photographs=self.backgrounds
         )
-        detectors: tuple[str, ...] = (OURS,)
-        if self.peers and all(map(known_to_opencv, self.dictionaries)):
-            detectors = (OURS, PEERS[0])
-        frames = self._scored("search", settings, detectors, self.frames)
+        frames = score_frames(settings, (OURS,), self.frames, self.seed, self.jobs)
         table, found = table_of(frames), offences(frames)
         empty = sum(len(frame.rows) == 0 for frame in frames)
         print(f"Search of {len(frames)} frames, {empty} of them without any marker")
@@ -360,28 +302,18 @@ class Markers:
             }
             print(f"{name:>16}: " + ", ".join(f"{key} {value}" for key, value in figures.items()))
         print("\n".join(_offence_lines(found)))
-        content["search"] = {
+        content = {
             "frames": len(frames), "without_markers": empty,
             "false": {name: len(of.false) for name, of in table.outcomes.items()},
-            "by_dictionary": by_dictionary, "offences": [asdict(offence) for offence in found],
+            "by_dictionary": by_dictionary, "offences": _offences_json(found),
         }  # fmt: skip
-        return found
-
-    def _search_photographs(self, content: dict[str, Any]) -> list[Offence]:
-        with progress("photographs", None) as tick:
-            count, found = search_photographs(
-                self.photographs, (OURS,), self.dictionaries, jobs=self.jobs, on_photograph=tick
-            )
-        print(
-            f"{count} photographs, each searched for {len(self.dictionaries)} dictionaries: "
-            f"{len(found)} false markers"
-        )
-        print("\n".join(_offence_lines(found)))
-        offences_json = [asdict(offence) for offence in found]
-        content["photographs"] = {"photographs": count, "offences": offences_json}
-        return found
+        return content, found
 
 
 def _offence_lines(found: list[Offence]) -> list[str]:
     lines = [f"  {one.detector}: {one.kind}: {one.place}" for one in found[:_SHOWN]]
     return lines + ([f"  ... and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else [])
+
+
+def _offences_json(found: list[Offence]) -> list[dict[str, str]]:
+    return [offence._asdict() for offence in found]

@@ -6,11 +6,12 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from camera import Camera
+from redetect.landmarks import squared_mahalanobis
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from tools.evaluation.tables import picture
 from tools.simulator.markers.samples import SampleFrame
@@ -61,7 +62,7 @@ def known_to_opencv(dictionary: str) -> bool:
 
 def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
     from detect.markers.detect import detect_markers
-    from detect.markers.settings import MarkerSettings
+    from detect.settings import MarkerSettings
 
     found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
     return Found(found.ids, found.corners, found.covariance)
@@ -99,8 +100,7 @@ MISSED, FOUND, MISIDENTIFIED = 0, 1, 2
 _NEAR_WIDTHS = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """What a detector made of the markers of one frame."""
 
     status: IntArray
@@ -132,8 +132,7 @@ def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
             status[which] = FOUND
             errors[which] = corners - markers[which].corners
             if found.covariances is not None:
-                solved = np.linalg.solve(found.covariances[k], errors[which][..., None])
-                normalised[which] = np.sum(errors[which] * solved[..., 0], axis=1) / 2.0
+                normalised[which] = squared_mahalanobis(errors[which], found.covariances[k]) / 2.0
     return Outcome(status, errors, normalised, tuple(false), repeated)
 
 
@@ -163,20 +162,20 @@ class ScoredFrame:
     index: int
     dictionary: str
     rows: FloatArray  # (M, 7) of `COLUMNS`.
-    things: tuple[str, ...]
     outcomes: dict[str, Outcome]
 
 
-def scored_frame(frame: SampleFrame, outcomes: dict[str, Outcome]) -> ScoredFrame:
-    """What is kept of a frame."""
+def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
+    """What is kept of a frame: what became of its markers, by detector."""
     imaging = frame.imaging
+    outcomes = {name: score_frame(frame.markers, of) for name, of in found.items()}
     rows = [
         (m.width_px, m.slant_deg, imaging.blur_px, m.contrast_grey, imaging.noise_grey,
          frame.motion_px, float(m.clear))
         for m in frame.markers
     ]  # fmt: skip
     table = np.array(rows).reshape(-1, len(COLUMNS))
-    return ScoredFrame(frame.seed, frame.index, frame.dictionary, table, frame.things, outcomes)
+    return ScoredFrame(frame.seed, frame.index, frame.dictionary, table, outcomes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +191,11 @@ def table_of(frames: Sequence[ScoredFrame]) -> Table:
     """All frames in one."""
 
     def joined(outcomes: list[Outcome]) -> Outcome:
+        status, errors_px, normalised, false, repeated = zip(*outcomes, strict=True)
         return Outcome(
-            np.concatenate([o.status for o in outcomes]),
-            np.concatenate([o.errors_px for o in outcomes]),
-            np.concatenate([o.normalised for o in outcomes]),
-            tuple(number for o in outcomes for number in o.false),
-            sum(o.repeated for o in outcomes),
-        )
+            np.concatenate(status), np.concatenate(errors_px), np.concatenate(normalised),
+            sum(false, ()), sum(repeated),
+        )  # fmt: skip
 
     rows = np.concatenate([frame.rows for frame in frames])
     outcomes = {n: joined([frame.outcomes[n] for frame in frames]) for n in frames[0].outcomes}
@@ -298,17 +295,16 @@ def _bin(table: Table, inside: BoolArray, quantity: str, low: float, high: float
 def _figures(outcome: Outcome, inside: BoolArray, judged: BoolArray) -> Figures:
     """Counts over the markers inside, errors over those of them that are judged and were found."""
     found = judged & (outcome.status == FOUND)
+    wrong = inside & (outcome.status == MISIDENTIFIED)
+    counts = int(inside.sum()), int(found.sum()), int(wrong.sum())
+    if counts[1] < _FEWEST:
+        return Figures(*counts, *[float("nan")] * 4)
     distances = np.linalg.norm(outcome.errors_px[found], axis=-1).ravel()
     normalised = outcome.normalised[found].ravel()
     normalised = normalised[np.isfinite(normalised)]
-    errors = (float("nan"),) * 3
-    enough = np.count_nonzero(found) >= _FEWEST
-    if enough:
-        rms, q95 = np.sqrt(np.mean(distances**2)), np.quantile(distances, 0.95)
-        errors = float(np.median(distances)), float(rms), float(q95)
-    wrong = inside & (outcome.status == MISIDENTIFIED)
-    known = float(np.mean(normalised)) if enough and len(normalised) else float("nan")
-    return Figures(int(inside.sum()), int(found.sum()), int(wrong.sum()), *errors, known)
+    rms, q95 = np.sqrt(np.mean(distances**2)), np.quantile(distances, 0.95)
+    known = float(np.mean(normalised)) if len(normalised) else float("nan")
+    return Figures(*counts, float(np.median(distances)), float(rms), float(q95), known)
 
 
 def bins_json(bins: list[Bin]) -> list[dict[str, Any]]:
@@ -361,22 +357,15 @@ def bins_lines(bins: list[Bin]) -> list[str]:
     those that both found.
     """
     names = list(bins[0].own)
+    above = "".join(f"  {name:>29}" for name in names)
     lines = [
-        "".join(
-            [
-                f"{'':32}{'markers':>8}",
-                *(f"  {name:>29}" for name in names),
-                "   error^2/dof  shared: ours peer ...",
-            ]
-        ),
-        "".join([" " * 40, *(f"  {'found  median    rms    95 %':>29}" for _ in names)]),
+        f"{'':32}{'markers':>8}{above}   error^2/dof  shared: ours peer ...",
+        " " * 40 + f"  {'found  median    rms    95 %':>29}" * len(names),
     ]
     for b in bins:
         if not b.own[names[0]].markers:
             continue
-        label = "all"
-        if b.quantity:
-            label = f"{TITLES[b.quantity]} {b.low:g}-{b.high:g}"
+        label = f"{TITLES[b.quantity]} {b.low:g}-{b.high:g}" if b.quantity else "all"
         cells = [f"{label:32.32}{b.own[names[0]].markers:8d}"]
         cells += [
             f"  {b.own[n].rate:8.3f} {b.own[n].median_px:6.3f} {b.own[n].rms_px:6.3f} "
@@ -402,24 +391,17 @@ def _draw(figure: Any, bins: list[Bin], title: str) -> None:
     axes = figure.subplots(2, len(BINS), sharey="row", squeeze=False)
     for column, quantity in enumerate(BINS):
         chosen = [b for b in bins if b.quantity == quantity]
-        middle = [
-            np.sqrt(b.low * b.high) if b.low > 0.0 else 0.5 * (b.low + b.high) for b in chosen
-        ]
-        if quantity == "slant_deg":
-            middle = [0.5 * (b.low + b.high) for b in chosen]
+        linear = quantity == "slant_deg"
+        middle = [0.5 * (b.low + b.high) if linear else np.sqrt(b.low * b.high) for b in chosen]
         for name, colour in zip(names, _COLOURS):
             own = [b.own[name] for b in chosen]
-            width = 2.2 if name == OURS else 1.2
-            axes[0, column].plot(
-                middle, [f.median_px for f in own], "o-", color=colour, lw=width, ms=3, label=name
-            )
-            axes[0, column].plot(middle, [f.q95_px for f in own], ":", color=colour, lw=width)
-            axes[1, column].plot(
-                middle, [f.rate for f in own], "o-", color=colour, lw=width, ms=3, label=name
-            )
+            style = {"color": colour, "lw": 2.2 if name == OURS else 1.2, "label": name}
+            axes[0, column].plot(middle, [f.median_px for f in own], "o-", ms=3, **style)
+            axes[0, column].plot(middle, [f.q95_px for f in own], ":", **style)
+            axes[1, column].plot(middle, [f.rate for f in own], "o-", ms=3, **style)
         for row in axes[:, column]:
             row.grid(alpha=0.3)
-            if quantity != "slant_deg":
+            if not linear:
                 row.set_xscale("log")
                 ticks = BINS[quantity]
                 row.set_xticks(ticks, [f"{t:g}" for t in ticks])

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from detect.line_settings import PRESETS, PUBLISHED, LineSettings
 from detect.lines import LineDetections, detect_lines
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from lut.verticals import build_vertical_table
 from redetect.landmarks import LineLandmark, parse_record
 from tools.evaluation.tables import Table

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from camera.calibration.floor import with_pose
 from camera.kernels import camera_numbers
+from camera.uncertainty import with_pose
 from detect.circles import candidates_at, detect_circles, disc_shape, second_looks_at
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_steps
-from detect.noise import estimate_noise
+from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
 from tools.arrays import BoolArray, ByteArray, Float32Array, FloatArray

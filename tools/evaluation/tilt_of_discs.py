@@ -13,8 +13,9 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from detect.seen import image_positions
 from detect.sources.image_files import image_name
-from redetect.landmarks import Frame, read_frames, read_tilts
+from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.slam.models import disc_in_robot
 from tools.arrays import FloatArray
 
 #: An error of the image smaller than this is not believed, pixels along u.
@@ -23,6 +24,8 @@ _LEAST_SIGMA_PX = 0.3
 #: tell no tilt, and one mistaken identifier among five would tell any (rad).
 _SPREAD_RAD = np.radians(0.5)
 _UNKNOWNS = 5
+#: Lines and discs that a frame needs, and how many of the frames that differ most are listed.
+_LEAST, _WORST = 5, 10
 #: A frame whose two tilts differ by more than this many standard deviations is listed.
 _FAR_SIGMAS = 4.0
 
@@ -62,14 +65,12 @@ def tilt_of_discs(
     per_sigma = np.array([1.0, camera.scale_x / camera.scale_y]) / _LEAST_SIGMA_PX
 
     def residuals(unknowns: FloatArray) -> FloatArray:
-        x, y, heading, *tilt = unknowns
-        cosine, sine = np.cos(heading), np.sin(heading)
-        level = (map_xy - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
+        level, tilt = disc_in_robot(unknowns[:3], map_xy), unknowns[3:]
         off = image_positions(camera, level, (tilt[0], tilt[1]), raised_m) - seen
         of_discs = np.nan_to_num(off * per_sigma, nan=1000.0).ravel()
         if usual is None:
             return np.asarray(of_discs)
-        return np.concatenate([of_discs, (np.array(tilt) - usual) / _SPREAD_RAD])
+        return np.concatenate([of_discs, (tilt - usual) / _SPREAD_RAD])
 
     start = np.array([*pose, *(usual or (0.0, 0.0))])
     scale = [0.1, 0.1, 0.1, 0.01, 0.01]
@@ -88,9 +89,7 @@ def compare_tilts(
     tilts: Path,
     map_path: Path,
     path_path: Path,
-    *,
     raised_m: float = 0.0,
-    least: int = 5,
 ) -> TiltComparison:
     """Hold the tilts of a `.tilt` file against those of the discs of a map."""
     discs = read_map(map_path).discs
@@ -102,8 +101,12 @@ def compare_tilts(
     for frame in read_frames(rows):
         name = image_name(frame.step.prefix)
         tilt, pose = by_lines.get(name), poses.get(name)
-        known = _known(frame, place)
-        if tilt is None or pose is None or tilt.lines < least or len(known) < least:
+        known = [
+            ((row.px, row.py), place[row.ids[0]])
+            for row in frame.circles
+            if row.ids and row.ids[0] in place
+        ]
+        if tilt is None or pose is None or tilt.lines < _LEAST or len(known) < _LEAST:
             continue
         rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
         prefixes.append(name)
@@ -118,8 +121,8 @@ def compare_tilts(
     squared = []
     for tilt, disc in zip(first, shown, strict=True):
         covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]) + disc.covariance
-        off = np.array([tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad])
-        squared.append(float(off @ np.linalg.solve(covariance, off)))
+        off = tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad
+        squared.append(float(squared_mahalanobis(off, covariance)))
     return TiltComparison(
         prefixes,
         np.array([(tilt.pitch, tilt.roll) for tilt in first]).reshape(-1, 2),
@@ -128,7 +131,7 @@ def compare_tilts(
     )
 
 
-def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
+def report_of(result: TiltComparison) -> list[str]:
     """The comparison in lines: medians, means, spread, and the frames that differ most."""
     off = np.degrees(result.by_lines - result.by_discs)
     lines = [f"{len(off)} frames; pitch and roll in degrees, verticals and discs of the map"]
@@ -150,23 +153,12 @@ def report_of(result: TiltComparison, worst: int = 10) -> list[str]:
         f"median {np.median(result.squared) / (2.0 * np.log(2.0)):.2f} of the expected; "
         f"{far.sum()} frames beyond {_FAR_SIGMAS:g} sigma"
     )
-    for k in np.argsort(-result.squared)[:worst]:
+    for k in np.argsort(-result.squared)[:_WORST]:
         lines.append(
             f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, "
             f"{np.sqrt(result.squared[k]):.1f} sigma"
         )
     return lines
-
-
-def _known(
-    frame: Frame, place: dict[int, FloatArray]
-) -> list[tuple[tuple[float, float], FloatArray]]:
-    """Rows of a frame whose disc is in the map, with its place there."""
-    return [
-        ((row.px, row.py), place[row.ids[0]])
-        for row in frame.circles
-        if row.ids and row.ids[0] in place
-    ]
 
 
 @dataclass(frozen=True)
@@ -183,8 +175,6 @@ class TiltOfDiscs:
 
     def __call__(self) -> int:
         camera = read_camera(self.camera)
-        compared = compare_tilts(
-            camera, self.rows, self.tilts, self.map, self.path, raised_m=self.raised_m
-        )
-        print("\n".join(report_of(compared)))
+        files = self.rows, self.tilts, self.map, self.path
+        print("\n".join(report_of(compare_tilts(camera, *files, self.raised_m))))
         return 0

@@ -19,7 +19,7 @@ from redetect.storage.command_line import exit_code_of
 #: Files are at most twice as long as the longest that a reader accepts, and at least so long.
 _SHORT_BYTES = 2048
 _INSTRUMENTED = (
-    "camera", "detect.drawing.inputs", "detect.runs.journal", "detect.sources", "redetect",
+    "camera", "detect.drawing.inputs", "detect.runs.stream", "detect.sources", "redetect",
     "tools.fuzz", "csv",
 )  # fmt: skip
 
@@ -73,7 +73,7 @@ def fuzz(name: str, seconds: int, corpora: Path | None) -> None:
     longest = max(map(len, reader.all_seeds()), default=0)
 
     def one_input(data: bytes) -> None:
-        path.write_bytes(reader.content_of(data))
+        path.write_bytes(reader.content(data))
         attempt(reader, path)
 
     flags = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -48,13 +49,13 @@ def _bag(path: Path) -> object:
     return images, steps, pose_in_dataset(transforms, "b", "o")
 
 
-class _Ros:
+class Ros:
     """Some messages of ROS 1 or 2, without ROS."""
 
     def __init__(self, kind: _Kind) -> None:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        self.is_1 = kind == "ros1"
+        self.kind, self.is_1 = kind, kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is_1 else Stores.ROS2_HUMBLE)
         if self.is_1:
             definition = "geometry_msgs/TransformStamped[] transforms\n"
@@ -63,8 +64,9 @@ class _Ros:
     def make(self, name: str, **fields: Any) -> Any:
         return self.store.types[name](**fields)
 
-    def header(self) -> Any:
-        stamp = self.make("builtin_interfaces/msg/Time", sec=1, nanosec=5)
+    def header(self, nanoseconds: int = 1_000_000_005) -> Any:
+        sec, nanosec = divmod(nanoseconds, 10**9)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         extra = {"seq": 0} if self.is_1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="optical", **extra)
 
@@ -119,38 +121,42 @@ class _Ros:
         )  # fmt: skip
         return self.make("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
+    def write(self, place: Path, said: Iterable[tuple[str, int, Any]]) -> None:
+        """Write a bag of messages with their topics and times (ns): a file, of ROS 2 a folder."""
+        if self.kind == "ros1":
+            from rosbags.rosbag1 import Writer as Writer1
+
+            writer: Any = Writer1(place)
+        else:
+            from rosbags.rosbag2 import StoragePlugin, Writer
+
+            plugin = StoragePlugin.SQLITE3 if self.kind == "sqlite" else StoragePlugin.MCAP
+            writer = Writer(place, version=9, storage_plugin=plugin)
+        serialize = self.store.serialize_ros1 if self.is_1 else self.store.serialize_cdr
+        connections: dict[str, Any] = {}
+        with writer as bag:
+            for topic, nanoseconds, message in said:
+                name = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = bag.add_connection(topic, name, typestore=self.store)
+                bag.write(connections[topic], nanoseconds, serialize(message, name))
+
 
 @cache
 def _recorded(kind: _Kind) -> bytes:
     """A bag of an image, its calibration and pose, and odometry."""
-    ros = _Ros(kind)
-    said = {
-        "/cam/image_raw": ros.image(),
-        "/cam/camera_info": ros.info(),
-        "/odom": ros.odometry(),
-        "/tf_static": ros.transforms(),
-    }
+    ros = Ros(kind)
+    said = [
+        ("/cam/image_raw", 5, ros.image()),
+        ("/cam/camera_info", 5, ros.info()),
+        ("/odom", 5, ros.odometry()),
+        ("/tf_static", 5, ros.transforms()),
+    ]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "b"
-        if ros.is_1:
-            from rosbags.rosbag1 import Writer as Writer1
-
-            with Writer1(place) as bag1:
-                for topic, message in said.items():
-                    name = message.__msgtype__
-                    connection1 = bag1.add_connection(topic, name, typestore=ros.store)
-                    bag1.write(connection1, 5, ros.store.serialize_ros1(message, name))
-            return place.read_bytes()
-        from rosbags.rosbag2 import StoragePlugin, Writer
-
-        plugin = StoragePlugin.SQLITE3 if kind == "sqlite" else StoragePlugin.MCAP
-        with Writer(place, version=9, storage_plugin=plugin) as bag:
-            for topic, message in said.items():
-                name = message.__msgtype__
-                connection = bag.add_connection(topic, name, typestore=ros.store)
-                bag.write(connection, 5, ros.store.serialize_cdr(message, name))
-        ending = ".db3" if kind == "sqlite" else ".mcap"
-        return (place / f"b{ending}").read_bytes()
+        ros.write(place, said)
+        files = {"ros1": place, "sqlite": place / "b.db3", "mcap": place / "b.mcap"}
+        return files[kind].read_bytes()
 
 
 def _seeds(kind: _Kind) -> tuple[bytes, ...]:
@@ -167,7 +173,7 @@ BAG_READERS: tuple[Reader, ...] = (
     _reader("ros1 bag", "b.bag", "ros1"),
     _reader("sqlite bag", "b.db3", "sqlite"),
     replace(
-        _reader("sqlite cells", "b.db3", "sqlite"), seeds=(b"",), made_seeds=None, files=12,
+        _reader("sqlite cells", "b.db3", "sqlite"), seeds=(b"",), made_seeds=tuple, files=12,
         content=lambda recipe: bag_with_edits(_recorded("sqlite"), recipe),
     ),
 )  # fmt: skip

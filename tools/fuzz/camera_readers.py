@@ -8,12 +8,17 @@ from pathlib import Path
 
 from camera import CameraError, format_camera, parse_camera, read_camera
 from camera.calibration.floor import read_floor_points
-from camera.commands.convert import format_of_text, read_text
 from camera.formats.colmap import format_colmap, parse_colmap
-from camera.formats.kalibr import format_kalibr, parse_kalibr
+from camera.formats.command import format_of_text, read_text
 from camera.formats.models import ForeignCamera
-from camera.formats.opencv import format_opencv, parse_opencv
-from camera.formats.ros import format_ros, parse_ros
+from camera.formats.yaml_files import (
+    format_kalibr,
+    format_opencv,
+    format_ros,
+    parse_kalibr,
+    parse_opencv,
+    parse_ros,
+)
 from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader
 
 

@@ -16,19 +16,19 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.journal import Journal
 from detect.runs.outputs import is_log
+from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
-from detect.sources.gray import (
+from detect.sources.interface import (
     bounded_content,
     decode_gray,
     gray_of_pixels,
+    read_image_times,
     significant_bits_of_file,
 )
-from detect.sources.interface import read_image_times
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
-from redetect.storage.image_header import claimed_size
+from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
 from tools.arrays import ByteArray
 from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader

@@ -10,24 +10,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tools.published_camera import PUBLISHED_CAMERA
+
 #: Numbers and signs that readers of text may stumble over.
 NUMBERS = (b"nan", b"inf", b"1e308", b"-1e-320", b"1_0", b"0x1", b",", b"#", b"\\", b"\x1b[2J")
 
 JSON_WORDS = (b"[", b"]", b"{", b"}", b'"', b":", b"null", b"true", b"1e999", b"NaN", b"-0")
 
-#: A calibration: that of the data set's run e.
-CAMERA_TEXT = b"""{ SmRadialDistortedCamera
-sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
-[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
-[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
-sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
-[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
-[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
-mountIndex: 0
-width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
-coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
-}
-"""
+CAMERA_TEXT = PUBLISHED_CAMERA.encode()
 
 #: Characters of a message beside the file's name.
 LONGEST_MESSAGE = 500
@@ -45,22 +35,18 @@ class Reader:
     words: tuple[bytes, ...] = ()  # Words of its language, for those who put files together.
     beside: Mapping[str, bytes] = field(default_factory=dict)
     """Other files that it needs in the same folder."""
-    made_seeds: Callable[[], tuple[bytes, ...]] | None = None
+    made_seeds: Callable[[], tuple[bytes, ...]] = tuple
     """Makes further files that it accepts, where that takes a while."""
     files: int = 150
     """So many damaged files are read by the tests: fewer where each takes milliseconds."""
     needed: bool = True  # Whether it is an error that there is no file.
-    content: Callable[[bytes], bytes] | None = None
+    content: Callable[[bytes], bytes] = bytes
     """Makes a file's content of bytes, where damage to the file's own would not lead far; seeds are
     then such bytes."""
 
     def all_seeds(self) -> tuple[bytes, ...]:
         """All files that it accepts."""
-        return self.seeds if self.made_seeds is None else (*self.seeds, *self.made_seeds())
-
-    def content_of(self, data: bytes) -> bytes:
-        """What stands in the file: these bytes, or what they say of it."""
-        return data if self.content is None else self.content(data)
+        return (*self.seeds, *self.made_seeds())
 
     def prepare(self, folder: Path) -> Path:
         """Put what stands beside its file into a folder; gives back the file's place."""

@@ -7,17 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from tyro.conf import Positional, arg
 
 from camera import read_camera
-from redetect.landmarks import read_frames
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.graph import graph_of_recording
+from redetect.slam.mounting import check_rows_fit_camera
+from redetect.slam.recording import read_recording
 from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
 from tools.evaluation.tables import Table
-from tools.reenactment.prepare import stages, world_of_stage
-from tools.reenactment.recording import RecordingError, read_map, read_path, recording_of_frames
-from tools.reenactment.world import write_world
+from tools.reenactment.prepare import assess, stages
+from tools.reenactment.world import World, write_world
 
 
 @dataclass(frozen=True)
@@ -34,37 +37,38 @@ class Prepare:
     camera: Path  # Its calibration (.cam), by which the rows were put on the floor.
     output: Annotated[Path, arg(aliases=["-o"])]
     """The .npz to write: poses, prefixes, tilt, disc_ids, disc_xy, robot_from_camera."""
-    path: Path | None = None
-    """Where to begin: the path as rows x, y, theta, first the start (0, 0, 0). Needs --map."""
-    map: Path | None = None
-    """Where to begin: the discs as rows ID, x, y. Needs --path. Without both, odometry will do."""
     force: bool = False  # Overwrite the output.
 
     def __call__(self) -> int:
         if self.output.exists() and not self.force:
             raise OutputExistsError(self.output)
         camera = read_camera(self.camera)
-        recording = recording_of_frames(camera, read_frames(self.landmarks))
-        start = None
-        if self.path is not None and self.map is not None:
-            poses = read_path(self.path, len(recording.steps))
-            start = poses, read_map(self.map, recording.disc_ids)
-        elif self.path is not None or self.map is not None:
-            raise RecordingError("--path and --map belong together: expected both or neither")
-        print(f"{len(recording.steps)} steps, {len(recording.frame)} rows with an ID")
+        recording = read_recording(self.landmarks)
+        graph = graph_of_recording(recording, camera)
+        if not len(graph.disc_ids):
+            raise SlamError(f"{self.landmarks}: no disc with an ID: expected LANDMARK_C rows")
+        check_rows_fit_camera(camera, graph.disc_xy)
+        print(f"{len(graph.steps)} steps, {len(graph.disc_pose)} rows with an ID")
         table = Table(
-            {"stage": "<28", "chi2": ".2f", "unseen": "d", "rotation x, y, z / rad": "<24",
+            {"stage": "<32", "chi2": ".2f", "unseen": "d", "rotation x, y, z / rad": "<24",
              "height / m": "z.4f", "tilt / deg": "<12", "discs": "d", "<= 4 sigma": ".4f",
              "whole px": ".4f", "median / px": ".3f"}
         )  # fmt: skip
-        for stage in stages(camera, recording, start):
-            q = stage.quality
+        for label, mended, found in stages(graph):
+            q = assess(mended, found)
             table.row(
-                q.label, q.chi_squared, q.out_of_sight, ", ".join(f"{a:z.4f}" for a in q.rotation),
-                q.height, ", ".join(f"{a:.3f}" for a in q.tilt_deg), q.discs, q.share,
+                label, q.chi_squared, q.out_of_sight,
+                ", ".join(f"{a:z.4f}" for a in q.mounting[:3]), q.mounting[3],
+                ", ".join(f"{a:.3f}" for a in q.tilt_deg), len(found.disc_xy), q.share,
                 q.share_whole_pixel, q.median_px,
             )  # fmt: skip
-        write_world(self.output, world_of_stage(stage), overwrite=self.force)
+        assert found.tilt is not None
+        assert found.mounting is not None
+        world = World(
+            np.array(recording.prefixes), found.poses[1:], found.tilt[1:], mended.disc_ids,
+            found.disc_xy, found.mounting,
+        )  # fmt: skip
+        write_world(self.output, world, overwrite=self.force)
         print(f"written to {self.output}")
         return 0
 

@@ -1,6 +1,6 @@
 """The world a recorded run happened in: where the robot drove, the discs lay and the camera looked.
 
-A world is what least squares finds (`tools.reenactment.refit`) and what a simulator renders. Its
+A world is what `tools.reenactment.prepare` finds and what `tools.simulator.reenact` renders. Its
 frames:
 
 map
@@ -20,9 +20,9 @@ floor moves its camera as well, but by an amount that its pose takes up.)
 
 from __future__ import annotations
 
-import os
 import zipfile
-from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +30,12 @@ from numpy.typing import NDArray
 from redetect.storage import write_whole
 from tools.arrays import FloatArray, IntArray
 
-# Zip entries carry a date; a constant one makes the same world the same bytes.
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-
 
 class WorldError(ValueError):
     """A file that should hold a world does not."""
 
 
-@dataclass(frozen=True, eq=False)
-class World:
+class World(NamedTuple):
     """A path, the discs beside it and the camera that saw them."""
 
     prefixes: NDArray[np.str_]  # (N,) The prefix of each STEP's image.
@@ -52,42 +48,18 @@ class World:
     robot_from_camera: FloatArray
     """(3, 4) The true mounting: rotation and translation camera -> robot, metres."""
 
-    def __post_init__(self) -> None:
-        frames, discs = len(self.prefixes), len(self.disc_ids)
-        for name, shape in (
-            ("prefixes", (frames,)),
-            ("poses", (frames, 3)),
-            ("tilt", (frames, 2)),
-            ("disc_ids", (discs,)),
-            ("disc_xy", (discs, 2)),
-            ("robot_from_camera", (3, 4)),
-        ):
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise WorldError(f"{name} has shape {found}: expected {shape}")
 
-
-_FIELDS = ("prefixes", "poses", "tilt", "disc_ids", "disc_xy", "robot_from_camera")
-
-
-def write_world(path: str | os.PathLike[str], world: World, *, overwrite: bool = False) -> None:
+def write_world(path: Path, world: World, *, overwrite: bool = False) -> None:
     """Write a world as ``.npz``, one array per field of `World`; the same world, the same bytes."""
-    with write_whole(path, overwrite=overwrite) as stream, zipfile.ZipFile(stream, "w") as archive:
-        for name in _FIELDS:
-            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(entry, "w") as member:
-                np.lib.format.write_array(member, getattr(world, name), allow_pickle=False)
+    with write_whole(path, overwrite=overwrite) as stream:
+        np.savez_compressed(stream, **world._asdict())
 
 
-def read_world(path: str | os.PathLike[str]) -> World:
+def read_world(path: Path) -> World:
     """Read a world that `write_world` wrote."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return World(**{name: archive[name] for name in _FIELDS})
-    except KeyError as error:
-        raise WorldError(
-            f"{path}: {error.args[0]}: expected the arrays {', '.join(_FIELDS)}"
-        ) from None
-    except (ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise WorldError(f"{path}: not a world of arrays (.npz): {error}") from None
+            return World(**{name: archive[name] for name in World._fields})
+    except (KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        fields = ", ".join(World._fields)
+        raise WorldError(f"{path}: {error}: expected a .npz with the arrays {fields}") from None

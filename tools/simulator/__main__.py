@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +17,7 @@ from tools.simulator.laser.settings import LaserSettings
 from tools.simulator.markers.samples import SampleSettings
 from tools.simulator.markers.session import CalibrationErrors, ImageFormat, SessionSettings
 from tools.simulator.renderer import Sensor
-from tools.simulator.runs import PUBLISHED_CAMERA, RunSettings
+from tools.simulator.runs import RunSettings
 
 # A run of the data set has so many frames, discs and things that look like discs.
 _FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
@@ -34,76 +32,83 @@ class Demo:
     force: bool = False  # Replace files that exist.
 
     def __call__(self) -> str:
-        from tools.simulator.runs import DEMO
+        from tools.simulator.runs import DEMO, write_run
 
-        return _write_run(DEMO, self.output, self.jobs, self.force)
+        rows = write_run(DEMO, self.output, jobs=self.jobs, overwrite=self.force)
+        return f"{DEMO.frames} frames, {rows} disc rows"
 
 
 @dataclass(frozen=True)
-class Run:
-    """Render a run through the office: images, odometry, and the truth."""
+class _Drive:
+    """A drive through the office."""
 
     output: Positional[Path]  # Folder of the run; its name is the run's.
-    frames: int = _FULL_FRAMES  # Frames to render.
+    frames: int = _FULL_FRAMES  # Steps to drive, a frame after each.
     seed: int = 1  # Everything about the run follows from it.
     discs: int | None = None  # On the floor along the way; by default 576 in 3297 frames.
-    lookalikes: int | None = None  # Other things on the floor; by default 140 in 3297 frames.
     visits: float = 0.6  # Probability that a room with an open door is visited in passing.
-    skip: int = 0  # Steps of the drive that go by before the first frame.
     unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
     camera: Path | None = None  # Calibration (.cam); the published one by default.
-    jobs: int = 1  # Processes that render.
     force: bool = False  # Replace files that exist.
     style: DriveStyle = field(default_factory=DriveStyle)
+
+    def settings(self) -> RunSettings:
+        """What the run is to be like, without things that look like discs."""
+        from camera import format_camera, read_camera
+
+        settings = RunSettings(
+            name=self.output.resolve().name, frames=self.frames, seed=self.seed, lookalikes=0,
+            discs=self.by_length(self.discs, _FULL_DISCS), visits=self.visits,
+            unlabelled=self.unlabelled, style=self.style,
+        )  # fmt: skip
+        if self.camera is None:
+            return settings
+        return replace(settings, camera_text=format_camera(read_camera(self.camera)))
+
+    def by_length(self, given: int | None, full: int) -> int:
+        """What was asked for, or as many things as the length of a run allows."""
+        return given if given is not None else max(1, round(full * self.frames / _FULL_FRAMES))
+
+
+@dataclass(frozen=True)
+class Run(_Drive):
+    """Render a run through the office: images, odometry, and the truth."""
+
+    lookalikes: int | None = None  # Other things on the floor; by default 140 in 3297 frames.
+    skip: int = 0  # Steps of the drive that go by before the first frame.
+    jobs: int = 1  # Processes that render.
     sensor: Sensor = field(default_factory=Sensor)
 
     def __call__(self) -> str:
-        settings = RunSettings(
-            name=self.output.resolve().name, frames=self.frames, seed=self.seed,
-            discs=_by_length(self.discs, _FULL_DISCS, self.frames),
-            lookalikes=_by_length(self.lookalikes, _FULL_LOOKALIKES, self.frames),
-            visits=self.visits, skip=self.skip, unlabelled=self.unlabelled, style=self.style,
-            camera_text=_camera_text(self.camera), sensor=self.sensor,
-        )  # fmt: skip
-        return _write_run(settings, self.output, self.jobs, self.force)
+        from tools.simulator.runs import write_run
+
+        lookalikes = self.by_length(self.lookalikes, _FULL_LOOKALIKES)
+        settings = replace(
+            self.settings(), lookalikes=lookalikes, skip=self.skip, sensor=self.sensor
+        )
+        rows = write_run(settings, self.output, jobs=self.jobs, overwrite=self.force)
+        return f"{self.frames} frames, {rows} disc rows"
 
 
 @dataclass(frozen=True)
-class Rows:
+class Rows(_Drive):
     """Write odometry and disc rows of a run, without images."""
 
-    output: Positional[Path]  # Folder of the run; its name is the run's.
-    frames: int = _FULL_FRAMES  # Steps to drive.
-    seed: int = 1  # Everything about the run follows from it.
-    discs: int | None = None  # On the floor along the way; by default 576 in 3297 frames.
-    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
-    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
-    camera: Path | None = None  # Calibration (.cam); the published one by default.
     exact: bool = False  # Leave the rows without measurement noise.
     miss: float = 0.0  # Probability that a row is left out.
-    force: bool = False  # Replace files that exist.
-    style: DriveStyle = field(default_factory=DriveStyle)
 
     def __call__(self) -> str:
         from tools.simulator.runs import write_rows
 
-        settings = RunSettings(
-            name=self.output.resolve().name, frames=self.frames, seed=self.seed, lookalikes=0,
-            discs=_by_length(self.discs, _FULL_DISCS, self.frames), visits=self.visits,
-            unlabelled=self.unlabelled, camera_text=_camera_text(self.camera), style=self.style,
-        )  # fmt: skip
         rows = write_rows(
-            settings, self.output, noisy=not self.exact, miss=self.miss, overwrite=self.force
+            self.settings(), self.output, noisy=not self.exact, miss=self.miss, overwrite=self.force
         )
-        return f"{settings.frames} steps, {rows} disc rows"
+        return f"{self.frames} steps, {rows} disc rows"
 
 
 @dataclass(frozen=True)
 class Reenact:
-    """Render what the camera of a recorded run would have seen.
-
-    Prints the discs' quality by distance, shipped and rendered.
-    """
+    """Render what the camera of a recorded run would have seen."""
 
     landmarks: Positional[Path]  # The recorded run's .circles file.
     output: Positional[Path]  # Folder of the run; its name is the run's.
@@ -115,16 +120,13 @@ class Reenact:
     force: bool = False  # Replace files that exist.
 
     def __call__(self) -> str:
-        from tools.simulator.reenact import prepare, quality_table, write_reenactment
+        from tools.simulator.reenact import prepare, write_reenactment
 
         run = prepare(self.landmarks, self.camera, self.world, self.seed)
-        rendered = len(range(0, len(run.frames), self.every))
-        with _progress(rendered) as tick:
-            qualities = write_reenactment(
-                run, self.output, self.every, jobs=self.jobs, overwrite=self.force, on_frame=tick
-            )
-        print("\n".join(quality_table(qualities)))
-        return f"{rendered} frames"
+        frames = write_reenactment(
+            run, self.output, self.every, jobs=self.jobs, overwrite=self.force
+        )
+        return f"{frames} frames"
 
 
 @dataclass(frozen=True)
@@ -141,11 +143,10 @@ class MarkerFrames:
     def __call__(self) -> str:
         from tools.simulator.markers.samples import write_samples
 
-        with _progress(self.count) as tick:
-            markers = write_samples(
-                self.sample, self.output, count=self.count, seed=self.seed, jobs=self.jobs,
-                overwrite=self.force, on_frame=tick,
-            )  # fmt: skip
+        markers = write_samples(
+            self.sample, self.output, count=self.count, seed=self.seed, jobs=self.jobs,
+            overwrite=self.force,
+        )  # fmt: skip
         return f"{self.count} frames, {markers} markers"
 
 
@@ -171,14 +172,10 @@ class MarkerSession:
 
         settings = replace(self.session, name=self.output.resolve().name)
         writer = SessionWriter(self.errors, self.image_format, self.quality, self.force)
-        with _progress(settings.cameras * (settings.references + settings.steps)) as tick:
-            images = write_session(settings, self.output, writer, jobs=self.jobs, on_frame=tick)
+        images = write_session(settings, self.output, writer, self.jobs)
         if not self.calibration:
             return f"{images} images"
-        with _progress(None) as tick:
-            more = write_calibration_set(
-                plan_session(settings), self.output / "calibration", writer, on_frame=tick
-            )
+        more = write_calibration_set(plan_session(settings), self.output / "calibration", writer)
         return f"{images} images, {more} for calibrations"
 
 
@@ -205,19 +202,13 @@ class LaserSession:
 
     output: Positional[Path]  # Folder of the session.
     seed: int = 1  # Everything about it follows from it and the settings.
-    picture: bool = False  # Also draw map, way, scanners and one set of scans: session.png.
     force: bool = False  # Replace files that exist.
     session: Annotated[LaserSettings, arg(name="")] = field(default_factory=LaserSettings)
 
     def __call__(self) -> str:
-        from tools.simulator.laser.session_files import draw_session, write_session
+        from tools.simulator.laser.session_files import write_session
 
-        with _progress(10) as tick:
-            plan = write_session(
-                self.session, self.output, seed=self.seed, overwrite=self.force, on_file=tick
-            )
-        if self.picture:
-            draw_session(self.output, self.output / "session.png", overwrite=self.force)
+        plan = write_session(self.session, self.output, seed=self.seed, overwrite=self.force)
         inside = sum(end - begin for begin, end in plan.visits)
         away = plan.route.end_s - plan.route.start_s - inside
         return f"{len(plan.visits)} visits, {inside:.0f} s in the room and {away:.0f} s outside"
@@ -246,35 +237,6 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
 
     return exit_code_of(perform)
-
-
-def _write_run(settings: RunSettings, output: Path, jobs: int, force: bool) -> str:
-    from tools.simulator.runs import write_run
-
-    with _progress(settings.frames) as tick:
-        rows = write_run(settings, output, jobs=jobs, overwrite=force, on_frame=tick)
-    return f"{settings.frames} frames, {rows} disc rows"
-
-
-def _by_length(given: int | None, full: int, frames: int) -> int:
-    """What was asked for, or as many things as the length of a run allows."""
-    return given if given is not None else max(1, round(full * frames / _FULL_FRAMES))
-
-
-def _camera_text(path: Path | None) -> str:
-    from camera import format_camera, read_camera
-
-    return PUBLISHED_CAMERA if path is None else format_camera(read_camera(path))
-
-
-@contextmanager
-def _progress(total: int | None) -> Iterator[Callable[[], None]]:
-    """A bar; what it gives is called after each frame."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    with Progress(BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) as bar:
-        task = bar.add_task("", total=total)
-        yield lambda: bar.advance(task)
 
 
 if __name__ == "__main__":

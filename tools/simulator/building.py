@@ -16,6 +16,7 @@ from tools.arrays import ByteArray, FloatArray
 from tools.simulator.scene import (
     CEILING_M,
     Construction,
+    Face,
     Flooring,
     Look,
     Texture,
@@ -81,47 +82,31 @@ class Office:
     floor_kind: NDArray[np.int8]
     floorings: FloatArray
     indoors: ByteArray
-    free_spans: list[tuple[FloatArray, FloatArray, FloatArray, float]] = field(default_factory=list)
+    free_spans: list[tuple[Face, float]] = field(default_factory=list)
+    """Stretches of corridor walls without doors: where they begin, and their lengths (m)."""
 
 
 def plan_rooms(rng: np.random.Generator) -> list[Room]:
     low, high = LONG_CORRIDORS_Y
+    west, middle, east = SHORT_CORRIDORS_X
+    half = HALF_CORRIDOR_M
     rooms: list[Room] = []
 
-    def row(x0: float, x1: float, y0: float, y1: float, wall: str, windows: str) -> None:
-        """Split a row of rooms along x."""
-        borders = _split(x0, x1, rng)
-        for a, b in pairwise(borders):
-            rooms.append(Room(a, y0, b, y1, wall, (windows,) if windows else ()))
+    def row(x: tuple[float, float], y: tuple[float, float], wall: str, *windows: str) -> None:
+        """Split a row of rooms along the corridor on which their doors are."""
+        along_x = wall in ("south", "north")
+        for a, b in pairwise(_split(*(x if along_x else y), rng)):
+            across, up = ((a, b), y) if along_x else (x, (a, b))
+            rooms.append(Room(across[0], up[0], across[1], up[1], wall, windows))
 
-    def column(x0: float, x1: float, y0: float, y1: float, wall: str, windows: str) -> None:
-        borders = _split(y0, y1, rng)
-        for a, b in pairwise(borders):
-            rooms.append(Room(x0, a, x1, b, wall, (windows,)))
-
-    row(0.0, WIDTH_M, 0.0, low - HALF_CORRIDOR_M, "north", "south")
-    row(0.0, WIDTH_M, high + HALF_CORRIDOR_M, DEPTH_M, "south", "north")
-    column(
-        0.0,
-        SHORT_CORRIDORS_X[0] - HALF_CORRIDOR_M,
-        low + HALF_CORRIDOR_M,
-        high - HALF_CORRIDOR_M,
-        "east",
-        "west",
-    )
-    column(
-        SHORT_CORRIDORS_X[2] + HALF_CORRIDOR_M,
-        WIDTH_M,
-        low + HALF_CORRIDOR_M,
-        high - HALF_CORRIDOR_M,
-        "west",
-        "east",
-    )
-    middle = 0.5 * (low + high)
-    for k in range(2):
-        x0, x1 = SHORT_CORRIDORS_X[k] + HALF_CORRIDOR_M, SHORT_CORRIDORS_X[k + 1] - HALF_CORRIDOR_M
-        row(x0, x1, low + HALF_CORRIDOR_M, middle, "south", "")
-        row(x0, x1, middle, high - HALF_CORRIDOR_M, "north", "")
+    row((0.0, WIDTH_M), (0.0, low - half), "north", "south")
+    row((0.0, WIDTH_M), (high + half, DEPTH_M), "south", "north")
+    row((0.0, west - half), (low + half, high - half), "east", "west")
+    row((east + half, WIDTH_M), (low + half, high - half), "west", "east")
+    halfway = 0.5 * (low + high)
+    for begin, end in ((west, middle), (middle, east)):
+        row((begin + half, end - half), (low + half, halfway), "south")
+        row((begin + half, end - half), (halfway, high - half), "north")
     for room in rooms:
         along = (room.x0, room.x1) if room.door_wall in ("south", "north") else (room.y0, room.y1)
         margin = 0.95
@@ -202,125 +187,97 @@ class Window(Opening):
 
 
 def add_wall(
-    building: Construction,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    openings: list[Opening],
-    left: Look,
-    right: Look,
-    extend: tuple[bool, bool] = (True, True),
-) -> None:
+    building: Construction, start: tuple[float, float], end: tuple[float, float],
+    openings: list[Opening], left: Look, right: Look, extend: tuple[bool, bool] = (True, True),
+) -> None:  # fmt: skip
     """Add a wall. `start`, `end` (x, y)."""
     p, q = np.array(start), np.array(end)
     length = float(np.linalg.norm(q - p))
     e = (q - p) / length
-    n = np.array([-e[1], e[0]])
+    wall = Face(p, e, np.array([-e[1], e[0]]))
     half = 0.5 * WALL_THICKNESS_M
     first = -half if extend[0] else 0.0
     last = length + half if extend[1] else length
     ordered = sorted(openings, key=lambda o: o.begin)
     for side, look in ((1.0, left), (-1.0, right)):
-        face = p + side * half * n
-        building.faces.append((face + first * e, face + last * e))
+        face = wall.moved(0.0, side * half)
+        building.faces.append((face.point(first), face.point(last)))
         at = first
         for hole in ordered:
-            a, b = face + hole.begin * e, face + hole.end * e
-            building.upright(face + at * e, a, 0.0, CEILING_M, look)
-            building.upright(a, b, 0.0, hole.sill, look)
-            building.upright(a, b, hole.head, CEILING_M, look)
+            building.panel(face, (at, hole.begin), (0.0, CEILING_M), look)
+            building.panel(face, (hole.begin, hole.end), (0.0, hole.sill), look)
+            building.panel(face, (hole.begin, hole.end), (hole.head, CEILING_M), look)
             at = hole.end
-        building.upright(face + at * e, face + last * e, 0.0, CEILING_M, look)
+        building.panel(face, (at, last), (0.0, CEILING_M), look)
     for s in (first, last):  # the ends are seen only where the wall stands free
-        building.upright(p + s * e - half * n, p + s * e + half * n, 0.0, CEILING_M, left)
+        building.upright(wall.point(s, -half), wall.point(s, half), 0.0, CEILING_M, left)
     for hole in ordered:
-        _add_reveal(building, p, e, n, hole, left)
+        _add_reveal(building, wall, hole, left)
         if isinstance(hole, Door):
-            _add_door(building, p, e, n, hole)
+            _add_door(building, wall, hole)
         elif isinstance(hole, Window):
-            _add_window(building, p, e, n, hole)
+            _add_window(building, wall, hole)
 
 
-def _add_reveal(
-    building: Construction, p: FloatArray, e: FloatArray, n: FloatArray, hole: Opening, look: Look
-) -> None:
+def _add_reveal(building: Construction, wall: Face, hole: Opening, look: Look) -> None:
     half = 0.5 * WALL_THICKNESS_M
-    inner = Look(Texture.PLAIN, look.albedo)
-    if isinstance(hole, Door):
-        inner = hole.casing
+    inner = hole.casing if isinstance(hole, Door) else Look(Texture.PLAIN, look.albedo)
     for s in (hole.begin, hole.end):
-        building.upright(
-            p + s * e - half * n, p + s * e + half * n, hole.sill, hole.head, inner, "reveal"
-        )
-    corner = p + hole.begin * e - half * n
-    across = (hole.end - hole.begin) * e
-    building.level(corner, across, 2.0 * half * n, hole.head, inner)
+        ends = wall.point(s, -half), wall.point(s, half)
+        building.upright(*ends, hole.sill, hole.head, inner, "reveal")
+    across = (hole.end - hole.begin) * wall.along, 2.0 * half * wall.out
+    building.level(wall.point(hole.begin, -half), *across, hole.head, inner)
     if hole.sill > 0.0:
-        building.level(corner, across, 2.0 * half * n, hole.sill, inner)
+        building.level(wall.point(hole.begin, -half), *across, hole.sill, inner)
 
 
-def _add_door(
-    building: Construction, p: FloatArray, e: FloatArray, n: FloatArray, door: Door
-) -> None:
+def _add_door(building: Construction, wall: Face, door: Door) -> None:
     half = 0.5 * WALL_THICKNESS_M
     for side in (1.0, -1.0):
-        off = side * (half + 0.5 * _CASING_DEPTH_M) * n
+        off = side * (half + 0.5 * _CASING_DEPTH_M)
+        top = door.head + _CASING_M
         for s in (door.begin - 0.5 * _CASING_M, door.end + 0.5 * _CASING_M):
-            building.box(
-                p + s * e + off, _CASING_M, _CASING_DEPTH_M, 0.0, door.head + _CASING_M,
-                door.casing, "door casing", e,
-            )  # fmt: skip
-        middle = p + 0.5 * (door.begin + door.end) * e + off
-        building.box(
-            middle, door.end - door.begin, _CASING_DEPTH_M, door.head, door.head + _CASING_M,
-            door.casing, "", e,
-        )  # fmt: skip
+            size = _CASING_M, _CASING_DEPTH_M
+            building.block(wall.moved(s, off), size, (0.0, top), door.casing, "door casing")
+        middle = wall.moved(0.5 * (door.begin + door.end), off)
+        size = door.end - door.begin, _CASING_DEPTH_M
+        building.block(middle, size, (door.head, top), door.casing)
     if door.leaf_deg is None:
         return
     width = door.end - door.begin - 0.01
     hinge_s, sense = (door.end - 0.005, -1.0) if door.hinge_at_end else (door.begin + 0.005, 1.0)
     inward = float(door.inward)
-    hinge = p + hinge_s * e + inward * (half - 0.5 * _LEAF_THICKNESS_M) * n
     angle = np.radians(door.leaf_deg)
-    along = np.cos(angle) * sense * e + np.sin(angle) * inward * n
-    building.box(
-        hinge + 0.5 * width * along, width, _LEAF_THICKNESS_M, 0.01, door.head - 0.01,
-        door.leaf, "door leaf", along,
-    )  # fmt: skip
-    across = np.array([-along[1], along[0]])
+    along = np.cos(angle) * sense * wall.along + np.sin(angle) * inward * wall.out
+    hinge = wall.point(hinge_s, inward * (half - 0.5 * _LEAF_THICKNESS_M))
+    leaf = Face(hinge, along, np.array([-along[1], along[0]]))
+    heights = 0.01, door.head - 0.01
+    middle = leaf.moved(0.5 * width)
+    building.block(middle, (width, _LEAF_THICKNESS_M), heights, door.leaf, "door leaf")
     for side in (1.0, -1.0):
-        knob = hinge + (width - 0.07) * along + side * (0.5 * _LEAF_THICKNESS_M + 0.02) * across
-        building.box(knob, 0.13, 0.03, 1.02, 1.05, Look(Texture.METAL, 0.6), "", along)
+        knob = leaf.moved(width - 0.07, side * (0.5 * _LEAF_THICKNESS_M + 0.02))
+        building.block(knob, (0.13, 0.03), (1.02, 1.05), Look(Texture.METAL, 0.6))
 
 
-def _add_window(
-    building: Construction, p: FloatArray, e: FloatArray, n: FloatArray, window: Window
-) -> None:
-    inside = float(window.inside) * n
-    a, b = p + window.begin * e, p + window.end * e
-    glass_out = -0.03 * inside
-    building.upright(
-        a, b, window.sill, window.head, Look(Texture.WINDOW, 0.1, emission=window.radiance)
-    )
-    building.upright(
-        a + glass_out, b + glass_out, window.sill, window.head, Look(Texture.WINDOW, 0.08)
-    )
+def _add_window(building: Construction, wall: Face, window: Window) -> None:
+    inside = float(window.inside)
+    span, heights = (window.begin, window.end), (window.sill, window.head)
+    glass = Look(Texture.WINDOW, 0.1, emission=window.radiance)
+    building.panel(wall, span, heights, glass)
+    outer = [wall.point(at, -0.03 * inside) for at in span]
+    building.upright(outer[0], outer[1], *heights, Look(Texture.WINDOW, 0.08))
     bar = 0.05
     width = window.end - window.begin
     for k in range(window.panes + 1):
         s = window.begin + 0.5 * bar + (width - bar) * k / window.panes
-        building.box(
-            p + s * e + 0.02 * inside, bar, 0.05, window.sill, window.head, window.frame,
-            "window frame", e,
-        )  # fmt: skip
-    middle = p + 0.5 * (window.begin + window.end) * e + 0.02 * inside
+        upright = wall.moved(s, 0.02 * inside)
+        building.block(upright, (bar, 0.05), heights, window.frame, "window frame")
+    middle = 0.5 * (window.begin + window.end)
     for z in (window.sill, window.head - bar):
-        building.box(middle, width, 0.05, z, z + bar, window.frame, "", e)
+        building.block(wall.moved(middle, 0.02 * inside), (width, 0.05), (z, z + bar), window.frame)
     if window.blind > 0.0:
         z = window.head - window.blind * (window.head - window.sill)
-        off = 0.05 * inside
-        building.upright(a + off, b + off, z, window.head, Look(albedo=0.8, emission=0.75))
-    board = 0.5 * WALL_THICKNESS_M + 0.10
-    building.box(
-        p + 0.5 * (window.begin + window.end) * e + board * inside,
-        width + 0.1, 0.22, window.sill - 0.03, window.sill, window.frame, "", e,
-    )  # fmt: skip
+        ends = [wall.point(at, 0.05 * inside) for at in span]
+        building.upright(ends[0], ends[1], z, window.head, Look(albedo=0.8, emission=0.75))
+    board = wall.moved(middle, (0.5 * WALL_THICKNESS_M + 0.10) * inside)
+    building.block(board, (width + 0.1, 0.22), (window.sill - 0.03, window.sill), window.frame)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from camera.uncertainty import with_pose
+from redetect.groundtruth.trajectories.transforms import transform
 from redetect.landmarks import Step
+from redetect.plane import between
+from redetect.slam.models import move, move_jacobians
+from redetect.slam.recording import Recording
 from tools.arrays import FloatArray
-
-
-def world_from_robot(pose: ArrayLike) -> FloatArray:
-    """(4, 4) transform of a robot at (x, y, heading): metres, radians; level."""
-    x, y, heading = np.asarray(pose, dtype=np.float64)
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
@@ -24,48 +23,13 @@ def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
     p, q = np.asarray(tilt_rad, dtype=np.float64)
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_rotvec([p, q, 0.0]).as_matrix()
-    return transform
-
-
-def relative_pose(before: ArrayLike, after: ArrayLike) -> FloatArray:
-    """Poses in the robot frames of other poses: what odometry measures.
-    `before`, `after` (..., 3); returns (..., 3).
-    """
-    a, b = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    dphi = b[..., 2] - a[..., 2]
-    dphi = np.pi - np.mod(np.pi - dphi, 2.0 * np.pi)
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, dphi], axis=-1)
-
-
-def world_to_robot(pose: ArrayLike, world_xy: ArrayLike) -> FloatArray:
-    """Points of the world's floor in the frame of a level robot.
-    `pose` (3,); `world_xy` (..., 2); returns (..., 2).
-    """
-    x, y, heading = np.asarray(pose, dtype=np.float64)
-    c, s = np.cos(heading), np.sin(heading)
-    off = np.asarray(world_xy, dtype=np.float64) - (x, y)
-    return np.stack(
-        [c * off[..., 0] + s * off[..., 1], -s * off[..., 0] + c * off[..., 1]], axis=-1
-    )
+    return transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
 
 
 def tilted_camera(camera: Camera, tilt_rad: ArrayLike) -> Camera:
     """The camera of a tilted robot, its pose relative to the level robot frame."""
     pose = np.vstack([np.array(camera.robot_from_camera), [0.0, 0.0, 0.0, 1.0]])
-    return with_mounting(camera, (level_from_tilted(tilt_rad) @ pose)[:3])
-
-
-def with_mounting(camera: Camera, robot_from_camera: ArrayLike) -> Camera:
-    """The same camera mounted elsewhere: (3, 4) transform camera -> robot."""
-    rows = tuple(
-        (float(a), float(b), float(c), float(d))
-        for a, b, c, d in np.asarray(robot_from_camera, dtype=np.float64)
-    )
-    return replace(camera, robot_from_camera=rows)
+    return with_pose(camera, (level_from_tilted(tilt_rad) @ pose)[:3])
 
 
 _DENSE_M = 0.01
@@ -234,7 +198,7 @@ def measured_steps(
 ) -> FloatArray:
     """Steps as odometry measures them. `poses` (N + 1, 3); `wrong` (N,); returns (N, 3)."""
     pose = np.asarray(poses, dtype=np.float64)
-    true = relative_pose(pose[:-1], pose[1:])
+    true = between(pose[:-1], pose[1:])
     root = np.linalg.cholesky(step_covariance(true) + 1e-18 * np.eye(3))
     noise = rng.standard_normal(true.shape)
     measured = true + np.einsum("nij,nj->ni", root, noise)
@@ -245,44 +209,24 @@ def measured_steps(
     return np.asarray(measured)
 
 
-def step_record(prefix: str, step: FloatArray) -> Step:
-    """Row of a measured step; its covariance is that of the measured movement."""
-    c = step_covariance(step)
-    dx, dy, dphi = (float(x) for x in step)
-    return Step(
-        prefix, dx, dy, dphi, float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[0, 2]),
-        float(c[1, 2]), float(c[2, 2]),
-    )  # fmt: skip
+def step_record(prefix: str, step: FloatArray, covariance: FloatArray | None = None) -> Step:
+    """Row of a measured step; by default its covariance is that of the measured movement."""
+    c = step_covariance(step) if covariance is None else covariance
+    numbers = *step, c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2]
+    return Step(prefix, *map(float, numbers))
 
 
-def joined_steps(steps: list[Step], kept: list[int]) -> list[Step]:
+def joined_steps(recording: Recording, kept: Sequence[int]) -> list[Step]:
     """Odometry of a run of which only some frames are kept."""
     joined: list[Step] = []
     first = 0
     for last in kept:
         pose, covariance = np.zeros(3), np.zeros((3, 3))
-        for step in steps[first : last + 1]:
-            move = np.array([step.dx, step.dy, step.dphi])
-            c, s = np.cos(pose[2]), np.sin(pose[2])
-            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-            lever = np.eye(3)
-            lever[:2, 2] = [-s * move[0] - c * move[1], c * move[0] - s * move[1]]
-            own = np.array(
-                [
-                    [step.cxx, step.cxy, step.cxphi],
-                    [step.cxy, step.cyy, step.cyphi],
-                    [step.cxphi, step.cyphi, step.cphiphi],
-                ]
-            )
-            covariance = lever @ covariance @ lever.T + turn @ own @ turn.T
-            pose = pose + turn @ move
-        a = covariance
-        joined.append(
-            Step(
-                steps[last].prefix, float(pose[0]), float(pose[1]), float(pose[2]),
-                float(a[0, 0]), float(a[0, 1]), float(a[1, 1]), float(a[0, 2]), float(a[1, 2]),
-                float(a[2, 2]),
-            )
-        )  # fmt: skip
+        for k in range(first, last + 1):
+            by_pose, by_step = move_jacobians(pose, recording.steps[k])
+            covariance = by_pose @ covariance @ by_pose.T
+            covariance += by_step @ recording.step_covariance[k] @ by_step.T
+            pose = move(pose, recording.steps[k])
+        joined.append(step_record(recording.prefixes[last], pose, covariance))
         first = last + 1
     return joined

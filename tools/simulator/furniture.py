@@ -1,15 +1,10 @@
-"""What stands in rooms and corridors, hangs on walls and ceilings, and lies on the floor.
-
-A place on a wall is given by a point on the wall's face, the unit vector along it, and the unit
-vector out of it into the room.
-"""
+"""What stands in rooms and corridors, hangs on walls and ceilings, and lies on the floor."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from tools.arrays import FloatArray
-from tools.simulator import furniture
 from tools.simulator.building import (
     CORRIDOR_M,
     HALF_CORRIDOR_M,
@@ -21,110 +16,86 @@ from tools.simulator.building import (
     Office,
     Room,
 )
-from tools.simulator.scene import Construction, FloorMark, Look, Mark, Texture
+from tools.simulator.scene import Construction, Face, FloorMark, Look, Mark, Texture
 
 _DARK = Look(albedo=0.06)
 _METAL_LEG = Look(Texture.METAL, 0.35)
 
 
-def add_lockers(
-    building: Construction, at: FloatArray, e: FloatArray, n: FloatArray, count: int, albedo: float
-) -> float:
+def add_lockers(building: Construction, face: Face, count: int, albedo: float) -> float:
     """Add a row of lockers beginning at a place on a wall; returns its length (m)."""
     width, depth, height = 0.40, 0.38, 1.80
-    look = Look(Texture.METAL, albedo)
     total = count * width
-    building.box(at + 0.5 * total * e + 0.5 * depth * n, total, depth, 0.0, height, look,
-                 "lockers", e)  # fmt: skip
-    front = at + (depth + 0.003) * n
+    middle = face.moved(0.5 * total, 0.5 * depth)
+    building.block(middle, (total, depth), (0.0, height), Look(Texture.METAL, albedo), "lockers")
+    front = face.moved(0.0, depth + 0.003)
     for k in range(1, count):
-        gap = front + k * width * e
-        building.upright(gap - 0.005 * e, gap + 0.005 * e, 0.05, height, _DARK, "locker gap")
+        gap = front.moved(k * width)
+        building.panel(gap, (-0.005, 0.005), (0.05, height), _DARK, "locker gap")
     for k in range(count):
-        left = front + (k * width + 0.11) * e
+        left = front.moved(k * width + 0.11)
         for z in (1.50, 1.54, 1.58, 1.62):
-            building.upright(left, left + 0.18 * e, z, z + 0.015, _DARK)
-        lock = front + (k * width + 0.33) * e
-        building.box(lock + 0.01 * n, 0.03, 0.02, 0.95, 1.0, _METAL_LEG, "", e)
+            building.panel(left, (0.0, 0.18), (z, z + 0.015), _DARK)
+        lock = front.moved(k * width + 0.33).moved(0.0, 0.01)
+        building.block(lock, (0.03, 0.02), (0.95, 1.0), _METAL_LEG)
     return total
 
 
 def add_poster(
-    building: Construction,
-    at: FloatArray,
-    e: FloatArray,
-    n: FloatArray,
-    width: float,
-    height: float,
-    z: float,
-    look: Look,
+    building: Construction, face: Face, size: tuple[float, float], z: float, look: Look,
     framed: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Hang a poster, notice or picture centred at a place on a wall, its lower side at z."""
-    face = at + 0.006 * n
-    a, b = face - 0.5 * width * e, face + 0.5 * width * e
+    width, height = size
+    face = face.moved(0.0, 0.006)
+    a, b = face.point(-0.5 * width), face.point(0.5 * width)
     # Seen from the room, the left side comes first.
     building.upright(b, a, z, z + height, look, "poster")
     building.pictures.append((*a, *b, z, z + height))
     if framed:
         bar = Look(albedo=0.12)
-        for s in (a, b):
-            building.box(s + 0.008 * n, 0.025, 0.02, z - 0.01, z + height + 0.01, bar,
-                         "picture frame", e)  # fmt: skip
+        for side in (a, b):
+            upright = face._replace(at=side).moved(0.0, 0.008)
+            building.block(
+                upright, (0.025, 0.02), (z - 0.01, z + height + 0.01), bar, "picture frame"
+            )
         for edge in (z - 0.012, z + height):
-            building.box(face + 0.008 * n, width, 0.02, edge, edge + 0.012, bar, "", e)
+            building.block(face.moved(0.0, 0.008), (width, 0.02), (edge, edge + 0.012), bar)
 
 
-def add_radiator(
-    building: Construction, at: FloatArray, e: FloatArray, n: FloatArray, width: float
-) -> None:
+def add_radiator(building: Construction, face: Face, width: float) -> None:
     """Add a ribbed radiator centred at a place on a wall."""
     ribs = int(width / 0.12)
     look = Look(albedo=0.75)
     for k in range(ribs):
-        s = (k + 0.5 - 0.5 * ribs) * 0.12
-        building.box(at + s * e + 0.09 * n, 0.07, 0.08, 0.12, 0.68, look, "radiator rib", e)
-    building.box(at + 0.06 * n, ribs * 0.12, 0.02, 0.14, 0.66, Look(albedo=0.55), "", e)
+        rib = face.moved((k + 0.5 - 0.5 * ribs) * 0.12, 0.09)
+        building.block(rib, (0.07, 0.08), (0.12, 0.68), look, "radiator rib")
+    building.block(face.moved(0.0, 0.06), (ribs * 0.12, 0.02), (0.14, 0.66), Look(albedo=0.55))
 
 
 def add_cupboard(
-    building: Construction,
-    at: FloatArray,
-    e: FloatArray,
-    n: FloatArray,
-    width: float,
-    depth: float,
-    height: float,
-    look: Look,
+    building: Construction, face: Face, width: float, depth: float, height: float, look: Look
 ) -> None:
     """Add a cupboard with doors, its back centred at a place on a wall."""
-    building.box(at + 0.5 * depth * n, width, depth, 0.0, height, look, "cupboard", e)
-    front = at + (depth + 0.003) * n
-    building.upright(
-        front - 0.004 * e, front + 0.004 * e, 0.06, height - 0.02, _DARK, "cupboard gap"
-    )
+    building.block(face.moved(0.0, 0.5 * depth), (width, depth), (0.0, height), look, "cupboard")
+    front = face.moved(0.0, depth + 0.003)
+    building.panel(front, (-0.004, 0.004), (0.06, height - 0.02), _DARK, "cupboard gap")
     for side in (-1.0, 1.0):
-        handle = front + side * 0.05 * e + 0.01 * n
-        building.box(handle, 0.015, 0.02, 0.5 * height, 0.5 * height + 0.12, _DARK, "", e)
+        handle = front.moved(side * 0.05, 0.01)
+        building.block(handle, (0.015, 0.02), (0.5 * height, 0.5 * height + 0.12), _DARK)
 
 
-def add_shelf(
-    building: Construction,
-    at: FloatArray,
-    e: FloatArray,
-    n: FloatArray,
-    width: float,
-    rng: np.random.Generator,
-) -> None:
+def add_shelf(building: Construction, face: Face, width: float, rng: np.random.Generator) -> None:
     """Add a shelf full of books, its back centred at a place on a wall."""
     depth, height = 0.30, 1.95
     board = Look(Texture.WOOD, 0.5)
     for s in (-0.5 * width, 0.5 * width):
-        building.box(at + s * e + 0.5 * depth * n, 0.025, depth, 0.0, height, board, "shelf", e)
+        side = face.moved(s, 0.5 * depth)
+        building.block(side, (0.025, depth), (0.0, height), board, "shelf")
     levels = 5
     for level in range(levels + 1):
         z = level * (height - 0.03) / levels
-        building.box(at + 0.5 * depth * n, width, depth, z, z + 0.025, board, "", e)
+        building.block(face.moved(0.0, 0.5 * depth), (width, depth), (z, z + 0.025), board)
         if level == levels:
             break
         s = -0.5 * width + 0.03
@@ -132,45 +103,39 @@ def add_shelf(
             thick = float(rng.uniform(0.025, 0.09))
             tall = float(rng.uniform(0.22, 0.33))
             grey = float(rng.choice([0.08, 0.15, 0.3, 0.5, 0.75, 0.85]))
-            spine = at + (depth - 0.04) * n + s * e
-            building.upright(
-                spine, spine + thick * e, z + 0.025, z + 0.025 + tall, Look(albedo=grey), "book"
-            )
+            spine = face.moved(0.0, depth - 0.04).moved(s)
+            heights = (z + 0.025, z + 0.025 + tall)
+            building.panel(spine, (0.0, thick), heights, Look(albedo=grey), "book")
             s += thick + (0.12 if rng.random() < 0.08 else 0.002)
-    building.upright(
-        at + 0.02 * n - 0.5 * width * e, at + 0.02 * n + 0.5 * width * e, 0.0, height,
-        Look(albedo=0.12),
-    )  # fmt: skip
+    back = face.moved(0.0, 0.02)
+    building.panel(back, (-0.5 * width, 0.5 * width), (0.0, height), Look(albedo=0.12))
 
 
-def add_table(
-    building: Construction, centre: FloatArray, e: FloatArray, width: float, depth: float, top: Look
-) -> None:
-    """Add a table with four legs; `e` is the direction of its width."""
-    n = np.array([-e[1], e[0]])
-    building.box(centre, width, depth, 0.70, 0.73, top, "", e)
+def add_table(building: Construction, place: Face, width: float, depth: float, top: Look) -> None:
+    """Add a table with four legs."""
+    building.block(place, (width, depth), (0.70, 0.73), top)
     for i in (-1.0, 1.0):
         for j in (-1.0, 1.0):
-            foot = centre + i * (0.5 * width - 0.06) * e + j * (0.5 * depth - 0.06) * n
-            building.box(foot, 0.05, 0.05, 0.0, 0.70, _METAL_LEG, "table leg", e)
+            foot = place.moved(i * (0.5 * width - 0.06), j * (0.5 * depth - 0.06))
+            building.block(foot, (0.05, 0.05), (0.0, 0.70), _METAL_LEG, "table leg")
 
 
-def add_monitor(building: Construction, centre: FloatArray, e: FloatArray) -> None:
-    """Put a screen on a table; `e` is the direction of its width."""
-    building.box(centre, 0.2, 0.16, 0.73, 0.75, _DARK, "", e)
-    building.box(centre, 0.05, 0.04, 0.75, 0.85, _DARK, "", e)
-    building.box(centre, 0.48, 0.05, 0.85, 1.18, Look(albedo=0.07), "screen", e)
+def add_monitor(building: Construction, place: Face) -> None:
+    """Put a screen on a table."""
+    building.block(place, (0.2, 0.16), (0.73, 0.75), _DARK)
+    building.block(place, (0.05, 0.04), (0.75, 0.85), _DARK)
+    building.block(place, (0.48, 0.05), (0.85, 1.18), Look(albedo=0.07), "screen")
 
 
-def add_chair(building: Construction, centre: FloatArray, e: FloatArray, albedo: float) -> None:
-    """Add a chair; `e` is the direction of its width."""
-    n = np.array([-e[1], e[0]])
-    building.box(centre, 0.44, 0.44, 0.43, 0.47, Look(albedo=albedo), "", e)
-    building.box(centre - 0.2 * n, 0.42, 0.035, 0.62, 0.92, Look(albedo=albedo), "chair back", e)
+def add_chair(building: Construction, place: Face, albedo: float) -> None:
+    """Add a chair."""
+    look = Look(albedo=albedo)
+    building.block(place, (0.44, 0.44), (0.43, 0.47), look)
+    building.block(place.moved(0.0, -0.2), (0.42, 0.035), (0.62, 0.92), look, "chair back")
     for i in (-0.19, 0.19):
         for j in (-0.19, 0.19):
             top = 0.62 if j < 0.0 else 0.43
-            building.box(centre + i * e + j * n, 0.028, 0.028, 0.0, top, _METAL_LEG, "", e)
+            building.block(place.moved(i, j), (0.028, 0.028), (0.0, top), _METAL_LEG)
 
 
 def add_plant(building: Construction, centre: FloatArray, rng: np.random.Generator) -> None:
@@ -181,11 +146,9 @@ def add_plant(building: Construction, centre: FloatArray, rng: np.random.Generat
         e = np.array([np.cos(angle), np.sin(angle)])
         size = rng.uniform(0.2, 0.5)
         z = rng.uniform(0.35, 1.0)
-        off = rng.uniform(-0.1, 0.1, 2)
-        building.upright(
-            centre + off - 0.5 * size * e, centre + off + 0.5 * size * e, z, z + size,
-            Look(Texture.FOLIAGE, 0.13),
-        )  # fmt: skip
+        leaf = Face(centre + rng.uniform(-0.1, 0.1, 2), e, e)
+        leaves = Look(Texture.FOLIAGE, 0.13)
+        building.panel(leaf, (-0.5 * size, 0.5 * size), (z, z + size), leaves)
 
 
 def add_bin(building: Construction, centre: FloatArray, albedo: float) -> None:
@@ -209,37 +172,29 @@ def furnish_room(building: Construction, room: Room, rng: np.random.Generator) -
     for wall, (corner, along, out, length) in sides.items():
         if wall == room.door_wall:
             continue
-        p, e, n = np.array(corner), np.array(along), np.array(out)
+        face = Face(np.array(corner), np.array(along), np.array(out))
         if wall in room.windows:
             count = 2 if length > 4.4 else 1
             for k in range(count):
-                at = p + length * (k + 0.5) / count * e
-                furniture.add_radiator(building, at, e, n, 1.2)
-            _add_desk(building, p + 0.3 * length * e + 0.75 * n, e, rng)
+                add_radiator(building, face.moved(length * (k + 0.5) / count), 1.2)
+            _add_desk(building, face.point(0.3 * length, 0.75), face.along, rng)
             continue
-        _fill_wall(building, p, e, n, length, rng)
+        _fill_wall(building, face, length, rng)
 
 
 def _add_desk(
     building: Construction, centre: FloatArray, e: FloatArray, rng: np.random.Generator
 ) -> None:
-    n = np.array([-e[1], e[0]])
-    top = Look(Texture.WOOD, float(rng.uniform(0.4, 0.65)))
-    furniture.add_table(building, centre, e, 1.5, 0.75, top)
-    furniture.add_monitor(building, centre + rng.uniform(-0.3, 0.3) * e, e)
+    desk = Face(centre, e, np.array([-e[1], e[0]]))
+    add_table(building, desk, 1.5, 0.75, Look(Texture.WOOD, float(rng.uniform(0.4, 0.65))))
+    add_monitor(building, desk.moved(rng.uniform(-0.3, 0.3)))
     away = 1.0 if rng.random() < 0.5 else -1.0
-    spot = centre + 0.62 * n * away + rng.uniform(-0.3, 0.3) * e
-    furniture.add_chair(building, spot, e * away, float(rng.choice([0.05, 0.12, 0.4])))
+    spot = centre + 0.62 * desk.out * away + rng.uniform(-0.3, 0.3) * e
+    turned = Face(spot, e * away, np.array([-(e * away)[1], (e * away)[0]]))
+    add_chair(building, turned, float(rng.choice([0.05, 0.12, 0.4])))
 
 
-def _fill_wall(
-    building: Construction,
-    p: FloatArray,
-    e: FloatArray,
-    n: FloatArray,
-    length: float,
-    rng: np.random.Generator,
-) -> None:
+def _fill_wall(building: Construction, face: Face, length: float, rng: np.random.Generator) -> None:
     """Cupboards, shelves and pictures along a wall of a room."""
     at = 0.35
     while at < length - 1.2:
@@ -249,21 +204,18 @@ def _fill_wall(
             look = Look(Texture.WOOD if rng.random() < 0.5 else Texture.METAL,
                         float(rng.choice([0.2, 0.35, 0.6])))  # fmt: skip
             height = float(rng.choice([0.75, 1.2, 1.9]))
-            furniture.add_cupboard(building, p + (at + 0.5 * width) * e, e, n, width, 0.42, height,
-                                   look)  # fmt: skip
+            add_cupboard(building, face.moved(at + 0.5 * width), width, 0.42, height, look)
         elif kind < 0.40:
             width = float(rng.uniform(0.8, 1.0))
-            furniture.add_shelf(building, p + (at + 0.5 * width) * e, e, n, width, rng)
+            add_shelf(building, face.moved(at + 0.5 * width), width, rng)
         elif kind < 0.65:
-            width = _hang_picture(building, p + (at + 0.5) * e, e, n, rng)
+            width = _hang_picture(building, face.moved(at + 0.5), rng)
         else:
             width = float(rng.uniform(0.3, 0.9))
         at += width + float(rng.uniform(0.1, 0.5))
 
 
-def _hang_picture(
-    building: Construction, at: FloatArray, e: FloatArray, n: FloatArray, rng: np.random.Generator
-) -> float:
+def _hang_picture(building: Construction, face: Face, rng: np.random.Generator) -> float:
     """Hang a picture or notice about a place on a wall; returns its width (m)."""
     if rng.random() < 0.65:
         width, height = float(rng.uniform(0.5, 0.9)), float(rng.uniform(0.5, 0.8))
@@ -272,44 +224,41 @@ def _hang_picture(
         width, height = float(rng.choice([0.21, 0.42, 0.6])), 0.6
         look = Look(Texture.PAPER, 0.85)
     z = float(rng.uniform(1.05, 1.4))
-    furniture.add_poster(building, at, e, n, width, height, z, look, bool(rng.random() < 0.5))
+    add_poster(building, face, (width, height), z, look, bool(rng.random() < 0.5))
     return width
 
 
 def furnish_corridors(office: Office, rng: np.random.Generator) -> None:
     building = office.building
     locker_albedo = float(rng.uniform(0.3, 0.5))
-    for start, e, n, length in office.free_spans:
+    for wall, length in office.free_spans:
         at = float(rng.uniform(0.0, 0.4))
         while at < length - 0.45:
             rest = length - at
-            place = start + at * e
+            place = wall.moved(at)
             kind = rng.random()
             if kind < 0.14 and rest > 1.4:
                 count = min(int(rest // 0.4), int(rng.integers(3, 7)))
-                used = furniture.add_lockers(building, place, e, n, count, locker_albedo)
+                used = add_lockers(building, place, count, locker_albedo)
             elif kind < 0.24 and rest > 1.0:
                 used = float(rng.uniform(0.7, 1.0))
-                furniture.add_cupboard(
-                    building, place + 0.5 * used * e, e, n, used, 0.36,
-                    float(rng.choice([0.8, 1.1, 1.8])), Look(Texture.WOOD, 0.4),
-                )  # fmt: skip
+                height = float(rng.choice([0.8, 1.1, 1.8]))
+                middle = place.moved(0.5 * used)
+                add_cupboard(building, middle, used, 0.36, height, Look(Texture.WOOD, 0.4))
             elif kind < 0.52 and rest > 1.0:
-                used = 0.5 + _hang_picture(building, place + 0.5 * e, e, n, rng)
+                used = 0.5 + _hang_picture(building, place.moved(0.5), rng)
             elif kind < 0.62:
-                used = 0.32
-                building.box(place + 0.16 * e + 0.09 * n, 0.32, 0.18, 0.0, 2.8,
-                             Look(Texture.WALL, 0.6, 0.2), "pillar", e)  # fmt: skip
+                used, look = 0.32, Look(Texture.WALL, 0.6, 0.2)
+                building.block(place.moved(0.16, 0.09), (0.32, 0.18), (0.0, 2.8), look, "pillar")
             elif kind < 0.68:
-                used = 0.4
-                building.box(place + 0.2 * e + 0.07 * n, 0.26, 0.14, 0.85, 1.5,
-                             Look(albedo=0.22), "extinguisher box", e)  # fmt: skip
+                used, middle, look = 0.4, place.moved(0.2, 0.07), Look(albedo=0.22)
+                building.block(middle, (0.26, 0.14), (0.85, 1.5), look, "extinguisher box")
             elif kind < 0.75:
                 used = 0.45
-                furniture.add_bin(building, place + 0.2 * e + 0.2 * n, float(rng.uniform(0.1, 0.6)))
+                add_bin(building, place.point(0.2, 0.2), float(rng.uniform(0.1, 0.6)))
             elif kind < 0.80 and rest > 0.6:
                 used = 0.6
-                furniture.add_plant(building, place + 0.3 * e + 0.22 * n, rng)
+                add_plant(building, place.point(0.3, 0.22), rng)
             else:
                 used = float(rng.uniform(0.3, 1.0))
             at += used + float(rng.uniform(0.15, 0.8))
@@ -375,18 +324,14 @@ _LOOKALIKES = ("ring", "ellipse", "large disc", "dark disc", "plate", "paper", "
 
 
 def lay_discs(
-    building: Construction,
-    path: FloatArray,
-    count: int,
-    lookalikes: int,
-    rng: np.random.Generator,
-    within: tuple[float, float, float, float],
-) -> None:
+    building: Construction, path: FloatArray, count: int, lookalikes: int,
+    rng: np.random.Generator, within: tuple[float, float, float, float],
+) -> None:  # fmt: skip
     """Lay discs and lookalikes on the floor on both sides of a path.
     `path` (N, 3); `within` (x0, y0, x1, y1).
     """
     total = count + lookalikes
-    boxes = _boxes(building)
+    boxes = [(ring.min(axis=0), ring.max(axis=0)) for ring in building.footprints]
     walls = _low_segments(building)
     chosen: list[tuple[float, float, float]] = []
     tries = 0
@@ -412,11 +357,8 @@ def lay_discs(
     order = rng.permutation(total)
     discs = sorted((chosen[k] for k in order[:count]), key=lambda c: c[2])
     for number, (x, y, _) in enumerate(discs, start=1):
-        building.marks.append(
-            FloorMark(
-                Mark.DISC, x, y, DISC_RADIUS_M, float(rng.uniform(0.78, 0.92)), disc_id=number
-            )
-        )
+        albedo = float(rng.uniform(0.78, 0.92))
+        building.marks.append(FloorMark(Mark.DISC, x, y, DISC_RADIUS_M, albedo, disc_id=number))
     for k, index in enumerate(order[count:]):
         x, y, _ = chosen[index]
         building.marks.append(_lookalike(_LOOKALIKES[k % len(_LOOKALIKES)], x, y, rng))
@@ -439,10 +381,6 @@ def _lookalike(label: str, x: float, y: float, rng: np.random.Generator) -> Floo
     }
     shape, radius, second, albedo = shapes[label]
     return FloorMark(shape, x, y, radius, albedo, second, angle, label=label)
-
-
-def _boxes(building: Construction) -> list[tuple[FloatArray, FloatArray]]:
-    return [(ring.min(axis=0), ring.max(axis=0)) for ring in building.footprints]
 
 
 def _low_segments(building: Construction) -> FloatArray:

@@ -8,18 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.landmarks import CircleLandmark, LineLandmark
+from redetect.slam.models import disc_in_robot
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from tools.simulator.driving import world_from_robot, world_to_robot
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 
 INNER_M, OUTER_M = 0.06, 0.14
 SAMPLES = 16
-
-#: Borders of forward distance (m), and the shipped rows' median quality between them.
-DISTANCE_BORDERS_M = (0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-SHIPPED_MEDIANS = (0.987, 0.973, 0.924, 0.836, 0.781, 0.703)
 
 
 def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
@@ -39,20 +36,6 @@ def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
         return 0.0
     difference = values[0].mean() - values[1].mean()
     return float(0.25 * difference * difference / total)
-
-
-def best_quality_near(
-    grey: ByteArray, camera: Camera, pixel: ArrayLike, reach: int = 2
-) -> tuple[float, tuple[int, int]]:
-    """The best quality within `reach` pixels of a place, and its pixel (u, v): a detector's row."""
-    u0, v0 = np.rint(np.asarray(pixel, dtype=np.float64)).astype(int)
-    best, where = -1.0, (int(u0), int(v0))
-    for v in range(max(v0 - reach, 0), min(v0 + reach, grey.shape[0] - 1) + 1):
-        for u in range(max(u0 - reach, 0), min(u0 + reach, grey.shape[1] - 1) + 1):
-            found = disc_quality(grey, camera, (u, v))
-            if found > best:
-                best, where = found, (int(u), int(v))
-    return best, where
 
 
 #: A row's centre lies at least so many pixels inside the image, as in the data set.
@@ -138,12 +121,9 @@ def see_discs(
     """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
     from tools.simulator.ray_kernels import points_visible
 
-    robot_xy = world_to_robot(pose, disc_xy)
+    robot_xy = disc_in_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
-    inside = (
-        (pixels[:, 0] >= -0.5) & (pixels[:, 0] < true.width - 0.5)
-        & (pixels[:, 1] >= -0.5) & (pixels[:, 1] < true.height - 0.5)
-    )  # fmt: skip
+    inside = _in_image(true, pixels)
     eye = camera_in_world(true, pose)[:, 3]
     spots = _sunflower(_DISC_POINTS) * radius_m
     seen: list[SeenDisc] = []
@@ -152,10 +132,7 @@ def see_discs(
         world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
         free = points_visible(scene, eye, world, _SLACK_M)
         uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
-        within = (
-            (uv[:, 0] >= -0.5) & (uv[:, 0] < true.width - 0.5)
-            & (uv[:, 1] >= -0.5) & (uv[:, 1] < true.height - 0.5)
-        )  # fmt: skip
+        within = _in_image(true, uv)
         share = float((free & within).mean())
         if share <= 0.0:
             continue
@@ -206,7 +183,7 @@ def see_edges(
     world[..., :2] = place[near, None]
     share = np.linspace(1.0, 0.0, _EDGE_POINTS)
     world[..., 2] = heights[near, :1] + share * (heights[near, 1:] - heights[near, :1])
-    world_to_level = np.linalg.inv(world_from_robot(pose))
+    world_to_level = np.linalg.inv(planar_transform(*pose))
     level = world @ world_to_level[:3, :3].T + world_to_level[:3, 3]
     uv = true.project_robot(level)
     visible = (
@@ -261,6 +238,11 @@ def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
         alpha=edge.bearing_rad, beta=float(np.arcsin(np.clip(normal[2], -1.0, 1.0))),
         quality=0.0, sigma=float(abs(bearing[0] - bearing[1])), ids=(edge.edge_id,),
     )  # fmt: skip
+
+
+def _in_image(camera: Camera, pixels: FloatArray) -> BoolArray:
+    size = np.array([camera.width, camera.height])
+    return np.asarray(np.all((pixels >= -0.5) & (pixels < size - 0.5), axis=-1))
 
 
 def _within_limits(nominal: Camera, pixel: FloatArray) -> bool:

@@ -23,7 +23,7 @@ from tools.simulator.building import (
     plan_rooms,
 )
 from tools.simulator.furniture import add_lamps, add_yard, furnish_corridors, furnish_room
-from tools.simulator.scene import Construction, Look, Texture
+from tools.simulator.scene import Construction, Face, Look, Texture
 
 _DOOR_M = 0.96
 
@@ -86,25 +86,21 @@ def _add_walls(office: Office, paint: Look, room_paint: Look, rng: np.random.Gen
         for hole in [*sorted(openings, key=lambda o: o.begin), None]:
             until = float(np.linalg.norm(q - p)) - 0.15 if hole is None else hole.begin - 0.12
             if until - at > 0.5:
-                office.free_spans.append(
-                    (p + at * e + 0.5 * WALL_THICKNESS_M * n, e, n, until - at)
-                )
+                place = Face(p, e, n).moved(at, 0.5 * WALL_THICKNESS_M)
+                office.free_spans.append((place, until - at))
             at = until if hole is None else hole.end + 0.12
 
     # The rows of rooms south and north; their doors open into the rooms.
-    y = low - HALF_CORRIDOR_M
-    corridor_wall((0.0, y), (WIDTH_M, y), doors("north", y, 0.0, WIDTH_M, -1), True,
-                  (False, False))  # fmt: skip
-    y = high + HALF_CORRIDOR_M
-    corridor_wall((0.0, y), (WIDTH_M, y), doors("south", y, 0.0, WIDTH_M, 1), False,
-                  (False, False))  # fmt: skip
+    for wall, y, inward in (
+        ("north", low - HALF_CORRIDOR_M, -1),
+        ("south", high + HALF_CORRIDOR_M, 1),
+    ):
+        openings = doors(wall, y, 0.0, WIDTH_M, inward)
+        corridor_wall((0.0, y), (WIDTH_M, y), openings, inward < 0, (False, False))
     # The blocks between the corridors.
-    pieces = [
-        (0.0, SHORT_CORRIDORS_X[0] - HALF_CORRIDOR_M),
-        (SHORT_CORRIDORS_X[0] + HALF_CORRIDOR_M, SHORT_CORRIDORS_X[1] - HALF_CORRIDOR_M),
-        (SHORT_CORRIDORS_X[1] + HALF_CORRIDOR_M, SHORT_CORRIDORS_X[2] - HALF_CORRIDOR_M),
-        (SHORT_CORRIDORS_X[2] + HALF_CORRIDOR_M, WIDTH_M),
-    ]
+    half = HALF_CORRIDOR_M
+    borders = [0.0, *(x + side for x in SHORT_CORRIDORS_X for side in (-half, half)), WIDTH_M]
+    pieces = list(zip(borders[::2], borders[1::2]))
     for x0, x1 in pieces:
         extend = (x0 > 0.0, x1 < WIDTH_M)
         y = low + HALF_CORRIDOR_M
@@ -112,13 +108,13 @@ def _add_walls(office: Office, paint: Look, room_paint: Look, rng: np.random.Gen
         y = high - HALF_CORRIDOR_M
         corridor_wall((x0, y), (x1, y), doors("north", y, x0, x1, -1), True, extend)
     y0, y1 = low + HALF_CORRIDOR_M, high - HALF_CORRIDOR_M
-    for k, x in enumerate(SHORT_CORRIDORS_X):
-        corridor_wall((x - HALF_CORRIDOR_M, y0), (x - HALF_CORRIDOR_M, y1),
-                      doors("east", x - HALF_CORRIDOR_M, y0, y1, 1) if k == 0 else [], False,
-                      (True, True))  # fmt: skip
-        corridor_wall((x + HALF_CORRIDOR_M, y0), (x + HALF_CORRIDOR_M, y1),
-                      doors("west", x + HALF_CORRIDOR_M, y0, y1, -1) if k == 2 else [], True,
-                      (True, True))  # fmt: skip
+    for k, middle in enumerate(SHORT_CORRIDORS_X):
+        x = middle - half
+        openings = doors("east", x, y0, y1, 1) if k == 0 else []
+        corridor_wall((x, y0), (x, y1), openings, False, (True, True))
+        x = middle + half
+        openings = doors("west", x, y0, y1, -1) if k == 2 else []
+        corridor_wall((x, y0), (x, y1), openings, True, (True, True))
     _add_partitions(building, rooms, room_paint)
     _add_outer_walls(building, rooms, room_paint, rng)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -15,9 +15,25 @@ _state: Any = None
 
 
 def in_order(
-    function: Callable[[State, Item], Result], state: State, items: Iterable[Item], jobs: int
+    function: Callable[[State, Item], Result], state: State, items: Sequence[Item], jobs: int = 1
 ) -> Iterator[Result]:
-    """Results of ``function(state, item)`` in the order of the items; `state` is sent once."""
+    """Results of ``function(state, item)`` in the order of the items; `state` is sent once.
+
+    On a terminal a bar shows how many there are already.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    terminal = Console(stderr=True)
+    yield from track(
+        _results(function, state, items, jobs), "", len(items), console=terminal, transient=True,
+        disable=not terminal.is_terminal,
+    )  # fmt: skip
+
+
+def _results(
+    function: Callable[[State, Item], Result], state: State, items: Sequence[Item], jobs: int
+) -> Iterator[Result]:
     if jobs <= 1:
         yield from (function(state, item) for item in items)
         return

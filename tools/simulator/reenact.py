@@ -8,24 +8,23 @@ shipped rows.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from camera import Camera, read_camera, write_camera
-from camera.uncertainty import exact
-from redetect.landmarks import Frame, read_frames, write_frames
-from redetect.storage import write_whole
-from tools.arrays import BoolArray, ByteArray, FloatArray
+from camera.uncertainty import exact, with_pose
+from redetect.landmarks import Frame, read_frames, wrap_angle, write_frames
+from redetect.slam.recording import recording_of_frames
+from tools.arrays import BoolArray, ByteArray
 from tools.reenactment.world import World, read_world
-from tools.simulator.driving import joined_steps, with_mounting
-from tools.simulator.observation import DISTANCE_BORDERS_M, SeenDisc, best_quality_near, see_discs
+from tools.simulator.driving import joined_steps
+from tools.simulator.files import encoded, rounded, write_bytes, write_truth
+from tools.simulator.observation import SeenDisc, see_discs
 from tools.simulator.parallel import in_order
-from tools.simulator.renderer import Sensor, encode_jpeg, grey_values, render_light, smeared
+from tools.simulator.renderer import Sensor, grey_values, render_light, smeared
 from tools.simulator.runs import SIMULATED
 from tools.simulator.scene import (
     CEILING_M,
@@ -41,7 +40,7 @@ from tools.simulator.scene import (
     raster_shape,
 )
 
-#: Tuned on the shipped rows' median quality by distance (see `quality_table`): no other figure than
+#: Tuned on the shipped rows' median quality by distance (`detect compare`): no other figure than
 #: the blur makes quality fall with distance as it does, and this one fits all distances at once.
 REENACTED_SENSOR = Sensor(
     blur_px=6.3,
@@ -75,13 +74,11 @@ class Reenactment:
 
 @dataclass(frozen=True)
 class ReenactedFrame:
-    """A rendered frame, what is truly in view, and the quality at each shipped row."""
+    """A rendered frame, and what is truly in view."""
 
     index: int
     grey: ByteArray
     discs: tuple[SeenDisc, ...]
-    qualities: tuple[tuple[float, float, float], ...]
-    """Forward distance (m), shipped quality and rendered quality of shipped rows with an ID."""
 
 
 def prepare(landmarks: Path, camera: Path, world: Path, seed: int) -> Reenactment:
@@ -100,12 +97,13 @@ def reenacted_frame(run: Reenactment, index: int, sensor: Sensor) -> ReenactedFr
     camera = true_camera(run, index)
     pose = run.world.poses[index]
     light = render_light(_showing(run.scene, shown), camera, pose)
-    before = run.world.poses[max(index - 1, 0)]
-    onward = pose + 0.5 * sensor.exposure * _motion(before, pose)
+    motion = pose - run.world.poses[max(index - 1, 0)]
+    motion[2] = wrap_angle(motion[2])
+    onward = pose + 0.5 * sensor.exposure * motion
     grey = grey_values(smeared(light, camera, pose, onward), sensor, rng)
     ids, xy = run.world.disc_ids[shown], run.world.disc_xy[shown]
     discs = see_discs(run.scene, run.camera, camera, pose, ids, xy, _DISC_RADIUS_M)
-    return ReenactedFrame(index, grey, tuple(discs), _qualities(run, index, grey, discs))
+    return ReenactedFrame(index, grey, tuple(discs))
 
 
 def true_camera(run: Reenactment, index: int) -> Camera:
@@ -115,74 +113,41 @@ def true_camera(run: Reenactment, index: int) -> Camera:
     mounting = run.world.robot_from_camera
     p, q = run.world.tilt[index]
     turn = Rotation.from_rotvec([p, q, 0.0]).as_matrix()
-    return with_mounting(run.camera, np.column_stack([turn @ mounting[:, :3], mounting[:, 3]]))
+    return with_pose(run.camera, np.column_stack([turn @ mounting[:, :3], mounting[:, 3]]))
 
 
 def write_reenactment(
-    run: Reenactment,
-    folder: Path,
-    every: int,
-    *,
-    jobs: int = 1,
-    sensor: Sensor = REENACTED_SENSOR,
-    overwrite: bool = False,
-    on_frame: Callable[[], None] | None = None,
-) -> FloatArray:
+    run: Reenactment, folder: Path, every: int, *, jobs: int = 1, overwrite: bool = False
+) -> int:
     """Render every `every`-th frame of a recorded run and write a run folder.
 
     Its ``map.circles`` holds the shipped rows of the rendered frames, so that what is detected
     again can be compared with them; odometry between them is joined.
 
-    Returns (K, 3).
+    Returns the number of frames.
     """
-    name = folder.resolve().name
-    images = folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
+    name, sensor = folder.resolve().name, REENACTED_SENSOR
+    (folder / "images").mkdir(parents=True, exist_ok=True)
     write_camera(exact(run.camera), folder / f"{name}.cam", overwrite=overwrite)
     indices = range(0, len(run.frames), every)
-    truth: list[str] = []
-    qualities: list[tuple[float, float, float]] = []
+    truth: list[dict[str, Any]] = []
     for frame in in_order(_rendered, (run, sensor), indices, jobs):
-        index = frame.index
-        prefix = run.frames[index].step.prefix
-        with write_whole(images / f"{prefix}.jpg", overwrite=overwrite) as out:
-            out.write(encode_jpeg(frame.grey, sensor.jpeg_quality))
-        qualities += frame.qualities
+        image = folder / "images" / f"{run.frames[frame.index].step.prefix}.jpg"
+        jpeg = encoded(frame.grey, quality=sensor.jpeg_quality)
+        write_bytes(image, jpeg, overwrite=overwrite)
         truth.append(_truth_json(run, frame))
-        if on_frame is not None:
-            on_frame()
-    steps = joined_steps([f.step for f in run.frames], list(indices))
+    recording = recording_of_frames(run.frames, name)
+    steps = joined_steps(recording, indices)
     kept = [Frame(step, run.frames[index].landmarks) for step, index in zip(steps, indices)]
     what = f"re-enactment, every {every}th frame, seed {run.seed}"
     head = SIMULATED.format(what=what).rstrip()
-    rows_head = (
-        f"{head}\n\nThe images are simulated; the LANDMARK rows below are the recorded run's own."
-    )
-    write_frames(folder / "map.circles", kept, head=rows_head, overwrite=overwrite)
-    write_frames(
-        folder / f"{name}.txt", [Frame(f.step) for f in kept], head=head, overwrite=overwrite
-    )
-    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
-        out.write(('{"frames": [\n' + ",\n".join(truth) + "\n]}\n").encode())
-    return np.array(qualities).reshape(-1, 3)
-
-
-def quality_table(qualities: FloatArray) -> Iterator[str]:
-    """Lines of a table: median quality of shipped and rendered rows by forward distance.
-    `qualities` (K, 3).
-    """
-    yield f"{'distance / m':>14}{'rows':>8}{'shipped':>10}{'rendered':>10}{'difference':>12}"
-    borders = DISTANCE_BORDERS_M
-    for low, high in pairwise(borders):
-        rows = qualities[(qualities[:, 0] >= low) & (qualities[:, 0] < high)]
-        if not len(rows):
-            yield f"{low:7.1f} - {high:4.1f}{0:8d}"
-            continue
-        shipped, rendered = np.median(rows[:, 1]), np.median(rows[:, 2])
-        yield (
-            f"{low:7.1f} - {high:4.1f}{len(rows):8d}{shipped:10.3f}{rendered:10.3f}"
-            f"{rendered - shipped:+12.3f}"
-        )
+    own = "The images are simulated; the LANDMARK rows below are the recorded run's own."
+    write_frames(folder / "map.circles", kept, head=f"{head}\n\n{own}", overwrite=overwrite)
+    steps_alone = [Frame(f.step) for f in kept]
+    write_frames(folder / f"{name}.txt", steps_alone, head=head, overwrite=overwrite)
+    note = {"note": head.split("\n")}
+    write_truth(folder / "truth.json", note, {"frames": truth}, overwrite=overwrite)
+    return len(indices)
 
 
 def _rendered(state: tuple[Reenactment, Sensor], index: int) -> ReenactedFrame:
@@ -195,12 +160,10 @@ def _scene(world: World, seed: int) -> Scene:
     from scipy.ndimage import gaussian_filter
 
     building = Construction()
-    for disc_id, (x, y) in zip(world.disc_ids, world.disc_xy):
-        building.marks.append(
-            FloorMark(
-                Mark.DISC, float(x), float(y), _DISC_RADIUS_M, _DISC_ALBEDO, disc_id=int(disc_id)
-            )
-        )
+    building.marks += [
+        FloorMark(Mark.DISC, float(x), float(y), _DISC_RADIUS_M, _DISC_ALBEDO, disc_id=int(number))
+        for number, (x, y) in zip(world.disc_ids, world.disc_xy)
+    ]
     places = np.concatenate([world.disc_xy, world.poses[:, :2]])
     low, high = places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
     extent = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
@@ -240,44 +203,14 @@ def _showing(scene: Scene, shown: BoolArray) -> Scene:
     )
 
 
-def _motion(before: FloatArray, after: FloatArray) -> FloatArray:
-    motion = after - before
-    motion[2] = np.pi - np.mod(np.pi - motion[2], 2.0 * np.pi)
-    return np.asarray(motion)
-
-
-def _qualities(
-    run: Reenactment, index: int, grey: ByteArray, discs: list[SeenDisc]
-) -> tuple[tuple[float, float, float], ...]:
-    """Distance, shipped and rendered quality of shipped rows whose disc is in view."""
-    found = []
-    for row in run.frames[index].circles:
-        ids = {i for i in row.ids if i >= 0}
-        candidates = [d for d in discs if d.disc_id in ids]
-        if not candidates:
-            continue
-        place = run.camera.project_floor(np.array([row.px, row.py]))
-        disc = min(candidates, key=lambda d: float(np.hypot(*(d.pixel - place))))
-        rendered, _ = best_quality_near(grey, run.camera, disc.pixel)
-        found.append((-row.py, row.quality, rendered))
-    return tuple(found)
-
-
-def _truth_json(run: Reenactment, frame: ReenactedFrame) -> str:
-    return json.dumps(
-        {
-            "prefix": run.frames[frame.index].step.prefix,
-            "pose": [round(float(v), 9) for v in run.world.poses[frame.index]],
-            "tilt": [round(float(v), 9) for v in run.world.tilt[frame.index]],
-            "discs": [
-                {
-                    "id": d.disc_id,
-                    "robot_xy": [round(float(v), 6) for v in d.robot_xy],
-                    "pixel": [round(float(v), 3) for v in d.pixel],
-                    "cut": d.cut,
-                }
-                for d in frame.discs
-            ],
-        },
-        separators=(",", ":"),
-    )
+def _truth_json(run: Reenactment, frame: ReenactedFrame) -> dict[str, Any]:
+    return {
+        "prefix": run.frames[frame.index].step.prefix,
+        "pose": rounded(run.world.poses[frame.index], 9),
+        "tilt": rounded(run.world.tilt[frame.index], 9),
+        "discs": [
+            {"id": d.disc_id, "robot_xy": rounded(d.robot_xy, 6), "pixel": rounded(d.pixel, 3),
+             "cut": d.cut}
+            for d in frame.discs
+        ],
+    }  # fmt: skip

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import lens_numbers
+from redetect.groundtruth.trajectories.transforms import planar_transform
 from tools.arrays import ByteArray, Float32Array, FloatArray
-from tools.simulator.driving import world_from_robot
 from tools.simulator.scene import Scene
 
 _INVERSE_NODES = 16384
@@ -63,7 +63,7 @@ def optics_of(camera: Camera) -> Optics:
 def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:
     """(3, 4) pose in the world of a camera on a robot at (x, y, heading)."""
     mounting = np.vstack([np.array(camera.robot_from_camera), [0.0, 0.0, 0.0, 1.0]])
-    return np.asarray((world_from_robot(pose) @ mounting)[:3])
+    return np.asarray((planar_transform(*pose) @ mounting)[:3])
 
 
 def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
@@ -186,13 +186,3 @@ def _through_lens(radiance: Float32Array, sensor: Sensor) -> FloatArray:
         scattered = cv2.resize(wide, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
         light = (1.0 - sensor.glare) * light + sensor.glare * scattered
     return np.asarray(light)
-
-
-def encode_jpeg(grey: ByteArray, quality: int) -> bytes:
-    """A grey JPEG file's bytes."""
-    import cv2
-
-    done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
-        raise ValueError(f"an image of {grey.shape} could not be encoded as JPEG")
-    return bytes(encoded)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
 from camera.uncertainty import exact
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
-from redetect.storage import write_whole
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from tools.published_camera import PUBLISHED_CAMERA
 from tools.simulator.building import EXTENT
 from tools.simulator.driving import (
     DriveStyle,
@@ -24,6 +23,7 @@ from tools.simulator.driving import (
     step_record,
     tilted_camera,
 )
+from tools.simulator.files import encoded, rounded, write_bytes, write_truth
 from tools.simulator.furniture import DISC_RADIUS_M, lay_discs
 from tools.simulator.observation import (
     SeenDisc,
@@ -35,23 +35,8 @@ from tools.simulator.observation import (
 )
 from tools.simulator.office import build_office, is_outside, office_route
 from tools.simulator.parallel import in_order
-from tools.simulator.renderer import Sensor, encode_jpeg, grey_values, render_light, smeared
+from tools.simulator.renderer import Sensor, grey_values, render_light, smeared
 from tools.simulator.scene import Scene, UprightEdge, make_scene
-
-#: The published calibration of run e of the DLR Spatial Cognition data set.
-PUBLISHED_CAMERA = """\
-{ SmRadialDistortedCamera
-sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
-[ 0.00718218, -0.0591054, 0.998226, 0.142944 ]
-[ -0.0103862, -0.998202, -0.0590291, 0.0522051 ]
-sensor2World: [ -0.99992, 0.00994383, 0.00778315, 0.0179777 ]
-[ -0.00211987, 0.475426, -0.879753, -0.0808609 ]
-[ -0.0124484, -0.879699, -0.475367, 1.50354 ]
-mountIndex: 0
-width: 768 height: 288 scaleX: 464.762 scaleY: 232.381 offsetX: 384 offsetY: 144
-coef: { -0.0620672 -0.324903 0.314764 1.52524 -0.480806 }
-}
-"""
 
 _SUN = (0.30, -0.70, 0.50, 3.0)
 _SKY = 3.0
@@ -105,19 +90,12 @@ class RunPlan:
 
 
 Purpose = Literal["building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows"]
-_PURPOSES: tuple[Purpose, ...] = (
-    "building", "route", "drive", "marks", "tilt", "odometry", "labels", "rows",
-)  # fmt: skip
+_PURPOSES = get_args(Purpose)
 
 
 def random_for(seed: int, purpose: Purpose) -> np.random.Generator:
     """A stream of random numbers of its own for each purpose: changing one leaves the others."""
     return np.random.default_rng(np.random.SeedSequence([seed, _PURPOSES.index(purpose)]))
-
-
-def random_for_frame(seed: int, frame: int) -> np.random.Generator:
-    """The random numbers of one frame, whatever was rendered before it."""
-    return np.random.default_rng(np.random.SeedSequence([seed, len(_PURPOSES), frame]))
 
 
 def plan_run(settings: RunSettings, *, lit: bool = True) -> RunPlan:
@@ -238,7 +216,9 @@ def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
     """Render one frame of a run and say what is in it."""
     import cv2
 
-    rng = random_for_frame(plan.settings.seed, frame)
+    # Its own random numbers, whatever was rendered before it.
+    seed = np.random.SeedSequence([plan.settings.seed, len(_PURPOSES), frame])
+    rng = np.random.default_rng(seed)
     camera = plan.true_camera(frame)
     pose = plan.poses[frame + 1]
     light = render_light(plan.scene, camera, pose)
@@ -246,7 +226,7 @@ def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
     onward = pose + 0.5 * plan.settings.sensor.exposure * (pose - plan.poses[frame])
     radiance = smeared(light, camera, pose, onward)
     grey = grey_values(radiance, plan.settings.sensor, rng)
-    jpeg = encode_jpeg(grey, plan.settings.sensor.jpeg_quality)
+    jpeg = encoded(grey, quality=plan.settings.sensor.jpeg_quality)
     decoded = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     return _truth(plan, frame, jpeg, np.asarray(decoded, dtype=np.uint8))
 
@@ -283,66 +263,49 @@ def _seen_lookalikes(plan: RunPlan, camera: Camera, pose: FloatArray) -> tuple[S
 
 
 def write_run(
-    settings: RunSettings,
-    folder: Path,
-    *,
-    jobs: int = 1,
-    overwrite: bool = False,
-    on_frame: Callable[[], None] | None = None,
+    settings: RunSettings, folder: Path, *, jobs: int = 1, overwrite: bool = False
 ) -> int:
-    """Render a run and write its folder.
+    """Render a run and write its folder, which should have its name; returns the disc rows' number.
 
-    Parameters
-    ----------
-    settings : RunSettings
-        The run; its name should be the folder's.
-    folder : Path
-        Where it goes; made if missing.
-    jobs : int
-        Processes that render frames.
-    overwrite : bool
-        Whether existing files may be replaced.
-    on_frame : callable, optional
-        Called after each frame.
-
-    Returns
-    -------
-    int
-        Number of disc rows.
+    `overwrite`: whether existing files may be replaced.
 
     Raises
     ------
     redetect.storage.OutputExistsError
-        If a file exists and `overwrite` is false.
+        If a file exists and may not be replaced.
     """
     plan = plan_run(settings)
-    name = settings.name
-    images = folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    what = f"run {name}, seed {settings.seed}, {settings.frames} frames"
+    what = f"run {settings.name}, seed {settings.seed}, {settings.frames} frames"
     if settings.skip:
         what += f" after {settings.skip} skipped"
-    write_camera(exact(plan.camera), folder / f"{name}.cam", overwrite=overwrite)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
     truths: list[FrameTruth] = []
     for truth in in_order(render_frame, plan, range(settings.frames), jobs):
-        if truth.jpeg is not None:
-            with write_whole(
-                images / f"{plan.prefix(truth.frame)}.jpg", overwrite=overwrite
-            ) as out:
-                out.write(truth.jpeg)
+        assert truth.jpeg is not None
+        image = folder / "images" / f"{plan.prefix(truth.frame)}.jpg"
+        write_bytes(image, truth.jpeg, overwrite=overwrite)
         # The bytes of all images need not be kept.
         truths.append(replace(truth, jpeg=None))
-        if on_frame is not None:
-            on_frame()
-    _write_steps(plan, folder, what, overwrite)
-    _write_landmarks(plan, folder / "map.circles", what, _CIRCLE_FORMAT,
-                     [t.circles for t in truths], overwrite)  # fmt: skip
-    _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, [t.lines for t in truths],
-                     overwrite)  # fmt: skip
+    circles = [t.circles for t in truths]
+    _write_seen(plan, folder, what, (_CIRCLE_FORMAT, circles), truths, overwrite)
+    lines = [t.lines for t in truths]
+    _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, lines, overwrite)
     write_beside(plan, folder, what, truths, overwrite=overwrite)
-    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
-        out.write(_truth_json(plan, truths, what).encode())
-    return sum(len(t.circles) for t in truths)
+    return sum(map(len, circles))
+
+
+def _write_seen(
+    plan: RunPlan, folder: Path, what: str, circles: tuple[str, Sequence[tuple[Landmark, ...]]],
+    truths: list[FrameTruth], overwrite: bool,
+) -> None:  # fmt: skip
+    """Write calibration, odometry, the rows of discs (and what is said of them) and the truth."""
+    name = plan.settings.name
+    write_camera(exact(plan.camera), folder / f"{name}.cam", overwrite=overwrite)
+    no_rows: list[tuple[Landmark, ...]] = [() for _ in truths]
+    _write_landmarks(plan, folder / f"{name}.txt", what, "", no_rows, overwrite)
+    _write_landmarks(plan, folder / "map.circles", what, *circles, overwrite)
+    head, lists = _truth_of(plan, truths, what)
+    write_truth(folder / "truth.json", head, lists, overwrite=overwrite)
 
 
 def write_beside(
@@ -379,13 +342,9 @@ def _nominal_row(disc: SeenDisc) -> CircleLandmark:
 
 
 def write_rows(
-    settings: RunSettings,
-    folder: Path,
-    *,
-    noisy: bool = True,
-    miss: float = 0.0,
+    settings: RunSettings, folder: Path, *, noisy: bool = True, miss: float = 0.0,
     overwrite: bool = False,
-) -> int:
+) -> int:  # fmt: skip
     """Write a run without images: odometry, and disc rows with or without measurement noise."""
     plan = plan_run(settings, lit=False)
     rng = random_for(settings.seed, "rows")
@@ -396,36 +355,21 @@ def write_rows(
         rows.append(tuple(_disturbed(row, rng) for row in kept) if noisy else tuple(kept))
     folder.mkdir(parents=True, exist_ok=True)
     what = f"run {settings.name}, seed {settings.seed}, {settings.frames} steps, no images"
-    write_camera(exact(plan.camera), folder / f"{settings.name}.cam", overwrite=overwrite)
-    _write_steps(plan, folder, what, overwrite)
     text = _NOISY_CIRCLE_FORMAT if noisy else _CIRCLE_FORMAT
-    _write_landmarks(plan, folder / "map.circles", what, text, rows, overwrite)
-    with write_whole(folder / "truth.json", overwrite=overwrite) as out:
-        out.write(_truth_json(plan, truths, what).encode())
-    return sum(len(r) for r in rows)
+    _write_seen(plan, folder, what, (text, rows), truths, overwrite)
+    return sum(map(len, rows))
 
 
 def _disturbed(row: CircleLandmark, rng: np.random.Generator) -> CircleLandmark:
     covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
     dx, dy = np.linalg.cholesky(covariance) @ rng.standard_normal(2)
-    return CircleLandmark(
-        row.px + float(dx), row.py + float(dy), row.quality, row.cxx, row.cxy, row.cyy, row.ids
-    )
-
-
-def _write_steps(plan: RunPlan, folder: Path, what: str, overwrite: bool) -> None:
-    _write_landmarks(plan, folder / f"{plan.settings.name}.txt", what, "",
-                     [() for _ in range(plan.settings.frames)], overwrite)  # fmt: skip
+    return replace(row, px=row.px + float(dx), py=row.py + float(dy))
 
 
 def _write_landmarks(
-    plan: RunPlan,
-    path: Path,
-    what: str,
-    row_format: str,
-    rows: Iterable[tuple[Landmark, ...]],
+    plan: RunPlan, path: Path, what: str, row_format: str, rows: Iterable[tuple[Landmark, ...]],
     overwrite: bool,
-) -> None:
+) -> None:  # fmt: skip
     head = "\n".join(
         part for part in (SIMULATED.format(what=what).rstrip(), "", _STEP_FORMAT, row_format)
     ).rstrip()
@@ -436,8 +380,10 @@ def _write_landmarks(
     write_frames(path, frames, head=head, overwrite=overwrite)
 
 
-def _truth_json(plan: RunPlan, truths: list[FrameTruth], what: str) -> str:
-    """All that is known about the run, one line per frame and object."""
+def _truth_of(
+    plan: RunPlan, truths: list[FrameTruth], what: str
+) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """All that is known about the run: a head, and lists of objects and frames."""
     head: dict[str, Any] = {
         "note": SIMULATED.format(what=what).split("\n"),
         "conventions": {
@@ -457,51 +403,43 @@ def _truth_json(plan: RunPlan, truths: list[FrameTruth], what: str) -> str:
         },
         "settings": {k: v for k, v in asdict(plan.settings).items() if k != "camera_text"},
         "disc_radius_m": plan.disc_radius_m,
-        "start": _rounded(plan.poses[0], 9),
+        "start": rounded(plan.poses[0], 9),
     }
     used = sorted({e.edge_id for t in truths for e in t.edges})
     lists: dict[str, list[Any]] = {
         "discs": [
-            {"id": int(i), "xy": _rounded(xy, 6)} for i, xy in zip(plan.disc_ids, plan.disc_xy)
+            {"id": int(i), "xy": rounded(xy, 6)} for i, xy in zip(plan.disc_ids, plan.disc_xy)
         ],
         "lookalikes": [
-            {"kind": kind, "xy": _rounded([x, y], 6)} for kind, x, y in plan.lookalikes
+            {"kind": kind, "xy": rounded([x, y], 6)} for kind, x, y in plan.lookalikes
         ],
-        "pictures": [_rounded(picture, 4) for picture in plan.pictures],
+        "pictures": [rounded(picture, 4) for picture in plan.pictures],
         "edges": [
-            {"id": k, "xy": _rounded([plan.edges[k].x, plan.edges[k].y], 6),
-             "z": _rounded([plan.edges[k].z0, plan.edges[k].z1], 4), "kind": plan.edges[k].label}
+            {"id": k, "xy": rounded([plan.edges[k].x, plan.edges[k].y], 6),
+             "z": rounded([plan.edges[k].z0, plan.edges[k].z1], 4), "kind": plan.edges[k].label}
             for k in used
         ],
         "frames": [_frame_json(plan, truth) for truth in truths],
     }  # fmt: skip
-    text = json.dumps(head, indent=1)[:-2]
-    for key, items in lists.items():
-        body = ",\n".join(json.dumps(item, separators=(",", ":")) for item in items)
-        text += f',\n "{key}": [\n{body}\n ]'
-    return text + "\n}\n"
+    return head, lists
 
 
 def _frame_json(plan: RunPlan, truth: FrameTruth) -> dict[str, Any]:
     frame = truth.frame
     return {
         "prefix": plan.prefix(frame),
-        "pose": _rounded(plan.poses[frame + 1], 9),
-        "tilt": _rounded(plan.tilts_rad[frame], 9),
+        "pose": rounded(plan.poses[frame + 1], 9),
+        "tilt": rounded(plan.tilts_rad[frame], 9),
         "wrong_odometry": bool(plan.wrong_odometry[frame]),
         "discs": [
-            {"id": d.disc_id, "robot_xy": _rounded(d.robot_xy, 6), "pixel": _rounded(d.pixel, 3),
+            {"id": d.disc_id, "robot_xy": rounded(d.robot_xy, 6), "pixel": rounded(d.pixel, 3),
              "share": round(d.share, 3), "occluded": d.occluded, "cut": d.cut, "listed": d.listed}
             for d in truth.discs
         ],
         "edges": [
             {"id": e.edge_id, "alpha": round(e.bearing_rad, 6),
-             "ends": _rounded(e.ends.ravel(), 2), "contrast": round(e.contrast, 1),
+             "ends": rounded(e.ends.ravel(), 2), "contrast": round(e.contrast, 1),
              "rows": e.rows, "listed": e.listed}
             for e in truth.edges
         ],
     }  # fmt: skip
-
-
-def _rounded(values: Any, digits: int) -> list[float]:
-    return [round(float(v), digits) for v in values]

@@ -115,6 +115,22 @@ class Look:
     emission: float = 0.0
 
 
+class Face(NamedTuple):
+    """A place on an upright face, metres: where things are set against it."""
+
+    at: FloatArray  # (2,)
+    along: FloatArray  # (2,) unit vector along the face.
+    out: FloatArray  # (2,) unit vector out of it, into the room.
+
+    def point(self, along: float, out: float = 0.0) -> FloatArray:
+        """(2,) the place so far along the face and out of it."""
+        return np.asarray(self.at + along * self.along + out * self.out)
+
+    def moved(self, along: float, out: float = 0.0) -> Face:
+        """The same face at another place."""
+        return self._replace(at=self.point(along, out))
+
+
 @dataclass(frozen=True)
 class UprightEdge:
     """A vertical edge of the building or of something in it; metres, world frame."""
@@ -202,17 +218,24 @@ class Construction:
         """Add a level rectangle at height z."""
         self.quad(np.array([*corner, z]), np.array([*a, 0.0]), np.array([*b, 0.0]), look)
 
+    def panel(
+        self, face: Face, along: tuple[float, float], z: tuple[float, float], look: Look,
+        label: str = "",
+    ) -> None:  # fmt: skip
+        """Add an upright rectangle on a face, from and to so far along it and up."""
+        self.upright(face.point(along[0]), face.point(along[1]), *z, look, label)
+
+    def block(
+        self, face: Face, size: tuple[float, float], z: tuple[float, float], look: Look,
+        label: str = "",
+    ) -> None:  # fmt: skip
+        """Add a box whose middle is a place by a face; `size` is along the face and out of it."""
+        self.box(face.at, *size, *z, look, label, face.along)
+
     def box(
-        self,
-        centre: FloatArray,
-        width: float,
-        depth: float,
-        z0: float,
-        z1: float,
-        look: Look,
-        label: str,
-        along: FloatArray | None = None,
-    ) -> None:
+        self, centre: FloatArray, width: float, depth: float, z0: float, z1: float, look: Look,
+        label: str = "", along: FloatArray | None = None,
+    ) -> None:  # fmt: skip
         """Add a box; `along` is the unit vector of its width, x by default."""
         e = np.array([1.0, 0.0]) if along is None else along
         n = np.array([-e[1], e[0]])
@@ -326,7 +349,7 @@ def make_scene(
         side_light=np.zeros((*floor_kind.shape, 3)),
         raster_m=_RASTER_M,
         ceiling_m=CEILING_M,
-        sun=np.array([*_unit(np.array(sun[:3])), sun[3]]),
+        sun=np.array([*(np.array(sun[:3]) / np.linalg.norm(sun[:3])), sun[3]]),
         sky=sky,
         photographs=_photographs(),
     )
@@ -426,7 +449,3 @@ def _photographs() -> Float32Array:
                 grey, (small, small), interpolation=cv2.INTER_AREA
             )
     return pyramid
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector))

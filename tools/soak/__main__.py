@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
@@ -10,10 +9,13 @@ from pathlib import Path
 
 import tyro
 
-from redetect.storage import OutputExistsError, write_whole
+from detect.sources.opening import open_run
+from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
-from tools.soak.long_run import link_run, soak
-from tools.soak.short_runs import repeat_short_runs
+from tools.benchmark.material import repeated_run
+from tools.evaluation.tables import write_json
+from tools.soak.long_run import SoakResult, soak
+from tools.soak.short_runs import ShortRuns, repeat_short_runs
 
 
 @dataclass(frozen=True)
@@ -36,35 +38,31 @@ class Soak:
     json: Path | None = None  # Write the figures as JSON.
     force: bool = False  # Replace an existing JSON file.
 
+    def __call__(self) -> int:
+        if self.json is not None and self.json.exists() and not self.force:
+            raise OutputExistsError(self.json)
+        result: ShortRuns | SoakResult
+        with tempfile.TemporaryDirectory(dir=self.scratch, prefix="soak-") as name:
+            folder = Path(name)
+            if self.short:
+                result = repeat_short_runs(
+                    self.source, folder, self.short, self.jobs, warm=self.warm
+                )
+            else:
+                run = repeated_run(open_run(self.source), folder / "soak", self.frames, 0)
+                result = soak(run, folder / "results", self.frames, self.jobs)
+        print(result)
+        if self.json is not None:
+            write_json(self.json, asdict(result), overwrite=self.force)
+        for sentence in result.unmet():
+            print(sentence, file=sys.stderr)
+        return 1 if result.unmet() else 0
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(Soak, prog="python -m tools.soak", args=arguments)
-    return exit_code_of(lambda: _carry_out(command))
-
-
-def _carry_out(command: Soak) -> int:
-    if command.json is not None and command.json.exists() and not command.force:
-        raise OutputExistsError(command.json)
-    with tempfile.TemporaryDirectory(dir=command.scratch, prefix="soak-") as name:
-        folder = Path(name)
-        if command.short:
-            short = repeat_short_runs(
-                command.source, folder, command.short, command.jobs, warm=command.warm
-            )
-            figures, unmet = asdict(short), short.unmet()
-            print(short)
-        else:
-            run = link_run(command.source, folder / "soak", command.frames)
-            result = soak(run, folder / "results", command.frames, command.jobs)
-            figures, unmet = asdict(result), result.unmet()
-            print(result)
-    if command.json is not None:
-        with write_whole(command.json, overwrite=command.force) as stream:
-            stream.write(f"{json.dumps(figures, indent=1)}\n".encode())
-    for sentence in unmet:
-        print(sentence, file=sys.stderr)
-    return 1 if unmet else 0
+    return exit_code_of(command)
 
 
 if __name__ == "__main__":

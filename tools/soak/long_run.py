@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
-import shutil
 import subprocess
 import sys
 import time
@@ -15,8 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-
-from tools.soak.processes import family
+import psutil  # type: ignore[import-untyped,unused-ignore]
 
 #: Throughput is compared between these shares of the run: before and after them, processes start
 #: and files take their places.
@@ -34,6 +30,28 @@ MOST_SLOWER = 0.05
 
 class SoakError(ValueError):
     """A run that did not end well, or too short a one."""
+
+
+class ProcessState(NamedTuple):
+    """A process at a moment."""
+
+    pid: int
+    resident_bytes: int  # Memory of its own and shared that is in use.
+    descriptors: int  # Open files, pipes and the like.
+    processor_s: float  # What it has computed so far.
+
+
+def family(pid: int) -> list[ProcessState]:
+    """A process and all that descend from it, itself first, but for those that have just ended."""
+    found = []
+    with suppress(psutil.Error):
+        first = psutil.Process(pid)
+        for process in [first, *first.children(recursive=True)]:
+            with suppress(psutil.Error), process.oneshot():
+                times = process.cpu_times()
+                state = process.memory_info().rss, process.num_fds(), times.user + times.system
+                found.append(ProcessState(process.pid, *state))
+    return found
 
 
 class _Look(NamedTuple):
@@ -82,44 +100,21 @@ class SoakResult:
         return found
 
     def __str__(self) -> str:
-        def row(name: str, values: tuple[float, ...], form: str) -> str:
-            return f"{name:<28}" + "  ".join(format(value, form) for value in values)
-
-        change = [b / a - 1.0 for a, b in (self.frames_per_s, self.decodings_per_frame)]
-        return "\n".join(
-            [
-                f"{self.frames} frames, {self.jobs} jobs, {self.duration_s:.0f} s",
-                row("frames/s, first and last", self.frames_per_s, ".1f") + f"  {change[0]:+.1%}",
-                row("decoding / ms", self.decoding_ms, ".3f"),
-                row("decodings per frame", self.decodings_per_frame, ".2f") + f"  {change[1]:+.1%}",
-                "at 10, 50, 90, 99 %",
-                row("memory / MiB", self.resident_mib, ".1f"),
-                row("largest worker / MiB", self.worker_mib, ".1f"),
-                row("descriptors", self.descriptors, "d"),
-                f"processes                   {self.processes}",
-            ]
+        change = [f"  {b / a - 1.0:+.1%}" for a, b in (self.frames_per_s, self.decodings_per_frame)]
+        rows = (
+            ("frames/s, first and last", self.frames_per_s, ".1f", change[0]),
+            ("decoding / ms", self.decoding_ms, ".3f", ""),
+            ("decodings per frame", self.decodings_per_frame, ".2f", change[1]),
+            ("at 10, 50, 90, 99 %", (), "", ""),
+            ("memory / MiB", self.resident_mib, ".1f", ""),
+            ("largest worker / MiB", self.worker_mib, ".1f", ""),
+            ("descriptors", self.descriptors, "d", ""),
+            ("processes", (self.processes,), "d", ""),
         )
-
-
-def link_run(source: Path, folder: Path, frames: int) -> Path:
-    """A run folder of any length: hard links to the images of another run, over and over."""
-    images = sorted((source / "images").glob("*.jpg"))
-    cameras = sorted(source.glob("*.cam"))
-    if not images or not cameras:
-        raise SoakError(f"{source}: expected a run folder with images/*.jpg and a .cam")
-    (folder / "images").mkdir(parents=True)
-    shutil.copy(cameras[0], folder / f"{folder.name}.cam")
-    copies = []
-    for image in images:  # links to these, not to the source's own files
-        copies.append(folder / image.name)
-        shutil.copy(image, copies[-1])
-    with (folder / f"{folder.name}.txt").open("w") as steps:
-        for number, image in zip(range(frames), itertools.cycle(copies)):
-            os.link(image, folder / "images" / f"s.{number:07d}.jpg")
-            steps.write(f"STEP s.{number:07d} 0 -0.25 0.01 1e-5 0 1e-5 0 0 1e-4\n")
-    for image in copies:
-        image.unlink()
-    return folder
+        lines = [f"{self.frames} frames, {self.jobs} jobs, {self.duration_s:.0f} s"]
+        for name, values, form, after in rows:
+            lines.append(f"{name:<28}" + "  ".join(format(v, form) for v in values) + after)
+        return "\n".join(lines)
 
 
 def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:

@@ -8,14 +8,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
-from tools.soak.long_run import SoakError, link_run
-from tools.soak.processes import marked
+import psutil  # type: ignore[import-untyped,unused-ignore]
+
+from detect.sources.opening import open_run
+from tools.benchmark.material import repeated_run
+from tools.soak.long_run import SoakError
 
 _FRAMES = 8
 _SHARED_MEMORY = Path("/dev/shm")
@@ -63,7 +65,7 @@ def repeat_short_runs(
     source: Path, folder: Path, runs: int, jobs: int, *, warm: bool = False
 ) -> ShortRuns:
     """Carry out `detect all` on a few frames again and again."""
-    run = link_run(source, folder / "short", _FRAMES)
+    run = repeated_run(open_run(source), folder / "short", _FRAMES)
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
         path.mkdir()
@@ -73,7 +75,7 @@ def repeat_short_runs(
     first: dict[str, bytes] = {}
     cached = different = 0
     shared = _shared()
-    with _environment(added):
+    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
         if warm:
             _command([*arguments, "1"])  # loads all that is needed
         for number in range(runs):
@@ -96,11 +98,15 @@ def repeat_short_runs(
     )
 
 
-@contextmanager
-def _environment(added: dict[str, str]) -> Iterator[None]:
-    """Variables of the environment for the time of a block."""
-    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
-        yield
+def marked(variable: str) -> list[int]:
+    """Processes with a ``NAME=value`` in their environment, but for this one."""
+    name, _, value = variable.partition("=")
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if process.pid != os.getpid() and process.environ().get(name) == value:
+                found.append(process.pid)
+    return found
 
 
 def _started(arguments: list[str]) -> None:

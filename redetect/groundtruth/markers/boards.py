@@ -36,8 +36,7 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.files import covariance_entry, is_number, numbers, read_json
 from redetect.groundtruth.markers.calibration import parse_pose
-from redetect.storage.bounded import path_inside, read_bounded
-from redetect.storage.image_header import claimed_size
+from redetect.storage.bounded import claimed_size, path_inside, read_bounded
 from redetect.storage.messages import excerpt, one_line
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated

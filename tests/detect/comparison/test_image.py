@@ -225,7 +225,7 @@ def test_without_a_calibration_the_floor_is_compared(
 
 def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path: Path) -> None:
     """All shipped rows, levelled by any tilt, are found again."""
-    from detect.run import camera_in
+    from detect.sources.interface import camera_in
 
     folder = shared_data / "dlr" / "e"
     camera = camera_in(folder)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from camera.calibration.floor import with_pose
+from camera.uncertainty import with_pose
 from detect.circles import disc_shape
 from detect.discs.hough import count_votes, grid_of, hough_candidates
 from detect.settings import CircleSettings

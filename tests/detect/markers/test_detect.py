@@ -18,7 +18,7 @@ from detect.markers import detect as identities
 from detect.markers import edges, geometry
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
-from detect.markers.settings import PUBLISHED, MarkerSettings
+from detect.settings import PUBLISHED_MARKERS, MarkerSettings
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
 FloatArray = NDArray[np.float64]
@@ -310,7 +310,7 @@ def test_a_ring_segment_is_not_solid() -> None:
 
 
 def test_the_published_filters_count_holes_and_their_share() -> None:
-    published = MarkerSettings(**{**vars(PUBLISHED), "dictionary": "6x6_250"})
+    published = MarkerSettings(**{**vars(PUBLISHED_MARKERS), "dictionary": "6x6_250"})
     grey = np.full((120, 120), 200.0)
     grey[40:80, 40:80] = 40.0
     assert regions.HOLES in squares(painted(grey), published).rejected
@@ -356,8 +356,6 @@ def test_expected_ids_and_width_narrow_the_search() -> None:
         MarkerSettings(dictionary="6x6_250", ids=(7, 9)),
         MarkerSettings(dictionary="6x6_250", width_px=60.0),
         MarkerSettings(dictionary="6x6_250", width_px=40.0),
-        MarkerSettings(dictionary="6x6_250", corners="A"),
-        MarkerSettings(dictionary="6x6_250", darkness="difference"),
     ):
         found = detect_markers(image, settings)
         assert found.ids.tolist() == [7]
@@ -368,12 +366,10 @@ def test_expected_ids_and_width_narrow_the_search() -> None:
 
 def test_the_published_detector_finds_a_plain_marker() -> None:
     image, corners = picture(dictionary="rawseeds", number=31, view=View(90.0, 20.0, 30.0, 12.0))
-    for corner_algorithm in ("A", "B"):
-        settings = MarkerSettings(**{**vars(PUBLISHED), "corners": corner_algorithm})
-        found = detect_markers(image, settings)
-        assert found.ids.tolist() == [31]
-        assert np.abs(found.corners[0] - corners).max() < 0.1
-        assert np.isnan(found.explained[0])
+    found = detect_markers(image, PUBLISHED_MARKERS)
+    assert found.ids.tolist() == [31]
+    assert np.abs(found.corners[0] - corners).max() < 0.1
+    assert np.isnan(found.explained[0])
 
 
 @pytest.mark.parametrize(

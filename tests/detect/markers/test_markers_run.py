@@ -10,10 +10,10 @@ import pytest
 
 from camera import Camera, write_camera
 from detect.cli import main
-from detect.markers.settings import MarkerSettings
-from detect.run import Run
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
+from detect.settings import MarkerSettings
+from detect.sources.interface import Run
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from tests.detect.markers.rendering import View, exposed, render, view_corners

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
 from camera import Camera
+from detect.grey_values import estimate_noise
 from detect.markers import pattern_model as model
 from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
@@ -29,9 +30,8 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
-from detect.markers.settings import MarkerSettings
-from detect.noise import estimate_noise
 from detect.positive_definite import invert_positive, solve_positive
+from detect.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -65,13 +65,9 @@ def test_dark_pixels_by_definition() -> None:
     closed = np.maximum(grey, rng.integers(0, 256, grey.shape)).astype(np.uint8)
     first, second = grey.astype(float), closed.astype(float)
     ratio = np.where(second > 0.0, 1.0 - first / np.maximum(second, 1.0), 0.0) > 0.3
-    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 0.0, "ratio") == 1, ratio)
-    difference = (second - first) / 255.0 > 0.2
-    np.testing.assert_array_equal(
-        dark_pixels(grey, closed, 0.2, 0.0, "difference") == 1, difference
-    )
+    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 0.0) == 1, ratio)
     gated = ratio & (second - first > 20.0)
-    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 20.0, "ratio") == 1, gated)
+    np.testing.assert_array_equal(dark_pixels(grey, closed, 0.3, 20.0) == 1, gated)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -95,24 +91,18 @@ def test_the_quadrangle_is_the_largest(seed: int) -> None:
     assert found == pytest.approx(best, rel=1e-9)
 
 
-@pytest.mark.parametrize("algorithm", ["A", "B"])
-def test_rough_corners_of_a_quadrangle_are_its_own(algorithm: str) -> None:
+def test_rough_corners_of_a_quadrangle_are_its_own() -> None:
     share = np.linspace(0.0, 1.0, 12, endpoint=False)[:, None]
     chain = np.concatenate([SLANTED[k] + share * (SLANTED[k - 3] - SLANTED[k]) for k in range(4)])
     for order in (chain, chain[::-1]):
-        found = rough_corners(np.ascontiguousarray(order), algorithm)  # type: ignore[arg-type]
+        found = rough_corners(np.ascontiguousarray(order))
         assert found is not None
         assert is_convex(found)
         assert count_same(found, np.array([SLANTED, 2.0 * SLANTED])) == 1
         assert sorted(map(tuple, found.round(9))) == sorted(map(tuple, SLANTED))
     angle = np.linspace(0.0, 2.0 * np.pi, 3, endpoint=False)
     triangle = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    if algorithm == "A":
-        dense = np.concatenate(
-            [triangle[k] + share * (triangle[k - 2] - triangle[k]) for k in range(3)]
-        )
-        assert rough_corners(dense, "A") is None
-    assert rough_corners(triangle, "B") is None
+    assert rough_corners(triangle) is None
 
 
 def test_areas_count_pixels() -> None:

@@ -18,8 +18,8 @@ from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import read_head
 from detect.line_settings import PUBLISHED as PUBLISHED_LINES
 from detect.report.figures import binned, disc_rates, line_rates, whitened
-from detect.run import camera_in
 from detect.seen import Sight
+from detect.sources.interface import camera_in
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
 from tests.detect.test_cli import assert_refused
@@ -298,20 +298,11 @@ def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path)
         "Rows",
         "Where on the floor the two sides put the same disc",
         "Residuals in units of the covariance that the rows state",
-        "1 of the 1 reference rows that are missing",
         "Frame s.0000",
     ]
     words = " ".join(" ".join(page.words).split())
     assert "0.9 (knee) 1 0.500 1.000" in words
     assert "1 of 1 frames; 9 verticals agree" in words
-
-
-def test_timing_is_measured_if_asked_for(judged_run: Path, tmp_path: Path) -> None:
-    page = reported(judged_run, tmp_path / "r.html", "--time-frames", "2")
-    words = " ".join(" ".join(page.words).split())
-    found = re.search(r"detecting discs and verticals (\d+\.\d+) (\d+\.\d+)", words)
-    assert found is not None
-    assert "medians of 2 frames" in words
 
 
 HOSTILE = "<script>document.title='in'</script><img/src=x/onerror=alert(2)>\"'&amp;{{7*7}}"
@@ -386,7 +377,6 @@ def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:
     report = ["report", run, "-o", str(page)]
     capsys.readouterr()
     assert_refused([*report, "--worst", "-1"], judged_run, "worst", capsys)
-    assert_refused([*report, "--time-frames", "-1"], judged_run, "time_frames", capsys)
     assert_refused([*report, "--reference", "no.circles"], judged_run, "no.circles", capsys)
     assert_refused([*report, "--rows", str(tmp_path)], judged_run, "detect all", capsys)
     page.write_bytes(b"mine")

@@ -13,10 +13,10 @@ import pytest
 
 from camera import Camera
 from detect import __version__
-from detect.run import Run
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings
+from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from lut import TableError
 from redetect.landmarks import read_frames, read_rows, read_steps

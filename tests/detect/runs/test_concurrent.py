@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
+from detect.sources.opening import open_run
 from tests.detect.forked_runs import StopAfter, forked_runs
-from tools.soak.long_run import link_run
+from tools.benchmark.material import repeated_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
@@ -42,7 +43,7 @@ def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Long enough for others to be at work meanwhile."""
     folder = tmp_path_factory.mktemp("long") / "s"
-    return link_run(project_root / "images" / "e", folder, LONG_FRAMES)
+    return repeated_run(open_run(project_root / "images" / "e"), folder, LONG_FRAMES, 0)
 
 
 def started(arguments: list[str], **environment: str) -> subprocess.Popen[str]:

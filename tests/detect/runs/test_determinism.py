@@ -18,8 +18,7 @@ from camera import read_camera
 from detect.circles import detect_circles, disc_shape
 from detect.lines import detect_lines
 from detect.markers.detect import detect_markers
-from detect.markers.settings import MarkerSettings
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, MarkerSettings
 from lut import build_disc_table, build_vertical_table
 
 Image = NDArray[np.uint8]

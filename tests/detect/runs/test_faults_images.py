@@ -17,11 +17,9 @@ import pytest
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.run import read_image
-from detect.sources.gray import bounded_content, demand_bounded
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, bounded_content, demand_bounded, read_image
 from redetect.landmarks import Step
-from redetect.storage.image_header import MOST_PIXELS, claimed_size
+from redetect.storage.bounded import MOST_PIXELS, claimed_size
 
 TEXTURE = np.random.default_rng(3).integers(0, 256, (48, 96)).astype(np.uint8)
 SIDE = 60_000
@@ -126,7 +124,7 @@ _PEAK = """
 import re, sys
 from pathlib import Path
 from detect.errors import FrameError
-from detect.run import RunFrame, read_image
+from detect.sources.interface import RunFrame, read_image
 from redetect.landmarks import Step
 import cv2
 

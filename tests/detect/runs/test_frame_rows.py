@@ -12,8 +12,8 @@ import pytest
 
 from detect.runs import frame as rows_module
 from detect.runs.frame import FrameDetections, detect_batch, rows_of_frames
-from detect.runs.journal import Journal, task_digest
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, KnownOfFrame
+from detect.runs.stream import Journal, task_digest
 from detect.settings import PUBLISHED
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_run

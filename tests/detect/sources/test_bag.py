@@ -20,9 +20,8 @@ from camera import Camera, write_camera
 from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.options import SourceOptions
-from detect.run import read_image
 from detect.sources.bag import pixels_of_message
-from detect.sources.gray import gray_of_pixels
+from detect.sources.interface import gray_of_pixels, read_image
 from detect.sources.opening import open_source
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps

@@ -15,12 +15,12 @@ pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 from camera import Camera
 from camera.formats.conversion import convert_to_foreign
 from camera.formats.models import ForeignCamera
-from camera.formats.ros import ROS_NAMES
+from camera.formats.yaml_files import ROS_NAMES
 from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import Run
 from detect.sources.bag import pose_in_dataset, rotation_of
+from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.sources.gray import gray_of_pixels
+from detect.sources.interface import gray_of_pixels
 
 COLOURS = np.random.default_rng(3).integers(0, 256, (6, 8, 4)).astype(np.uint8)
 GRAY = COLOURS[:, :, 0]

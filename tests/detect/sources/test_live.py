@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from detect.cli import main
 from detect.options import SourceOptions
-from detect.run import read_image
 from detect.sources import video as live
+from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames

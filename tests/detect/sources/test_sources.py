@@ -14,7 +14,7 @@ from camera import Camera
 from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.run import Run, read_image
+from detect.sources.interface import Run, read_image
 from detect.sources.opening import open_run, open_source
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
-from detect.sources.gray import decode_gray
+from detect.sources.interface import decode_gray
 from detect.verticals.refinement import (
     Crossings,
     newton_step,

@@ -25,7 +25,7 @@ from tools.benchmark.material import BenchmarkError, repeated_run
 
 @pytest.fixture
 def short_run(project_root: Path, tmp_path: Path) -> Path:
-    return repeated_run(open_run(project_root / "images/e"), tmp_path, 2)
+    return repeated_run(open_run(project_root / "images/e"), tmp_path / "short", 2)
 
 
 @pytest.mark.long
@@ -42,7 +42,7 @@ def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_p
 
 
 def test_a_pass_that_fails_is_an_error(short_run: Path, tmp_path: Path) -> None:
-    (short_run / "images" / "e.000001.jpg").write_bytes(b"no image")
+    (short_run / "images" / "e.0000001.jpg").write_bytes(b"no image")
     with pytest.raises(BenchmarkError, match=r"ended with 3.*cannot be decoded"):
         perform(commands(short_run, tmp_path)["detect circles --preset published"])
 

@@ -72,7 +72,7 @@ def test_photographs_get_the_cameras_size(published_camera: Camera, tmp_path: Pa
 
 
 def test_a_folder_without_photographs_is_an_error(published_camera: Camera, tmp_path: Path) -> None:
-    with pytest.raises(BenchmarkError, match="no images"):
+    with pytest.raises(ValueError, match="no photographs"):
         photograph_pictures(tmp_path, published_camera, 3)
 
 
@@ -85,7 +85,7 @@ def test_a_broken_photograph_is_an_error(published_camera: Camera, tmp_path: Pat
 def test_a_repeated_run_holds_the_frames_over_and_over(project_root: Path, tmp_path: Path) -> None:
     run = open_run(project_root / "images/e")
     sources = [frame.image for frame in run.frames if frame.image is not None]
-    longer = open_run(repeated_run(run, tmp_path, len(sources) + 2))
+    longer = open_run(repeated_run(run, tmp_path / "longer", len(sources) + 2))
     images = [frame.image for frame in longer.frames if frame.image is not None]
     assert longer.camera == run.camera
     assert len(images) == len(sources) + 2
@@ -94,12 +94,11 @@ def test_a_repeated_run_holds_the_frames_over_and_over(project_root: Path, tmp_p
 
 
 def test_a_long_run_takes_no_more_room_on_the_disk_than_a_processor_notices(
-    project_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    project_root: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("tools.benchmark.material._MOST_COPIES", 100)
     run = open_run(project_root / "images/e")
     sources = [frame.image for frame in run.frames if frame.image is not None]
-    longer = open_run(repeated_run(run, tmp_path, 250))
+    longer = open_run(repeated_run(run, tmp_path / "longer", 250, 100))
     images = [frame.image for frame in longer.frames if frame.image is not None]
     assert len(images) == 250
     assert len({image.stat().st_ino for image in images}) == 100

@@ -1,9 +1,8 @@
-"""The command, on a run of known truth and on the data set's own run."""
+"""The command, on a run of known truth and on the data set's own run; worlds and their files."""
 
 from __future__ import annotations
 
 import shutil
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,12 @@ import pytest
 
 from camera import Camera, write_camera
 from redetect.landmarks import read_frames, write_frames
-from tests.tools.reenactment.synthetic import make_run, rows_of_frame
+from redetect.slam.mapping.graph import Estimate, graph_of_recording
+from redetect.slam.recording import read_recording
+from tests.tools.reenactment.synthetic import make_run, rows_of_pose
 from tools.reenactment.__main__ import main
-from tools.reenactment.mounted_discs import Geometry
-from tools.reenactment.prepare import Stage, stages
-from tools.reenactment.recording import Recording, read_map, read_path, recording_of_frames
-from tools.reenactment.world import read_world
+from tools.reenactment.prepare import assess, stages
+from tools.reenactment.world import WorldError, read_world
 
 
 def laid_run(folder: Path, camera: Camera) -> Path:
@@ -48,17 +47,13 @@ def arguments(folder: Path, *more: str) -> list[str]:
 
 def test_world_shows_the_rows_again(prepared: Path, published_camera: Camera) -> None:
     world = read_world(prepared / "world.npz")
-    geometry = Geometry(
-        poses=world.poses,
-        disc_xy=world.disc_xy,
-        rotation=world.robot_from_camera[:, :3],
-        centre=world.robot_from_camera[:, 3],
-        tilt=world.tilt,
+    estimate = Estimate(
+        world.poses, world.disc_xy, np.zeros((0, 2)), world.robot_from_camera, world.tilt
     )
     found = rows = 0
     for i, frame in enumerate(read_frames(prepared / "map.circles")):
         assert world.prefixes[i] == frame.step.prefix
-        shown, _, seen = rows_of_frame(published_camera, geometry, i)
+        shown, _, seen = rows_of_pose(published_camera, estimate, i)
         ids = world.disc_ids[seen].tolist()
         for row in frame.circles:
             rows += 1
@@ -81,60 +76,45 @@ def test_same_bytes_again(
 
 
 def test_errors_are_one_line(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run_folder / "path.csv").write_text("0,0,0\n")
-    path = str(run_folder / "path.csv")
-    assert main(arguments(run_folder, "--path", path)) == 1
-    assert "--path and --map belong together" in capsys.readouterr().err
-    assert main(arguments(run_folder, "--path", path, "--map", path)) == 1
-    assert "path.csv: 1 poses: expected 121" in capsys.readouterr().err
-    (run_folder / "map.circles").write_text("STEP a 1 2 x\n")
-    assert main(arguments(run_folder)) == 1
-    error = capsys.readouterr().err
-    assert "map.circles:1: " in error
-    assert error.count("\n") == 1
+    rows = (run_folder / "map.circles").read_text()
+    steps = [line for line in rows.splitlines() if "LANDMARK" not in line]
+    for text, message in (
+        ("\n".join(steps) + "\n", "map.circles: no disc with an ID"),
+        (rows + "LANDMARK_C 0 9 0.9 0.01 0 0.01 5\n", "lie where the camera as calibrated cannot"),
+        ("STEP a 1 2 x\n", "map.circles:1: "),
+    ):
+        (run_folder / "map.circles").write_text(text)
+        assert main(arguments(run_folder)) == 1
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
     assert not (run_folder / "world.npz").exists()
 
 
-@pytest.fixture(scope="module")
-def run_e(shared_data: Path, published_camera: Camera) -> Recording:
-    rows = read_frames(shared_data / "dlr" / "map.circles")
-    return recording_of_frames(published_camera, rows)
-
-
-@pytest.fixture(scope="module")
-def least_squares(shared_data: Path, published_camera: Camera, run_e: Recording) -> list[Stage]:
-    """The published solution of run e, and the one with the true mounting."""
-    folder = shared_data / "dlr"
-    start = (
-        read_path(folder / "least_squares_path.csv", len(run_e.steps)),
-        read_map(folder / "least_squares_map.csv", run_e.disc_ids),
-    )
-    return list(islice(stages(published_camera, run_e, start), 2))
+def test_files_that_hold_no_world(tmp_path: Path) -> None:
+    np.savez(tmp_path / "lacking.npz", poses=np.zeros((2, 3)))
+    with pytest.raises(WorldError, match=r"lacking.npz: .*prefixes"):
+        read_world(tmp_path / "lacking.npz")
+    (tmp_path / "text.npz").write_text("poses")
+    np.save(tmp_path / "array.npy", np.zeros((2, 3)))
+    for name in ("text.npz", "array.npy"):
+        with pytest.raises(WorldError, match=rf"{name}: .*expected a .npz"):
+            read_world(tmp_path / name)
 
 
 @pytest.mark.long
-def test_run_e_from_its_least_squares_solution(
-    run_e: Recording, least_squares: list[Stage]
-) -> None:
-    counts = len(run_e.steps), len(run_e.frame), len(run_e.disc_ids)
+def test_run_e(shared_data: Path, published_camera: Camera) -> None:
+    folder = shared_data / "dlr"
+    graph = graph_of_recording(read_recording(folder / "map.circles"), published_camera)
+    counts = len(graph.steps), len(graph.disc_pose), len(graph.disc_ids)
     assert counts == (3297, 14_309, 576)
-    published, corrected = (stage.quality for stage in least_squares)
+    every = [assess(*stage[1:]) for stage in stages(graph)]
+    published, corrected, world = every[0], every[1], every[-1]
     assert published.chi_squared == pytest.approx(56_871.4, abs=0.15)
     assert corrected.chi_squared == pytest.approx(37_450.2, abs=1.0)
-    np.testing.assert_allclose(corrected.rotation, [-0.0366, 0.0099, 0.0024], atol=2e-4)
-    assert corrected.height == pytest.approx(-0.0111, abs=5e-4)
+    expected = [-0.0366, 0.0099, 0.0024, -0.0111]
+    np.testing.assert_allclose(corrected.mounting, expected, atol=5e-4)
     assert published.share_whole_pixel < corrected.share_whole_pixel < 0.999
-
-
-@pytest.mark.long
-def test_run_e_from_odometry_alone(
-    published_camera: Camera, run_e: Recording, least_squares: list[Stage]
-) -> None:
-    *_, world = stages(published_camera, run_e, None)
-    assert world.quality.share_whole_pixel >= 0.999
-    assert world.quality.median_px < 0.8
-    assert world.quality.out_of_sight <= 3
-    corrected = least_squares[-1].geometry
-    off = np.hypot(*(world.geometry.poses - corrected.poses)[:, :2].T)
-    # Plain least squares is drawn aside by rows of confused discs.
-    assert off.max() < 1.2
+    assert world.share_whole_pixel >= 0.999
+    assert world.median_px < 0.8
+    assert world.out_of_sight <= 3

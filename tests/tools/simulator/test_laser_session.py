@@ -22,8 +22,8 @@ from redetect.groundtruth.lasers.scanners import (
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.groundtruth.validation.reference_poses import read_distances, read_survey
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose
 from tools.simulator.__main__ import main
-from tools.simulator.laser.measuring import compose
 from tools.simulator.laser.session import EPOCH_S, SessionPlan, plan_session, sides_of
 from tools.simulator.laser.session_files import (
     camera_covariances,
@@ -354,18 +354,6 @@ def test_the_command_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["laser-session", str(tmp_path / "t"), "--visits", "0"]) == 1
     assert "visits is 0" in capsys.readouterr().err
     assert not (tmp_path / "t").exists()
-
-
-@pytest.mark.long
-def test_the_picture_shows_the_session(tmp_path: Path) -> None:
-    import cv2
-
-    assert main(["laser-session", str(tmp_path / "s"), "--picture", *QUICK]) == 0
-    picture = cv2.imread(str(tmp_path / "s" / "session.png"))
-    assert picture is not None
-    for bgr in ((180, 119, 31), (14, 127, 255), (40, 39, 214), (0, 0, 0)):
-        drawn = np.all(np.abs(picture.astype(int) - bgr) < 12, axis=2)
-        assert drawn.sum() > 50, bgr  # two scanners, the robot, walls
 
 
 @pytest.mark.long

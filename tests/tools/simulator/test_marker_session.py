@@ -27,6 +27,7 @@ from tools.simulator.__main__ import main
 from tools.simulator.markers.calibration_set import (
     DOUBLE,
     WORLD,
+    board_surface,
     board_views,
     first_from_second,
     write_calibration_set,
@@ -160,7 +161,7 @@ def test_markers_are_in_the_image_where_the_truth_says(folder: Path) -> None:
 
 def test_published_like_session(full_plan: SessionPlan) -> None:
     assert len(full_plan.network.names) == 4
-    assert full_plan.references == 23
+    assert full_plan.settings.references == 23
     assert len(full_plan.rig.ids) == 6
     times, poses = full_plan.times_s, full_plan.poses
     drive = slice(23, None)
@@ -264,7 +265,7 @@ def test_calibration_set(tmp_path: Path) -> None:
         pose = _pose(known["world_from_board"])
         placements.setdefault(row["placement"], {})[row["board"]] = pose
         camera = network.names.index(row["camera"])
-        points = apply(inverse(network.world_from_camera[camera]) @ pose, board.corners())
+        points = apply(inverse(network.world_from_camera[camera]) @ pose, board.points)
         corners = np.array(known["corners"])
         np.testing.assert_allclose(network.cameras[camera].project(points), corners, atol=1e-3)
         image = cv2.imread(str(tmp_path / "network" / row["image"]), cv2.IMREAD_GRAYSCALE)
@@ -335,7 +336,7 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(full_plan: SessionPl
     """What the simulator calls a board is what `groundtruth` finds in an image."""
     for board, pose in ((DOUBLE, 0.3), (WORLD, -0.4)):
         same = Checkerboard(board.columns, board.rows, board.square_m)
-        np.testing.assert_allclose(board.corners(), same.points, atol=1e-12)
+        np.testing.assert_allclose(board.points, same.points, atol=1e-12)
         camera = full_plan.network.cameras[0]
         camera_from_board = facing_pose(np.zeros(3), pose, 0.2, 0.5)
         # From the world's axes to the camera's, three metres before it.
@@ -344,7 +345,7 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(full_plan: SessionPl
         camera_from_board[:3, 3] = [0.1, 0.2, 3.0]
         empty = np.full((camera.height, camera.width), 0.4, np.float32)
         imaging = Imaging(blur_px=0.8)
-        light = render_light(camera, [[board.surface(camera_from_board)]], empty)
+        light = render_light(camera, [[board_surface(board, camera_from_board)]], empty)
         image = grey_image(light, 1.0, imaging, np.random.default_rng(0))
-        truth = camera.project(apply(camera_from_board, board.corners()))
+        truth = camera.project(apply(camera_from_board, board.points))
         assert np.abs(find_checkerboard(image, same) - truth).max() < 0.5

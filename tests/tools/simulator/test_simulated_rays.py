@@ -7,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.driving import tilted_camera, world_from_robot, world_to_robot
+from redetect.groundtruth.trajectories.transforms import planar_transform
+from redetect.slam.models import disc_in_robot
+from tools.simulator.driving import tilted_camera
 from tools.simulator.frame_kernels import camera_ray
 from tools.simulator.ray_kernels import nearest_quad, points_visible
 from tools.simulator.renderer import Light, optics_of, render_light, smeared
@@ -71,8 +73,8 @@ def test_disc_is_rendered_where_the_camera_projects_it(
 ) -> None:
     camera = tilted_camera(published_camera, tilt)
     robot_xy = np.array([0.35, -1.6])
-    world_xy = (world_from_robot(pose) @ [*robot_xy, 0.0, 1.0])[:2]
-    np.testing.assert_allclose(world_to_robot(pose, world_xy), robot_xy, atol=1e-12)
+    world_xy = (planar_transform(*pose) @ [*robot_xy, 0.0, 1.0])[:2]
+    np.testing.assert_allclose(disc_in_robot(pose, world_xy), robot_xy, atol=1e-12)
     light = render_light(_scene(_with_disc(*world_xy)), camera, np.array(pose, dtype=np.float64))
     expected = render_disc(camera, robot_xy, 0.1, 1.0, 0.0, row_aperture=0.5, rounded=False)
     height, width = expected.grey.shape
@@ -160,8 +162,8 @@ def test_turning_smears_sideways_by_the_angle(published_camera: Camera) -> None:
     light = render_light(scene, published_camera, np.zeros(3))
     turned = np.array([0.0, 0.0, 0.02])
     blurred = smeared(light, published_camera, np.zeros(3), turned)
-    before = published_camera.project_floor(world_to_robot(-turned, [0.0, -1.6]))
-    after = published_camera.project_floor(world_to_robot(turned, [0.0, -1.6]))
+    before = published_camera.project_floor(disc_in_robot(-turned, [0.0, -1.6]))
+    after = published_camera.project_floor(disc_in_robot(turned, [0.0, -1.6]))
     way = abs(before[0] - after[0])
     assert way > 8.0
     share, still = (

@@ -14,8 +14,9 @@ from scipy.stats import chi2
 from camera import Camera, read_camera
 from camera.uncertainty import exact
 from redetect.landmarks import read_frames
+from redetect.slam.models import disc_in_robot
 from tools.simulator.__main__ import main
-from tools.simulator.driving import tilted_camera, world_to_robot
+from tools.simulator.driving import tilted_camera
 from tools.simulator.observation import published_covariance
 from tools.simulator.runs import DEMO, RunPlan, RunSettings, plan_run, render_frame, write_rows
 
@@ -77,7 +78,7 @@ def test_demo_disc_rows_lie_at_the_true_places(
         camera = tilted_camera(published_camera, truth["tilt"])
         for row, disc in zip(frame.circles, listed):
             assert row.ids in ((disc["id"],), (-1,))
-            robot_xy = world_to_robot(truth["pose"], places[disc["id"]])
+            robot_xy = disc_in_robot(truth["pose"], places[disc["id"]])
             np.testing.assert_allclose([row.px, row.py], robot_xy, atol=1e-5)
             pixel = camera.project_floor(robot_xy)
             np.testing.assert_allclose(pixel, disc["pixel"], atol=2e-3)
@@ -129,7 +130,7 @@ def test_demo_edges_lie_on_grey_value_edges(
                 continue
             world = edges[edge["id"]]
             z = np.linspace(world["z"][0], world["z"][1], 200)
-            robot_xy = world_to_robot(truth["pose"], world["xy"])
+            robot_xy = disc_in_robot(truth["pose"], world["xy"])
             uv = camera.project_robot(np.column_stack([np.tile(robot_xy, (200, 1)), z]))
             u0, v0, u1, v1 = edge["ends"]
             nearest = int(np.nanargmin(np.abs(uv[:, 1] - round(0.5 * (v0 + v1)))))
@@ -154,7 +155,7 @@ def test_rows_are_the_truth_plus_noise_of_their_covariance(
     assert sum(len(f.circles) for f in frames) == count > 100
     squared, unlabelled = [], 0
     for k, frame in enumerate(frames):
-        truth = world_to_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
+        truth = disc_in_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
         for row in frame.circles:
             if row.ids == (-1,):
                 unlabelled += 1
@@ -174,7 +175,7 @@ def test_exact_rows_and_missed_rows(tmp_path: Path, rows_plan: RunPlan) -> None:
     some = write_rows(SETTINGS, tmp_path / "some", noisy=False, miss=0.3)
     assert 0.55 * every < some < 0.85 * every
     for k, frame in enumerate(read_frames(tmp_path / "exact" / "map.circles")):
-        truth = world_to_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
+        truth = disc_in_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
         for row in frame.circles:
             assert np.abs(truth - [row.px, row.py]).max(axis=1).min() < 1e-5
 

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from tools.simulator.observation import best_quality_near, disc_quality
-from tools.simulator.renderer import Sensor, encode_jpeg, grey_values
+from tools.simulator.files import encoded
+from tools.simulator.observation import disc_quality
+from tools.simulator.renderer import Sensor, grey_values
 from tools.simulator.single_disc import render_disc
 
 PLAIN = Sensor(
@@ -73,8 +74,8 @@ def test_jpeg_can_be_read_and_is_deterministic() -> None:
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 255, (36, 96)).astype(np.uint8)
     grey = np.asarray(cv2.resize(coarse, (768, 288)), dtype=np.uint8)
-    data = encode_jpeg(grey, 90)
-    assert data == encode_jpeg(grey, 90)
+    data = encoded(grey, quality=90)
+    assert data == encoded(grey, quality=90)
     back = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     assert back is not None
     assert back.shape == (288, 768)
@@ -99,9 +100,6 @@ def test_quality_of_a_clean_disc_is_one(published_camera: Camera) -> None:
     grey, pixel = _image(published_camera)
     assert disc_quality(grey, published_camera, pixel) == pytest.approx(1.0)
     assert disc_quality(255 - grey, published_camera, pixel) == pytest.approx(1.0)
-    best, where = best_quality_near(grey, published_camera, np.array(pixel) + 0.4)
-    assert best == pytest.approx(1.0)
-    assert np.hypot(*(np.array(where) - pixel)) <= 3.0
 
 
 def test_quality_falls_with_noise_as_variances_say(published_camera: Camera) -> None:

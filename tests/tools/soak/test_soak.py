@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
+from detect.sources.opening import open_run
+from tools.benchmark.material import repeated_run
 from tools.soak import short_runs
 from tools.soak.__main__ import main
-from tools.soak.long_run import MOST_GROWTH_MIB, SoakError, SoakResult, link_run
-from tools.soak.processes import family, marked
-from tools.soak.short_runs import ShortRuns
+from tools.soak.long_run import MOST_GROWTH_MIB, SoakResult, family
+from tools.soak.short_runs import ShortRuns, marked
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads Linux's /proc")
 
@@ -40,28 +41,6 @@ GOOD = SoakResult(
     descriptors=(40, 40, 40, 40),
     processes=4,
 )
-
-
-def test_a_run_of_any_length(project_root: Path, tmp_path: Path) -> None:
-    from detect.sources.opening import open_run
-
-    run = open_run(link_run(project_root / "images" / "e", tmp_path / "s", 200))
-    frames = list(run.frames)
-    assert len(frames) == 200
-    images = [frame.image for frame in frames]
-    assert all(image is not None and image.is_file() for image in images)
-    assert frames[0].image is not None
-    assert frames[80].image is not None
-    assert frames[0].image.samefile(frames[80].image)
-    original = project_root / "images" / "e" / "images" / "e.0000.jpg"
-    assert frames[0].image.read_bytes() == original.read_bytes()
-    assert not frames[0].image.samefile(original)
-    assert run.images_without_step == 0
-
-
-def test_a_source_without_images(tmp_path: Path) -> None:
-    with pytest.raises(SoakError, match="expected a run folder"):
-        link_run(tmp_path, tmp_path / "s", 10)
 
 
 def test_processes_are_found_and_measured() -> None:
@@ -120,7 +99,7 @@ def test_a_soak_of_some_seconds(
 ) -> None:
     figures = tmp_path / "soak.json"
     source = project_root / "images" / "e"
-    short = link_run(source, tmp_path_factory.mktemp("short") / "s", 2)
+    short = repeated_run(open_run(source), tmp_path_factory.mktemp("short") / "s", 2)
     compiled = ["all", str(short), "-o", str(tmp_path_factory.mktemp("compiled"))]
     subprocess.run([sys.executable, "-m", "detect", *compiled], check=True, capture_output=True)
     arguments = ["--frames", "6000", "--jobs", "1", "--source", str(source)]

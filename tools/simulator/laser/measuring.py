@@ -9,6 +9,7 @@ import numba as nb
 import numpy as np
 
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.plane import compose
 from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 
@@ -185,15 +186,3 @@ def measured(
     ranges_mm = np.rint(1e3 * np.where(none, 0.0, noisy)).astype(np.uint16)
     kept = rng.random(len(times_s)) >= errors.lost_scans
     return Scans(times_s[kept], ranges_mm[kept])
-
-
-def compose(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N, 3) poses b, given in the frames of poses a, in the frame of a."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    return np.column_stack(
-        [
-            a[:, 0] + c * b[:, 0] - s * b[:, 1],
-            a[:, 1] + s * b[:, 0] + c * b[:, 1],
-            a[:, 2] + b[:, 2],
-        ]
-    )

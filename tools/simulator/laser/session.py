@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,7 +73,8 @@ def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
     scanners = _fixed_scanners(settings, seed)
     faults = settings.faults
     moved = tuple(
-        _shifted(s, np.array(faults.by)) if s.name == faults.moved_scanner else s for s in scanners
+        replace(s, pose=s.pose + faults.by) if s.name == faults.moved_scanner else s
+        for s in scanners
     )
     clock = RobotClock(
         route.start_s, settings.clock_offset_s, settings.clock_drift,
@@ -128,13 +129,6 @@ def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:
         )  # fmt: skip
         scanners.append(sick(f"fixed{i}", pose, settings))
     return tuple(scanners)
-
-
-def _shifted(scanner: Scanner, by: FloatArray) -> Scanner:
-    return Scanner(
-        scanner.name, scanner.pose + by, scanner.covariance, scanner.first_angle_rad,
-        scanner.angle_step_rad, scanner.readings, scanner.max_range_m, scanner.sigma_m,
-    )  # fmt: skip
 
 
 def _drive(

@@ -1,36 +1,26 @@
-"""A simulated laser session as a folder (docs/groundtruth/sessions.md), its truth, a picture."""
+"""A simulated laser session as a folder (docs/groundtruth/sessions.md), and its truth."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.files import read_json, write_json
-from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import (
-    Scanner,
-    Scans,
-    find_scans,
-    read_robot,
-    read_scanners,
-    read_scans,
-    write_scanners,
-)
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.lasers.scanners import Scanner, Scans, write_scanners
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
-    read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.reference_poses import Distance, Survey, read_survey
+from redetect.groundtruth.validation.reference_poses import Distance, Survey
 from redetect.landmarks import wrap_angle
-from redetect.storage import write_whole
+from redetect.plane import apply
 from tools.arrays import BoolArray, FloatArray
-from tools.simulator.laser.measuring import Scene, compose, measured, true_ranges
+from tools.simulator.files import write_bytes
+from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
 from tools.simulator.laser.settings import LaserSettings
@@ -144,10 +134,10 @@ def measured_distances(plan: SessionPlan) -> list[Distance]:
     places = np.stack([survey.fiducials[name] for name in names])
     rows = []
     for pose, time in enumerate(reference_times(plan)):
-        robot = plan.route.poses(np.array([time]))
-        near = np.argsort(np.linalg.norm(places - robot[0, :2], axis=1))[:_NEAREST_FIDUCIALS]
+        robot = plan.route.poses(np.array([time]))[0]
+        near = np.argsort(np.linalg.norm(places - robot[:2], axis=1))[:_NEAREST_FIDUCIALS]
         for point, offset in survey.robot_points.items():
-            world = compose(robot, np.array([[*offset, 0.0]]))[0, :2]
+            world = apply(robot, offset)
             for i in sorted(near):
                 far = float(np.linalg.norm(places[i] - world)) + rng.normal(0.0, survey.sigma_m)
                 rows.append(Distance(pose, float(time), point, names[i], max(float(far), 0.0)))
@@ -161,36 +151,27 @@ _PTPD_SIGMA_S = 20e-6
 
 
 def write_session(
-    settings: LaserSettings,
-    folder: Path,
-    *,
-    seed: int,
-    overwrite: bool = False,
-    on_file: Callable[[], None] | None = None,
+    settings: LaserSettings, folder: Path, *, seed: int, overwrite: bool = False
 ) -> SessionPlan:
     """Simulate a session and write its folder."""
     plan = plan_session(settings, seed)
     (folder / "empty").mkdir(parents=True, exist_ok=True)
     _write_site(plan, folder, overwrite)
-    for scanner, moved in zip(plan.scanners, plan.moved):
-        for place, run in ((folder / "empty", _empty_scans), (folder, _fixed_scans)):
-            scans = run(plan, scanner if place != folder else moved)
+    for place, run, scanners in (
+        (folder / "empty", _empty_scans, plan.scanners),
+        (folder, _fixed_scans, plan.moved),
+        (folder, _onboard_scans, plan.robot.scanners),
+    ):
+        for scanner in scanners:
+            scans = run(plan, scanner)
             write_scans(place / f"{scanner.name}.scans.npz", scans, overwrite=overwrite)
-            if on_file is not None:
-                on_file()
-    for scanner in plan.robot.scanners:
-        scans = _onboard_scans(plan, scanner)
-        write_scans(folder / f"{scanner.name}.scans.npz", scans, overwrite=overwrite)
-        if on_file is not None:
-            on_file()
     write_planar_poses(folder / "odometry.csv", odometry_stream(plan), overwrite=overwrite)
     write_planar_poses(folder / "camera.csv", camera_stream(plan), overwrite=overwrite)
     write_survey(folder / "fiducials.json", survey_of(plan), {"note": NOTE}, overwrite=overwrite)
     write_distances(folder / "distances.csv", measured_distances(plan), overwrite=overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
-    with write_whole(folder / "ptpd.log", overwrite=overwrite) as stream:
-        stream.write(("\n".join(lines) + "\n").encode())
+    write_bytes(folder / "ptpd.log", ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
     _write_truth(plan, folder, overwrite)
     return plan
 
@@ -222,21 +203,13 @@ def _measured_by_hand(plan: SessionPlan) -> list[Scanner]:
     return scanners
 
 
-def _no_legs(times_s: FloatArray) -> FloatArray:
-    return np.zeros((len(times_s), 0, 3))
-
-
 def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     """The scanner looking at the room before anybody comes."""
     settings, rng = plan.settings, plan.random(f"empty {scanner.name}")
     count = max(1, round(settings.empty_s * settings.rate_hz))
-    phase = float(rng.random())
-    times = (
-        plan.route.start_s
-        - _EMPTY_BEFORE_S
-        + (phase + np.arange(count, dtype=np.float64)) / settings.rate_hz
-    )
-    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), _no_legs)
+    ticks = float(rng.random()) + np.arange(count, dtype=np.float64)
+    times = plan.route.start_s - _EMPTY_BEFORE_S + ticks / settings.rate_hz
+    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), partial(legs_of, ()))
     ranges = true_ranges(scanner, None, times, scene)
     return measured(times, ranges, scanner, settings.reading, rng)
 
@@ -244,15 +217,13 @@ def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
 def _fixed_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     settings, rng = plan.settings, plan.random(f"scans {scanner.name}")
     phase, period = float(rng.random()), 1.0 / settings.rate_hz
-    first, last = plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
+    first, last = _logged_span(plan)
     times = np.arange(first + phase * period, last, period)
     times = times[in_visits(plan, times, SCAN_MARGIN_S)]
     lost_s = times - plan.visits[0][0] - settings.faults.lost_laser_at_s
     times = times[~((lost_s >= 0.0) & (lost_s < settings.faults.lost_laser_s))]
-    scene = Scene(
-        plan.site.solid, plan.route.poses, sides_of(plan.robot.outline),
-        lambda t: legs_of(list(plan.passers), t),
-    )  # fmt: skip
+    sides = sides_of(plan.robot.outline)
+    scene = Scene(plan.site.solid, plan.route.poses, sides, partial(legs_of, plan.passers))
     ranges = true_ranges(scanner, None, times, scene, settings.reading.sweep_s)
     return measured(times, ranges, scanner, settings.reading, rng)
 
@@ -260,12 +231,16 @@ def _fixed_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
 def _onboard_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     """By the robot's clock."""
     settings, rng = plan.settings, plan.random(f"scans {scanner.name}")
-    first, last = plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
-    times = plan.clock.ticks(first, last, 1.0 / settings.onboard_hz, float(rng.random()))
+    span = _logged_span(plan)
+    times = plan.clock.ticks(*span, 1.0 / settings.onboard_hz, float(rng.random()))
     times = times[in_visits(plan, times, SCAN_MARGIN_S)]
-    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), lambda t: legs_of(list(plan.passers), t))
+    scene = Scene(plan.site.solid, None, np.zeros((0, 4)), partial(legs_of, plan.passers))
     ranges = true_ranges(scanner, plan.route.poses, times, scene, settings.reading.sweep_s)
     return measured(plan.clock.robot_times(times), ranges, scanner, settings.reading, rng)
+
+
+def _logged_span(plan: SessionPlan) -> tuple[float, float]:
+    return plan.visits[0][0] - SCAN_MARGIN_S, plan.visits[-1][1] + SCAN_MARGIN_S
 
 
 def _write_truth(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
@@ -315,81 +290,3 @@ def _nearest_m(plan: SessionPlan, passer: Passer) -> float:
     times = np.arange(passer.from_s, passer.to_s, 0.02)
     gaps = passer.places(times)[0] - plan.route.poses(times)[:, :2]
     return round(float(np.nanmin(np.linalg.norm(gaps, axis=1))), 3)
-
-
-_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple")
-
-
-def draw_session(
-    folder: Path, path: Path, *, at_s: float | None = None, overwrite: bool = False
-) -> None:
-    """Draw a session from its files."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
-
-    truth, camera = (read_planar_poses(folder / f"{n}.csv") for n in ("truth", "camera"))
-    at_s = float(camera.times_s[len(camera) // 2]) if at_s is None else at_s
-    robot_pose = truth.poses[np.argmin(np.abs(truth.times_s - at_s))]
-    robot = read_robot(folder / "robot.json")
-    figure = Figure(figsize=(12.0, 10.0), layout="tight")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(aspect="equal")
-    walls = read_building(folder / "building.csv").reshape(-1, 2, 2)
-    axes.add_collection(LineCollection(list(walls), colors="black", linewidths=1.2))
-    axes.plot(*truth.poses[:, :2].T, color="0.6", linewidth=0.8, label="way")
-    axes.plot(*camera.poses[:, :2].T, ".", color="tab:red", markersize=2, label="marker poses")
-    stands = read_planar_poses(folder / "reference.csv") if _has_rows(folder) else None
-    if stands is not None:
-        axes.plot(*stands.poses[:, :2].T, "k+", markersize=9, label="reference poses")
-    survey = read_survey(folder / "fiducials.json")
-    axes.plot(*np.stack(list(survey.fiducials.values())).T, "k*", label="fiducials")
-    scanners = read_scanners(folder / "scanners.truth.json")
-    for scanner, colour in zip(scanners, _COLOURS):
-        points = _points_at(folder, scanner, scanner.pose, at_s)
-        axes.plot(*points.T, ".", color=colour, markersize=3, label=scanner.name)
-        axes.plot(*_arrow(scanner.pose), color=colour, linewidth=2.5)
-    for scanner, colour in zip(robot.scanners, ("0.3", "tab:cyan")):
-        pose = compose(robot_pose[None], scanner.pose[None])[0]
-        points = _points_at(folder, scanner, pose, _robot_time(folder, at_s))
-        axes.plot(*points.T, "x", color=colour, markersize=3, label=f"{scanner.name} (on board)")
-    outline = np.vstack([robot.outline, robot.outline[:1]])
-    body = compose(
-        np.tile(robot_pose, (len(outline), 1)), np.column_stack([outline, 0 * outline[:, :1]])
-    )
-    axes.plot(*body[:, :2].T, color="tab:red", linewidth=1.5)
-    axes.autoscale_view()
-    axes.set(xlabel="x / m", ylabel="y / m", title=f"t = {at_s:.2f} s")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(buffer.getvalue())
-
-
-def _robot_time(folder: Path, at_s: float) -> float:
-    """What the robot's clock showed, by the truth."""
-    time = at_s
-    for piece in read_json(folder / "truth.json")["clock"]["pieces"]:
-        if piece["from_s"] is None or at_s >= piece["from_s"]:
-            time = at_s + piece["offset_s"] + piece["drift"] * (at_s - piece["reference_s"])
-    return time
-
-
-def _has_rows(folder: Path) -> bool:
-    return (folder / "reference.csv").stat().st_size > 0
-
-
-def _arrow(pose: FloatArray) -> FloatArray:
-    """(2, 2) ends of a short line from a scanner along its middle beam."""
-    tip = pose[:2] + 0.5 * np.array([np.cos(pose[2]), np.sin(pose[2])])
-    return np.stack([pose[:2], tip]).T
-
-
-def _points_at(folder: Path, scanner: Scanner, pose: FloatArray, at_s: float) -> FloatArray:
-    """(M, 2) points in the world of the scan nearest in time."""
-    scans = read_scans(find_scans(folder, scanner.name), scanner.readings)
-    points = scanner.points(scans.ranges_mm[np.argmin(np.abs(scans.times_s - at_s))])
-    points = points[np.isfinite(points[:, 0])]
-    local = np.column_stack([points, np.zeros(len(points))])
-    return compose(np.tile(pose, (len(points), 1)), local)[:, :2]

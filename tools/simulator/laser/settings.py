@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, Bounds, demand
 
 FIXED_SCANNERS = 4
 
@@ -102,21 +103,15 @@ class LaserSettings:
 
     def check(self) -> None:
         """Refuse what cannot be."""
-        positive = ("visits", "visit_s", "rate_hz", "onboard_hz", "odometry_hz", "camera_hz",
-                    "truth_hz", "ptpd_hz", "max_range_m", "empty_s", "stand_s")  # fmt: skip
-        for name in positive:
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise GroundTruthError(f"{name} is {getattr(self, name)}: expected above 0")
-        for name in ("references", "passers", "between_s"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise GroundTruthError(f"{name} is {getattr(self, name)}: expected 0 or more")
-        if not self.max_range_m <= 65.0:
-            raise GroundTruthError(f"max_range_m is {self.max_range_m}: expected 65 or less")
-        if self.faults.clock_jump_s < 0.0:
-            raise GroundTruthError(
-                "a clock that is set back gives two readings the same stamp: expected "
-                "clock_jump_s of 0 or more"
-            )
+        demand(
+            self, GroundTruthError, visits=ABOVE_0, visit_s=ABOVE_0, rate_hz=ABOVE_0,
+            onboard_hz=ABOVE_0, odometry_hz=ABOVE_0, camera_hz=ABOVE_0, truth_hz=ABOVE_0,
+            ptpd_hz=ABOVE_0, empty_s=ABOVE_0, stand_s=ABOVE_0, references=NOT_NEGATIVE,
+            passers=NOT_NEGATIVE, between_s=NOT_NEGATIVE,
+            max_range_m=Bounds("above 0, at most 65", 0.0, 65.0, above=True),
+        )  # fmt: skip
+        # A clock that is set back gives two readings the same stamp.
+        demand(self.faults, GroundTruthError, clock_jump_s=NOT_NEGATIVE)
         names = {f"fixed{i}" for i in range(FIXED_SCANNERS)} | {""}
         for name in (self.faults.wrong_scanner, self.faults.moved_scanner):
             if name not in names:

@@ -6,12 +6,15 @@ western door and leaves through the eastern one, and drives round it in the corr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tools.arrays import BoolArray, FloatArray
+
+#: (N, 3) poses of the robot at times (N,).
+Poses = Callable[[FloatArray], FloatArray]
 
 ROOM_M = (10.0, 7.5)
 CORRIDOR_M = 3.0
@@ -159,7 +162,7 @@ class Passer:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def legs_of(passers: list[Passer], times_s: FloatArray) -> FloatArray:
+def legs_of(passers: Sequence[Passer], times_s: FloatArray) -> FloatArray:
     """(N, 2 P, 3) x, y, radius of the legs of all passers-by."""
     legs = [passer.legs(times_s) for passer in passers]
     return np.concatenate(legs, axis=1) if legs else np.zeros((len(times_s), 0, 3))
@@ -167,7 +170,7 @@ def legs_of(passers: list[Passer], times_s: FloatArray) -> FloatArray:
 
 def strolling(
     rng: np.random.Generator,
-    robot_poses: Callable[[FloatArray], FloatArray],
+    robot_poses: Poses,
     walls: FloatArray,
     interval_s: tuple[float, float],
     apart_m: float,
@@ -188,7 +191,7 @@ def strolling(
 
 def crossing(
     rng: np.random.Generator,
-    robot_poses: Callable[[FloatArray], FloatArray],
+    robot_poses: Poses,
     walls: FloatArray,
     when_s: float,
     near_m: float,
@@ -206,12 +209,7 @@ def crossing(
     return None
 
 
-def _is_free(
-    passer: Passer,
-    robot_poses: Callable[[FloatArray], FloatArray],
-    walls: FloatArray,
-    apart_m: float,
-) -> bool:
+def _is_free(passer: Passer, robot_poses: Poses, walls: FloatArray, apart_m: float) -> bool:
     times = np.arange(passer.from_s, passer.to_s, 0.05)
     places, _ = passer.places(times)
     there = np.isfinite(places[:, 0])

@@ -4,19 +4,18 @@
 ``network/``: a double checkerboard, two boards fixed to each other, stands so that each of two
 cameras sees one of them; and a board on the floor, seen by the first camera, defines the world.
 
-Frame of a board, as of a marker: origin at the middle of its inner corners, x right, y up, z out of
-the printed face, the upper left square black.
+Frames of boards are those of `camera.boards.board`, as of markers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from camera.boards.board import Board
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.trajectories.transforms import (
     apply,
@@ -25,7 +24,7 @@ from redetect.groundtruth.trajectories.transforms import (
     quaternion_xyzw,
 )
 from tools.arrays import ByteArray, FloatArray
-from tools.simulator.markers.rendering import Imaging, grey_image, render_light
+from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (
     NOTE,
@@ -47,32 +46,17 @@ _TRIES = 400
 _EDGE_PX = 12.0
 
 
-@dataclass(frozen=True)
-class Board:
-    """A checkerboard: its inner corners, columns along x and rows along y."""
-
-    columns: int
-    rows: int
-    square_m: float
-
-    def corners(self) -> FloatArray:
-        """(rows * columns, 3) inner corners in the board's frame, row by row from the top left."""
-        r, c = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float64)
-        x = (c - 0.5 * (self.columns - 1)) * self.square_m
-        y = (0.5 * (self.rows - 1) - r) * self.square_m
-        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
-
-    def surface(self, pose: FloatArray) -> Surface:
-        """The board with its white rim, one square wide."""
-        texture = checkerboard(self.columns + 1, self.rows + 1)
-        rows, columns = texture.values.shape
-        return Surface(pose, columns * self.square_m, rows * self.square_m, texture, 0.3)
+def board_surface(board: Board, pose: FloatArray) -> Surface:
+    """A checkerboard with its white rim, one square wide."""
+    texture = checkerboard(board.columns + 1, board.rows + 1)
+    rows, columns = texture.values.shape
+    return Surface(pose, columns * board.square_m, rows * board.square_m, texture, 0.3)
 
 
 #: Both boards of the double board. Their numbers of corners are odd and even, so that a board
 #: turned by half a turn looks different.
-DOUBLE = Board(7, 6, 0.11)
-WORLD = Board(9, 6, 0.15)
+DOUBLE = Board("checkerboard", 7, 6, 0.11)
+WORLD = Board("checkerboard", 9, 6, 0.15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +80,6 @@ def first_from_second(rng: np.random.Generator) -> FloatArray:
     transform = inverse(first) @ second
     transform[:3, 3] = middle
     return np.asarray(transform)
-
-
-def world_board_pose(plan: SessionPlan) -> FloatArray:
-    """(4, 4) world_from_board of the board on the floor, before the first camera."""
-    return _world_view(plan).pose
 
 
 def _world_view(plan: SessionPlan) -> BoardView:
@@ -177,18 +156,16 @@ def _seen(
     middle = to_camera[:3, 3]
     if -(to_camera[:3, 2] @ middle) < 0.5 * np.linalg.norm(middle):
         return None
-    outline = model.project(kind.surface(to_camera).corners())
+    outline = model.project(board_surface(kind, to_camera).corners())
     size = np.array([model.width, model.height])
     if not np.all((outline > _EDGE_PX) & (outline < size - 1.0 - _EDGE_PX)):
         return None
-    return BoardView(
-        camera, board, placement, pose, model.project(apply(to_camera, kind.corners()))
-    )
+    return BoardView(camera, board, placement, pose, model.project(apply(to_camera, kind.points)))
 
 
 def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> ByteArray:
     settings, model = plan.settings, plan.network.cameras[view.camera]
-    imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
+    imaging = settings.imaging
     seen = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
     background = plan.background(view.camera)
     light = render_light(model, [seen], background, fine=imaging.fine, samples=settings.samples)
@@ -197,17 +174,12 @@ def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: in
 
 
 def write_calibration_set(
-    plan: SessionPlan,
-    folder: Path,
-    writer: SessionWriter | None = None,
-    *,
-    on_frame: Callable[[], None] | None = None,
+    plan: SessionPlan, folder: Path, writer: SessionWriter | None = None
 ) -> int:
     """Write ``rig/`` and ``network/`` below a folder; returns the number of images."""
-    tick = on_frame or (lambda: None)
     writer = writer or SessionWriter()
-    count = _write_rig_images(plan, folder / "rig", writer, tick)
-    return count + _write_network_images(plan, folder / "network", writer, tick)
+    count = _write_rig_images(plan, folder / "rig", writer)
+    return count + _write_network_images(plan, folder / "network", writer)
 
 
 def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
@@ -233,9 +205,7 @@ def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
     return np.column_stack([np.tile(nearest, (_TURN_STEPS, 1)), turn])
 
 
-def _write_rig_images(
-    plan: SessionPlan, folder: Path, writer: SessionWriter, tick: Callable[[], None]
-) -> int:
+def _write_rig_images(plan: SessionPlan, folder: Path, writer: SessionWriter) -> int:
     writer.calibrations(plan, folder)
     seen: list[SeenFrame] = []
     poses: list[FloatArray] = []
@@ -247,16 +217,14 @@ def _write_rig_images(
             writer.image(folder, name, prefix, view.image)
             poses.append(pose)
             seen.append(SeenFrame(name, prefix, _RIG_S + _PAUSE_S * number, view.markers))
-            tick()
     writer.times(folder, plan, seen)
-    writer.poses(folder / "truth.csv", np.array([s.time_s for s in seen]), np.stack(poses))
+    times_s = np.array([s.time_s for s in seen])
+    writer.poses(folder / "truth.csv", times_s, np.stack(poses))
     writer.truth(folder / "truth.json", plan, seen)
     return len(seen)
 
 
-def _write_network_images(
-    plan: SessionPlan, folder: Path, writer: SessionWriter, tick: Callable[[], None]
-) -> int:
+def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter) -> int:
     writer.calibrations(plan, folder)
     offset = first_from_second(random_for(plan.settings.seed, "boards", 99))
     views = board_views(plan, offset)
@@ -265,10 +233,10 @@ def _write_network_images(
     seen: list[SeenFrame] = []
     for number, view in enumerate(views):
         if view.board == "world":
-            boards = [WORLD.surface(view.pose)]
+            boards = [board_surface(WORLD, view.pose)]
         else:
             first = view.pose if view.board == "first" else view.pose @ inverse(offset)
-            boards = [DOUBLE.surface(first), DOUBLE.surface(first @ offset)]
+            boards = [board_surface(DOUBLE, at) for at in (first, first @ offset)]
         name = plan.network.names[view.camera]
         place = view.placement if view.placement >= 0 else after
         prefix = f"network.{place:04d}"
@@ -280,13 +248,15 @@ def _write_network_images(
             {"image": image, "board": view.board, "world_from_board": _pose_json(view.pose),
              "corners": np.round(view.corners, 4).tolist()}
         )  # fmt: skip
-        tick()
     writer.times(folder, plan, seen)
     content: dict[str, Any] = {
         "note": NOTE,
-        "boards": {"first": asdict(DOUBLE), "second": asdict(DOUBLE), "world": asdict(WORLD)},
+        "boards": {
+            name: {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
+            for name, board in (("first", DOUBLE), ("second", DOUBLE), ("world", WORLD))
+        },
         "first_from_second": _pose_json(offset),
-        "world_from_board": _pose_json(world_board_pose(plan)),
+        "world_from_board": _pose_json(_world_view(plan).pose),
         "images": rows,
     }
     write_json(folder / "boards.json", content, overwrite=writer.overwrite)

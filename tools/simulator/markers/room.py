@@ -18,6 +18,7 @@ from tools.arrays import FloatArray
 from tools.simulator.markers.surface import (
     Surface,
     Texture,
+    box_against,
     box_sides,
     marker_surface,
     plain,
@@ -196,16 +197,8 @@ def obstacles(rng: np.random.Generator, area_m: tuple[float, float]) -> list[Sur
         (0.15 * width, depth + 0.65, (0.5, 0.3, 0.75)),
     ):
         shade = rng.uniform(0.1, 0.7)
-        textures = {
-            side: plain(float(shade * factor))
-            for side, factor in (
-                ("front", 1.0),
-                ("rear", 0.8),
-                ("left", 0.9),
-                ("right", 0.7),
-                ("top", 1.1),
-            )
-        }
+        factors = {"front": 1.0, "rear": 0.8, "left": 0.9, "right": 0.7, "top": 1.1}
+        textures = {side: plain(float(shade * factor)) for side, factor in factors.items()}
         turn = rng.uniform(0.0, np.pi)
         result += box_sides(size, textures, planar_transform(x, y, turn))
     return result
@@ -270,10 +263,7 @@ def _before_the_wall(
         }
         if rng.random() < 0.5:
             _, textures["front"] = thing(rng, known)
-        # The wall's x is the box's y, its z the box's x.
-        wall_from_box = np.eye(4)
-        wall_from_box[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-        wall_from_box[:3, 3] = [x + 0.5 * size[1], -0.5 * _HEIGHT_M, 0.5 * size[0] + 0.02]
-        result += box_sides(size, textures, wall @ wall_from_box)
+        foot = x + 0.5 * size[1], -0.5 * _HEIGHT_M, 0.5 * size[0] + 0.02
+        result += box_sides(size, textures, wall @ box_against(foot))
         x += size[1] + rng.uniform(0.3, 1.8)
     return result

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -13,8 +12,9 @@ import numpy as np
 
 from camera import Camera, format_camera, write_camera
 from detect.markers.dictionaries import marker_dictionary
-from redetect.storage import write_whole
+from redetect.groundtruth.trajectories.transforms import transform
 from tools.arrays import ByteArray, Float32Array, FloatArray
+from tools.simulator.files import encoded, write_bytes, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
 from tools.simulator.markers.rendering import (
     SAMPLES,
@@ -29,6 +29,7 @@ from tools.simulator.markers.surface import (
     WHITE,
     Surface,
     Texture,
+    box_against,
     box_sides,
     cross,
     marker_surface,
@@ -130,10 +131,7 @@ def backing_box(rng: np.random.Generator, card: Surface) -> list[Surface]:
     depth = rng.uniform(0.3, 1.2) * card.width_m
     slack = 0.5 * (np.array([across, upward]) - [card.width_m, card.height_m])
     shift = slack * rng.uniform(-1.0, 1.0, 2)
-    # The box's own frame has its front at +x and stands on z = 0.
-    card_from_box = np.eye(4)
-    card_from_box[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-    card_from_box[:3, 3] = [shift[0], shift[1] - 0.5 * upward, -0.5 * depth - _BEHIND_M]
+    foot = shift[0], shift[1] - 0.5 * upward, -0.5 * depth - _BEHIND_M
     shade = rng.uniform(0.08, 0.85)
     textures: dict[str, Texture] = {
         side: plain(float(np.clip(shade * rng.uniform(0.5, 1.2), 0.03, 0.95)))
@@ -142,7 +140,7 @@ def backing_box(rng: np.random.Generator, card: Surface) -> list[Surface]:
     if rng.random() < 0.4:
         pattern = shade + 0.25 * (blotches(rng, (48, 64), octaves=3) - np.float32(0.5))
         textures["front"] = Texture(np.clip(pattern, 0.03, 0.95).astype(np.float32), smooth=True)
-    return box_sides((depth, across, upward), textures, card.pose @ card_from_box)
+    return box_sides((depth, across, upward), textures, card.pose @ box_against(foot))
 
 
 _NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -287,12 +285,10 @@ class _Scene:
         if placed is None:
             return
         pose = random_pose(rng, self.camera, placed.pixel, width_px, slant, _MARKER_M)
-        self.taken.append(placed)
-        self.cards.append((len(self.surfaces), marker_id))
         card = marker_surface(self.dictionary, marker_id, _MARKER_M, pose, quiet_cells=quiet)
-        self.surfaces.append(card)
+        self.cards.append((len(self.surfaces), marker_id))
+        self._put(card, placed, boxed)
         if boxed:
-            self.surfaces += backing_box(rng, card)
             self.things.append("box")
         if occluded:
             self.surfaces.append(_occluder(rng, card))
@@ -302,8 +298,7 @@ class _Scene:
         rng, settings = self.rng, self.settings
         width_px = _log_uniform(rng, (16.0, 260.0))
         placed = place(rng, self.camera, self.taken, width_px, inside=rng.random() < 0.6)
-        near = rng.random() < settings.near
-        if near:
+        if rng.random() < settings.near:
             name, texture = "near_marker", near_marker(rng, self.dictionary)
         else:
             name, texture = thing(rng, self.dictionary)
@@ -314,12 +309,14 @@ class _Scene:
             return
         pose = random_pose(rng, self.camera, placed.pixel, width_px, slant, width_m)
         rows, columns = texture.values.shape
-        surface = Surface(pose, width_m, width_m * rows / columns, texture, 0.4)
+        self._put(Surface(pose, width_m, width_m * rows / columns, texture, 0.4), placed, boxed)
+        self.things.append(name)
+
+    def _put(self, surface: Surface, placed: Placed, boxed: bool) -> None:
         self.taken.append(placed)
         self.surfaces.append(surface)
-        self.things.append(name)
         if boxed:
-            self.surfaces += backing_box(rng, surface)
+            self.surfaces += backing_box(self.rng, surface)
 
 
 def _camera(settings: SampleSettings, rng: np.random.Generator) -> Camera:
@@ -345,8 +342,6 @@ def _imaging(settings: SampleSettings, rng: np.random.Generator) -> Imaging:
 
 def _background(settings: SampleSettings, camera: Camera, rng: np.random.Generator) -> Float32Array:
     files = () if settings.photographs is None else photograph_files(settings.photographs)
-    if settings.photographs is not None and not files:
-        raise ValueError(f"{settings.photographs}: holds no photographs (.jpg, .png)")
     if files and rng.random() < 0.5:
         return photograph_background(rng, camera.width, camera.height, files)
     return shapes_background(rng, camera.width, camera.height)
@@ -366,13 +361,9 @@ def _motion(
     # Steps of a pixel: the pixel's own width fills the gaps.
     count = int(np.clip(np.ceil(length), 2, _MOST_EXPOSURES))
     axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
-    moves = []
-    for k in range(count):
-        angle = length / camera.scale_x * ((k + 0.5) / count - 0.5)
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-        moves.append(move)
-    return moves, length
+    angles = [length / camera.scale_x * ((k + 0.5) / count - 0.5) for k in range(count)]
+    turns = (Rotation.from_rotvec(angle * axis).as_matrix() for angle in angles)
+    return [transform(turn, np.zeros(3)) for turn in turns], length
 
 
 def _occluder(rng: np.random.Generator, card: Surface) -> Surface:
@@ -400,12 +391,9 @@ def _truth(
     camera = scene.camera
     visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M, arrays)
     corners = marker_corners(camera, pose, _MARKER_M)
-    u, v = np.rint(camera.project(pose[:3, 3])).astype(int)
-    light = 1.0
-    if np.ndim(illumination) == 2:
-        light = float(
-            illumination[np.clip(v, 0, camera.height - 1), np.clip(u, 0, camera.width - 1)]
-        )
+    middle = np.rint(camera.project(pose[:3, 3])).astype(int)
+    u, v = np.clip(middle, 0, [camera.width - 1, camera.height - 1])
+    light = float(illumination[v, u]) if np.ndim(illumination) == 2 else 1.0
     return MarkerTruth(
         dictionary, marker_id, corners, pose, _MARKER_M, mean_side_px(corners), slant_deg(pose),
         gain * light * (WHITE - BLACK), visible, rim,
@@ -417,48 +405,32 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float
 
 
 def write_samples(
-    settings: SampleSettings,
-    folder: Path,
-    *,
-    count: int,
-    seed: int,
-    jobs: int = 1,
+    settings: SampleSettings, folder: Path, *, count: int, seed: int, jobs: int = 1,
     overwrite: bool = False,
-    on_frame: Callable[[], None] | None = None,
-) -> int:
+) -> int:  # fmt: skip
     """Render random frames and write them as PNG files, with their calibrations and truth."""
-    import cv2
-
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras = sample_cameras(settings.width, settings.height)
     for number, camera in enumerate(cameras):
         write_camera(camera, folder / f"camera{number}.cam", overwrite=overwrite)
     names = {format_camera(camera): f"camera{k}.cam" for k, camera in enumerate(cameras)}
-    rows, markers = [], 0
+    rows: list[dict[str, Any]] = []
     for frame in sample_frames(settings, seed, range(count), jobs):
         prefix = f"s{seed}.{frame.index:05d}"
-        done, encoded = cv2.imencode(".png", frame.image)
-        if not done:
-            raise ValueError(f"{prefix}: could not be encoded")
-        with write_whole(folder / "images" / f"{prefix}.png", overwrite=overwrite) as stream:
-            stream.write(bytes(encoded))
-        row: dict[str, Any] = {"image": prefix, "camera": names[format_camera(frame.camera)]}
-        rows.append(json.dumps({**row, **frame.as_json()}, separators=(",", ":")))
-        markers += len(frame.markers)
-        if on_frame is not None:
-            on_frame()
-    head = json.dumps({"settings": {**asdict(settings), "photographs": None}}, indent=1)
-    text = head[:-2] + ',\n "frames": [\n' + ",\n".join(rows) + "\n ]\n}\n"
-    with write_whole(folder / "truth.json", overwrite=overwrite) as stream:
-        stream.write(text.encode())
-    return markers
+        png = encoded(frame.image, ".png")
+        write_bytes(folder / "images" / f"{prefix}.png", png, overwrite=overwrite)
+        row = {"image": prefix, "camera": names[format_camera(frame.camera)]}
+        rows.append({**row, **frame.as_json()})
+    head = {"settings": {**asdict(settings), "photographs": None}}
+    write_truth(folder / "truth.json", head, {"frames": rows}, overwrite=overwrite)
+    return sum(len(row["markers"]) for row in rows)
 
 
 def sample_frames(
-    settings: SampleSettings, seed: int, indices: Iterable[int], jobs: int = 1
+    settings: SampleSettings, seed: int, indices: Sequence[int], jobs: int = 1
 ) -> Iterator[SampleFrame]:
     """Frames of a seed in order, rendered by one or more processes; the same either way."""
-    yield from in_order(_sample, (settings, seed), indices, jobs)
+    return in_order(_sample, (settings, seed), indices, jobs)
 
 
 def _sample(state: tuple[SampleSettings, int], index: int) -> SampleFrame:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -16,8 +15,8 @@ from camera import Camera, format_camera, write_camera
 from redetect.groundtruth.markers.calibration import Network, Rig, write_network, write_rig
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse, planar_transform
-from redetect.storage import write_whole
 from tools.arrays import ByteArray, Float32Array, FloatArray
+from tools.simulator.files import encoded, rounded, write_bytes, write_truth
 from tools.simulator.markers.rendering import (
     Imaging,
     grey_image,
@@ -125,11 +124,14 @@ class SessionSettings:
     noise_grey: float = 2.0  # Standard deviation of the noise (grey levels).
     samples: int = 16  # Rays in each quarter of a pixel that an edge crosses.
 
+    @property
+    def imaging(self) -> Imaging:
+        """How light becomes grey values."""
+        return Imaging(self.blur_px, 6.0, 280.0, self.noise_grey)
+
 
 Purpose = Literal["rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame"]
-_PURPOSES: tuple[Purpose, ...] = (
-    "rig", "cameras", "room", "robot", "drive", "errors", "light", "boards", "frame",
-)  # fmt: skip
+_PURPOSES = get_args(Purpose)
 
 
 def random_for(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
@@ -152,11 +154,6 @@ class SessionPlan:
     things: tuple[Surface, ...]  # What stands beside the area, world frame.
     room: tuple[Surface, ...]  # What is behind all that, world frame.
     _backgrounds: dict[int, Float32Array] = field(default_factory=dict)
-
-    @property
-    def references(self) -> int:
-        """How many of the images are of the robot standing still."""
-        return self.settings.references
 
     @cached_property
     def camera_from_world(self) -> FloatArray:
@@ -196,30 +193,21 @@ def plan_session(settings: SessionSettings) -> SessionPlan:
     seed = settings.seed
     if not 1 <= settings.cameras <= len(CAMERA_NAMES):
         raise ValueError(f"{settings.cameras} cameras: expected 1 to {len(CAMERA_NAMES)}")
-    names = tuple(CAMERA_NAMES[: settings.cameras])
+    area_m, dictionary, count = settings.area_m, settings.dictionary, settings.cameras
+    names = tuple(CAMERA_NAMES[:count])
     cameras, world_from_camera = room_cameras(
-        random_for(seed, "cameras"), settings.cameras, settings.area_m, settings.width,
-        settings.height,
-    )  # fmt: skip
-    count = len(names)
-    network = Network(
-        names, cameras, tuple(f"{name}/{name}.cam" for name in names), world_from_camera,
-        np.zeros((6 * count, 6 * count)),
-    )  # fmt: skip
-    rig = robot_rig(random_for(seed, "rig"), settings.dictionary, settings.marker_m)
-    times_s, poses, speeds = _drive(settings, random_for(seed, "drive"))
-    room = room_surfaces(random_for(seed, "room"), settings.area_m, settings.dictionary)
-    return SessionPlan(
-        settings=settings,
-        rig=rig,
-        network=network,
-        times_s=times_s,
-        poses=poses,
-        speeds=speeds,
-        robot=tuple(robot_surfaces(rig, random_for(seed, "robot"))),
-        things=tuple(obstacles(random_for(seed, "room", 1), settings.area_m)),
-        room=tuple(room),
+        random_for(seed, "cameras"), count, area_m, settings.width, settings.height
     )
+    files = tuple(f"{name}/{name}.cam" for name in names)
+    known = np.zeros((6 * count, 6 * count))
+    network = Network(names, cameras, files, world_from_camera, known)
+    rig = robot_rig(random_for(seed, "rig"), dictionary, settings.marker_m)
+    return SessionPlan(
+        settings, rig, network, *_drive(settings, random_for(seed, "drive")),
+        robot=tuple(robot_surfaces(rig, random_for(seed, "robot"))),
+        things=tuple(obstacles(random_for(seed, "room", 1), area_m)),
+        room=tuple(room_surfaces(random_for(seed, "room"), area_m, dictionary)),
+    )  # fmt: skip
 
 
 def _drive(
@@ -228,11 +216,9 @@ def _drive(
     """Times, poses and speeds: standing at random places, then a figure of eight."""
     area = np.array(settings.area_m)
     half = 0.5 * area - 0.55
+    still = settings.references
     standing = np.column_stack(
-        [
-            0.5 * area + half * rng.uniform(-1.0, 1.0, (settings.references, 2)),
-            rng.uniform(-np.pi, np.pi, settings.references),
-        ]
+        [0.5 * area + half * rng.uniform(-1.0, 1.0, (still, 2)), rng.uniform(-np.pi, np.pi, still)]
     )
     # A figure of eight whose loops slowly turn, so that no two rounds are the same.
     length = 2.0 * np.pi * np.hypot(0.75 * half[0], 1.1 * half[1])
@@ -253,13 +239,8 @@ def _drive(
     poses, later = pose(t), pose(t + 1e-3)
     change = later - poses
     change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
-    times = np.concatenate(
-        [
-            _FIRST_S + _STANDING_S * np.arange(settings.references),
-            _FIRST_S + _STANDING_S * settings.references + t,
-        ]
-    )
-    speeds = np.concatenate([np.zeros((settings.references, 3)), change / 1e-3])
+    times = _FIRST_S + np.concatenate([_STANDING_S * np.arange(still), _STANDING_S * still + t])
+    speeds = np.concatenate([np.zeros((still, 3)), change / 1e-3])
     return times, np.concatenate([standing, poses]), speeds
 
 
@@ -276,9 +257,9 @@ def view_robot(
     camera_from_world = plan.camera_from_world[camera]
     exposures = [
         _surfaces(plan, camera_from_world, pose + offset * settings.exposure_s * speed)
-        for offset in _instants(plan, camera_from_world, model, pose, speed)
+        for offset in _instants(plan, camera, pose, speed)
     ]
-    imaging = Imaging(settings.blur_px, 6.0, 280.0, settings.noise_grey)
+    imaging = settings.imaging
     background = _shadowed(plan, camera, pose)
     light = render_light(model, exposures, background, fine=imaging.fine, samples=settings.samples)
     illumination = plan.illumination(camera)
@@ -290,25 +271,20 @@ def view_robot(
 
 def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray) -> list[Surface]:
     """Robot and obstacles in the camera frame, first the rig's boards."""
-    world_from_robot = planar_transform(*(float(x) for x in pose))
+    world_from_robot = planar_transform(*pose.tolist())
     robot = [lit(surface.moved(world_from_robot)) for surface in plan.robot]
     return [surface.moved(camera_from_world) for surface in [*robot, *plan.things]]
 
 
-def _instants(
-    plan: SessionPlan,
-    camera_from_world: FloatArray,
-    model: Camera,
-    pose: FloatArray,
-    speed: FloatArray,
-) -> FloatArray:
+def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray) -> FloatArray:
     """When the robot is looked at, in shares of the exposure from its middle: every pixel."""
     points = plan.rig.robot_from_marker[:, :3, 3]
     ends = []
     for offset in (-0.5, 0.5):
         moved = pose + offset * plan.settings.exposure_s * speed
-        world = apply(planar_transform(*(float(x) for x in moved)), points)
-        ends.append(model.project(apply(camera_from_world, world)))
+        world = apply(planar_transform(*moved.tolist()), points)
+        seen = apply(plan.camera_from_world[camera], world)
+        ends.append(plan.network.cameras[camera].project(seen))
     way = np.nan_to_num(np.linalg.norm(ends[1] - ends[0], axis=1)).max()
     count = int(np.clip(np.ceil(way), 1, _MOST_EXPOSURES))
     return (np.arange(count) + 0.5) / count - 0.5
@@ -319,7 +295,7 @@ def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     background, model = plan.background(camera), plan.network.cameras[camera]
     x, y = 1.15 * np.array(FOOTPRINT_M)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    world = apply(planar_transform(*(float(p) for p in pose)), corners)
+    world = apply(planar_transform(*pose.tolist()), corners)
     pixels = model.project(apply(plan.camera_from_world[camera], world))
     if np.isnan(pixels).any():
         return background
@@ -409,11 +385,6 @@ class SessionWriter:
     quality: int = 92  # Of the jpg files.
     overwrite: bool = False  # Whether existing files may be replaced.
 
-    def text(self, path: Path, content: str) -> None:
-        """Write a text file."""
-        with write_whole(path, overwrite=self.overwrite) as stream:
-            stream.write(content.encode())
-
     def calibrations(self, plan: SessionPlan, folder: Path) -> None:
         """Write ``network.json``, ``rig.json`` and a ``.cam`` per camera; make the folders."""
         seed = plan.settings.seed
@@ -429,13 +400,8 @@ class SessionWriter:
     def image(self, folder: Path, camera: str, prefix: str, image: ByteArray) -> str:
         """Write a camera's image; returns its place in the session's folder."""
         place = f"{camera}/images/{prefix}.{self.image_format}"
-        jpg = self.image_format == "jpg"
-        options = [cv2.IMWRITE_JPEG_QUALITY, self.quality] if jpg else []
-        done, encoded = cv2.imencode(f".{self.image_format}", image, options)
-        if not done:
-            raise ValueError(f"{place}: an image of {image.shape} could not be encoded")
-        with write_whole(folder / place, overwrite=self.overwrite) as stream:
-            stream.write(bytes(encoded))
+        content = encoded(image, f".{self.image_format}", self.quality)
+        write_bytes(folder / place, content, overwrite=self.overwrite)
         return place
 
     def times(self, folder: Path, plan: SessionPlan, seen: Sequence[SeenFrame]) -> None:
@@ -443,7 +409,8 @@ class SessionWriter:
         for name in plan.network.names:
             own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
             rows = [f"# {NOTE}", "# image seconds", *(f"{s.prefix} {s.time_s:.6f}" for s in own)]
-            self.text(folder / name / f"{name}.times", "\n".join(rows) + "\n")
+            text = "\n".join([*rows, ""]).encode()
+            write_bytes(folder / name / f"{name}.times", text, overwrite=self.overwrite)
 
     def poses(self, path: Path, times_s: FloatArray, poses: FloatArray) -> None:
         """Write rows t, x, y, theta as RAWSEEDS' streams have them."""
@@ -460,7 +427,7 @@ class SessionWriter:
             "conventions": _CONVENTIONS,
             "settings": asdict(plan.settings),
             "errors": asdict(self.errors),
-            "references": plan.references,
+            "references": plan.settings.references,
             "cameras": {
                 name: {"calibration": format_camera(camera), "world_from_camera": _rows_of(pose)}
                 for name, camera, pose in zip(
@@ -473,24 +440,16 @@ class SessionWriter:
             },
             **(extra or {}),
         }
-        frames = ",\n".join(
-            json.dumps(
-                {"camera": s.camera, "image": s.prefix, "t": s.time_s,
-                 "markers": [_marker_json(m) for m in s.markers]},
-                separators=(",", ":"),
-            )
+        frames = [
+            {"camera": s.camera, "image": s.prefix, "t": s.time_s,
+             "markers": [_marker_json(m) for m in s.markers]}
             for s in seen
-        )  # fmt: skip
-        self.text(path, json.dumps(head, indent=1)[:-2] + f',\n "frames": [\n{frames}\n ]\n}}\n')
+        ]  # fmt: skip
+        write_truth(path, head, {"frames": frames}, overwrite=self.overwrite)
 
 
 def write_session(
-    settings: SessionSettings,
-    folder: Path,
-    writer: SessionWriter | None = None,
-    *,
-    jobs: int = 1,
-    on_frame: Callable[[], None] | None = None,
+    settings: SessionSettings, folder: Path, writer: SessionWriter | None = None, jobs: int = 1
 ) -> int:
     """Render a session and write its folder."""
     plan, writer = plan_session(settings), writer or SessionWriter()
@@ -502,11 +461,9 @@ def write_session(
         prefix = plan.prefix(frame)
         writer.image(folder, names[camera], prefix, view.image)
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))
-        if on_frame is not None:
-            on_frame()
     writer.times(folder, plan, seen)
     writer.poses(folder / "truth.csv", plan.times_s, plan.poses)
-    still = slice(0, plan.references)
+    still = slice(0, plan.settings.references)
     writer.poses(folder / "reference.csv", plan.times_s[still], plan.poses[still])
     writer.truth(folder / "truth.json", plan, seen)
     return len(work)
@@ -518,7 +475,7 @@ def _view(plan: SessionPlan, work: tuple[int, int]) -> View:
 
 def _rows_of(pose: FloatArray) -> list[list[float]]:
     """A (4, 4) transform's first three rows as plain numbers."""
-    return [[round(float(x), 12) for x in row] for row in pose[:3]]
+    return [rounded(row, 12) for row in pose[:3]]
 
 
 def _marker_json(marker: MarkerTruth) -> dict[str, Any]:

@@ -103,6 +103,18 @@ def box_sides(
     return result
 
 
+def box_against(origin: ArrayLike) -> FloatArray:
+    """(4, 4) surface_from_box of a box whose front looks as the surface does.
+
+    `origin` (3,) is the middle of its foot in the surface's frame.
+    """
+    # The surface's x is the box's y, its z the box's x.
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    pose[:3, 3] = origin
+    return pose
+
+
 #: Reflectance of printer's black and of paper.
 BLACK, WHITE = 0.05, 0.88
 

@@ -24,12 +24,12 @@ from tools.simulator.markers.surface import (
 _TRIES = 32
 
 
-def checkerboard(columns: int, rows: int, black: float = BLACK, white: float = WHITE) -> Texture:
+def checkerboard(columns: int, rows: int) -> Texture:
     """A board of columns x rows squares, the upper left one black, with a white rim."""
     r, c = np.mgrid[0 : rows + 2, 0 : columns + 2]
-    values = np.where((r + c) % 2 == 0, black, white).astype(np.float32)
-    values[[0, -1], :] = white
-    values[:, [0, -1]] = white
+    values = np.where((r + c) % 2 == 0, BLACK, WHITE).astype(np.float32)
+    values[[0, -1], :] = WHITE
+    values[:, [0, -1]] = WHITE
     return Texture(values)
 
 
@@ -266,7 +266,10 @@ def _fill(image: ByteArray, corners: FloatArray, shade: int) -> None:
 
 def photograph_files(folder: Path) -> tuple[Path, ...]:
     """The photographs below a folder, in an order that does not depend on the file system."""
-    return tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in _PHOTOGRAPHS))
+    files = tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in _PHOTOGRAPHS))
+    if not files:
+        raise ValueError(f"{folder}: holds no photographs (.jpg, .png)")
+    return files
 
 
 def photograph_background(

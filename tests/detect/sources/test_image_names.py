@@ -1,4 +1,4 @@
-"""Names looked up: what a dictionary would say, whatever the names."""
+"""Names of images looked up, and their order."""
 
 from __future__ import annotations
 
@@ -11,22 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.errors import FrameError
-from detect.sources.image_files import ImageNames, NameIndex
-
-# Short alphabets make names that begin alike.
-NAMES = st.lists(
-    st.text("ab.0\xff", max_size=6).map(str.encode) | st.binary(min_size=60, max_size=70),
-    max_size=30,
-).map(lambda names: [name.replace(b"\0", b"x") for name in names])
-
-
-@given(names=NAMES, others=NAMES)
-def test_the_last_of_equal_names_is_found(names: list[bytes], others: list[bytes]) -> None:
-    index = NameIndex(names)
-    places = {name: place for place, name in enumerate(names)}
-    assert len(index) == len(names)
-    for name in [*names, *others]:
-        assert index.find(name) == places.get(name)
+from detect.sources.image_files import ImageNames
 
 
 def by_value(name: str) -> tuple[list[tuple[int, str]], str]:

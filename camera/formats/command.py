@@ -14,14 +14,21 @@ from camera.formats.conversion import (
     convert_to_camera,
     convert_to_foreign,
 )
-from camera.formats.kalibr import format_kalibr, parse_kalibr
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.opencv import format_opencv, parse_opencv
-from camera.formats.plain_yaml import parse_yaml, read_content, text_of
-from camera.formats.ros import format_ros, parse_ros
+from camera.formats.yaml_files import (
+    format_kalibr,
+    format_opencv,
+    format_ros,
+    parse_kalibr,
+    parse_opencv,
+    parse_ros,
+    parse_yaml,
+    read_content,
+    text_of,
+)
 from camera.model import Camera
 from camera.options import Convert, Format
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import demand_place, write_bytes
 
 #: The models that each format has, the simplest first.
 MODELS: dict[str, tuple[Model, ...]] = {
@@ -36,8 +43,7 @@ _FREE = {("kalibr", "radtan"): 4, ("colmap", "radtan"): 4, ("colmap", "rational"
 
 def perform(options: Convert) -> int:
     """Carry the command out; returns the exit code."""
-    if options.target.exists() and not options.force:
-        raise OutputExistsError(options.target)
+    demand_place(options.target, overwrite=options.force)
     text = read_text(options.source)
     from_format = options.from_format
     if from_format == "auto":
@@ -70,8 +76,7 @@ def perform(options: Convert) -> int:
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose stays behind: the format has none (--pose-from brings it back)")
     written = format_of(camera, to_format, options.camera_name)
-    with write_whole(options.target, overwrite=options.force) as stream:
-        stream.write(written.encode())
+    write_bytes(options.target, written.encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

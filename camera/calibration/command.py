@@ -7,19 +7,13 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from errno import ENOENT
 from itertools import islice
-from math import degrees, radians
-from os import strerror
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from camera.boards.board import Board
-from camera.boards.charuco import dictionary_of
+from camera.boards.board import Board, board_of, dictionary_of
 from camera.boards.points import corners_counted, find_board
 from camera.calibration.calibrate import (
     BoardView,
@@ -27,29 +21,27 @@ from camera.calibration.calibrate import (
     aspect_of,
     calibrate,
     calibrate_freely,
+    coverage,
 )
-from camera.calibration.check_pictures import drawn_corners, drawn_floor, rectified_floor
-from camera.calibration.checks import coverage
 from camera.calibration.floor import (
     FloorPose,
-    on_floor,
+    describe_pose,
+    file_name,
+    floor_points,
     place_on_floor,
     placed_camera,
-    read_floor_points,
+    write_floor_pictures,
+    write_picture,
 )
-from camera.calibration.images import GreyImage, calibration_images, read_grey
-from camera.calibration.model import COUNT, INTRINSICS
-from camera.calibration.pictures import pictures
-from camera.calibration.projection import UNPOSED, projection_sigma, with_intrinsics
-from camera.calibration.settings import CalibrationSettings
+from camera.calibration.images import GreyImage, calibration_images
+from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
+from camera.calibration.pictures import drawn_corners, pictures
 from camera.camfile import format_camera
 from camera.errors import CalibrationError, CameraError
 from camera.model import PARAMETERS, Camera
-from camera.options import Calibrate, Floor
-from camera.uncertainty import with_covariance
-from redetect.storage import OutputExistsError, write_whole
-
-FloatArray = NDArray[np.float64]
+from camera.options import Calibrate
+from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
+from redetect.storage import demand_place, write_bytes
 
 #: How many pictures are looked through for the true size of a checkerboard, and how many agree.
 _COUNTED_PICTURES, _VOTES = 8, 2
@@ -62,14 +54,11 @@ def perform(options: Calibrate) -> int:
     kinds = ("residuals", "views", "coverage")
     names = {kind: output.with_name(f"{output.stem}.{kind}.png") for kind in kinds}
     report = output.with_suffix(".json")
-    for path in (output, report, *names.values()):
-        if path.exists() and not options.force:
-            raise OutputExistsError(path)
     # Checked first, not after minutes of work.
+    for path in (output, report, *names.values()):
+        demand_place(path, overwrite=options.force)
     if report == output:
         raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
-    if not output.parent.exists():
-        raise FileNotFoundError(ENOENT, strerror(ENOENT), str(output))
     if options.floor is not None and not options.floor.exists():
         raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
     board = board_of(options)
@@ -109,59 +98,19 @@ def perform(options: Calibrate) -> int:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
-                place = options.pictures / f"{_file_name(name)}.corners.png"
+                place = options.pictures / f"{file_name(name)}.corners.png"
                 write_picture(picture, place, force=options.force)
         if options.floor is not None:
             write_floor_pictures(options, options.floor, camera)
     drawn = pictures(calibration, camera)
     for name, path in names.items():
-        with write_whole(path, overwrite=options.force) as stream:
-            stream.write(drawn[name])
-    with write_whole(report, overwrite=options.force) as stream:
-        stream.write(report_text(options, calibration, camera, placed).encode())
-    with write_whole(output, overwrite=options.force) as stream:
-        stream.write(format_camera(camera).encode())
+        write_bytes(path, drawn[name], overwrite=options.force)
+    write_bytes(
+        report, report_text(options, calibration, camera, placed).encode(), overwrite=options.force
+    )
+    write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
     print(f"written: {output}, {report.name}, {', '.join(p.name for p in names.values())}")
     return 0
-
-
-def write_floor_pictures(options: Calibrate | Floor, floor: Path, camera: Camera) -> None:
-    """The floor's grid in its photograph, and the floor from above; of a table, nothing."""
-    if options.pictures is None:
-        return
-    if floor.suffix.lower() == ".csv":
-        print(f"{floor}: no photograph, so there is no picture of the floor's grid")
-        return
-    image = read_grey(floor)
-    for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
-        place = options.pictures / f"{_file_name(floor.name)}.{name}.png"
-        write_picture(draw(image, camera), place, force=options.force)
-
-
-def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> None:
-    """Write a PNG file, its folder if need be."""
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with write_whole(place, overwrite=force) as stream:
-        stream.write(cv2.imencode(".png", picture)[1].tobytes())
-    print(f"written: {place}")
-
-
-def _file_name(name: str) -> str:
-    """Of a picture, or a frame of a video."""
-    return name.replace(":", "-")
-
-
-def board_of(options: Calibrate | Floor) -> Board:
-    """The board that the flags describe."""
-    return Board(
-        kind=options.board,
-        columns=options.columns,
-        rows=options.rows,
-        square_m=options.square_m,
-        marker_m=options.marker_m,
-        dictionary=options.dictionary,
-        circle_m=options.circle_m,
-    )
 
 
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
@@ -251,41 +200,6 @@ def camera_of(calibration: Calibration) -> Camera:
         ) from None
 
 
-class FloorPoints(NamedTuple):
-    """(N, 2) pixels, (N, 2) places (robot X, Y in m), radius of the circles seen there (m) or 0."""
-
-    pixels: FloatArray
-    xy: FloatArray
-    radius_m: float = 0.0
-
-
-def floor_points(
-    options: Calibrate | Floor, board: Board | None, path: Path, size: tuple[int, int]
-) -> FloorPoints:
-    """Points on the floor of a .csv file, or of a picture of the board."""
-    if path.suffix.lower() == ".csv":
-        return FloorPoints(*read_floor_points(path))
-    board = board or board_of(options)
-    if board.looks_turned:
-        raise CalibrationError(
-            f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
-            "axes point: use one with one even and one odd number, or a .csv of places u,v,x,y"
-        )
-    image = read_grey(path)
-    if image.shape != size[::-1]:
-        raise CalibrationError(
-            f"{path}: {image.shape[1]} x {image.shape[0]} pixels: expected the calibrated camera's "
-            f"{size[0]} x {size[1]}"
-        )
-    try:
-        indices, pixels = find_board(image, board)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
-    yaw = radians(options.floor_yaw)
-    places = on_floor(board.points[indices], options.floor_origin, yaw)[:, :2]
-    return FloorPoints(pixels, places, 0.5 * board.circle_m)
-
-
 def describe(calibration: Calibration, camera: Camera) -> str:
     """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
@@ -314,29 +228,6 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         lines.append(f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)")
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
-
-
-def describe_pose(pose: FloorPose) -> str:
-    """The pose with its standard deviations, for people."""
-    sigma = np.sqrt(np.diag(pose.covariance))
-    R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
-    down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
-    bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
-    return "\n".join(
-        [
-            f"pose from {len(pose.residuals)} points on the floor, RMS {pose.rms_px:.3f} px:",
-            *(
-                f"  {axis} {value:9.5f} m +- {s:.5f}"
-                for axis, value, s in zip(
-                    ("X (left)    ", "Y (backward)", "Z (up)      "), t, sigma
-                )
-            ),
-            f"  looking {down:.3f} deg down, {bearing:.3f} deg to the left; rotations about X, "
-            f"Y, Z +- {', '.join(f'{degrees(s):.4f}' for s in sigma[3:])} deg",
-            "  covariance (X Y Z in m, rotations about X Y Z in rad):",
-            *(f"    {' '.join(f'{value: .3e}' for value in row)}" for row in pose.covariance),
-        ]
-    )
 
 
 def report_text(

@@ -1,0 +1,409 @@
+"""Calibrations in YAML: OpenCV's, ROS's camera_info and Kalibr's camchain.
+
+YAML is read safely: plain values only, bounded, without aliases. OpenCV's own dialect begins with
+``%YAML:1.0`` and tags its matrices; both are understood.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml  # type: ignore[import-untyped, unused-ignore]
+
+from camera.errors import ConversionError
+from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
+from redetect.storage.bounded import read_bounded
+from redetect.storage.messages import excerpt, one_line
+
+_LARGEST_FILE_BYTES = 1 << 20
+_MOST_CAMERAS = 1000
+
+
+def read_content(path: Path) -> bytes:
+    """The content of a calibration file."""
+    try:
+        return read_bounded(path, _LARGEST_FILE_BYTES)
+    except FileNotFoundError:
+        raise ConversionError(f"{path}: no such calibration file") from None
+    except OSError as error:
+        raise ConversionError(
+            f"{path}: cannot be read as a calibration: {error.strerror}"
+        ) from None
+
+
+def text_of(content: bytes, name: str) -> str:
+    """The content of a calibration file as text."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConversionError(f"{name}: is no text: expected a calibration") from None
+
+
+def parse_yaml(text: str, name: str) -> dict[str, Any]:
+    """The first document of a YAML text, which must be a mapping."""
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            # Aliases of aliases grow without end, and no calibration has any.
+            if self.check_event(yaml.events.AliasEvent):
+                line = self.peek_event().start_mark.line + 1
+                raise ConversionError(f"{name}:{line}: an alias: expected plain values")
+            return super().compose_node(parent, index)
+
+    def matrix(loader: Any, node: Any) -> Any:
+        return loader.construct_mapping(node, deep=True)
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
+    lines = text.splitlines()
+    if lines and lines[0].startswith("%YAML:"):
+        text = "\n".join(["", *lines[1:]])
+    try:
+        # Only the first of several documents: `rostopic echo` writes one per message.
+        content = next(iter(yaml.load_all(text, Loader)), None)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f":{mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or "no YAML"
+        raise ConversionError(f"{name}{where}: {problem}: expected YAML") from None
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, ConversionError):
+            raise
+        raise ConversionError(
+            f"{name}: not YAML that can be read: {one_line(str(error), 100)}"
+        ) from None
+    if not isinstance(content, dict):
+        raise ConversionError(f"{name}: expected YAML with keys and values")
+    # Keys of calibrations are words, or cameras' numbers; others may be too long to be written.
+    return {
+        str(key): value
+        for key, value in content.items()
+        if isinstance(key, str) or (isinstance(key, int) and abs(key) < _MOST_CAMERAS)
+    }
+
+
+def numbers(value: Any, key: str, name: str) -> list[float]:
+    """The numbers of a list, of nested lists, or of a mapping with `data`, flat."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    flat: list[Any] = []
+    pending = [value]
+    while pending:
+        item = pending.pop()
+        if isinstance(item, list):
+            pending += reversed(item)
+        else:
+            flat.append(item)
+    result = []
+    for item in flat:
+        # YAML 1.1 takes 1e-3 for text, because it lacks the dot.
+        try:
+            number = float(item) if not isinstance(item, bool) else float("nan")
+        except (OverflowError, TypeError, ValueError):
+            number = float("nan")
+        if not np.isfinite(number):
+            raise ConversionError(f"{name}: {key} has {excerpt(item)}: expected numbers")
+        result.append(number)
+    return result
+
+
+def first_of(content: dict[str, Any], keys: tuple[str, ...], name: str) -> Any:
+    """The value of the first key that is there."""
+    for key in keys:
+        if key in content:
+            return content[key]
+    raise ConversionError(f"{name}: lacks {' or '.join(keys)}")
+
+
+def whole(value: Any, key: str, name: str) -> int:
+    """A whole number."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ConversionError(f"{name}: {key} is {excerpt(value)}: expected a whole number")
+    return value
+
+
+def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a 3 x 3 camera matrix without skew."""
+    m = numbers(value, key, name)
+    if len(m) != 9 or m[3:4] + m[6:] != [0.0, 0.0, 0.0, 1.0]:
+        raise ConversionError(
+            f"{name}: {key} is {excerpt(m)}: expected the 9 numbers fx 0 cx 0 fy cy 0 0 1"
+        )
+    if m[1] != 0.0:
+        raise ConversionError(f"{name}: {key} has a skew of {m[1]:g}: only 0 can be converted")
+    return m[0], m[4], m[2], m[5]
+
+
+def shortest(value: float) -> str:
+    """The shortest text that reads back as the same float, with the dot that YAML 1.1 wants."""
+    text = repr(float(value) + 0.0)
+    if "e" in text and "." not in text:
+        return text.replace("e", ".0e")
+    return text
+
+
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
+_DISTORTION = (
+    "distortion_coefficients",
+    "dist_coeffs",
+    "distCoeffs",
+    "Distortion_Coefficients",
+    "D",
+)
+_TILT = 12
+_FISHEYE = ("1", "true", "fisheye", "equidistant")
+
+
+def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
+    """A camera of the text of an OpenCV YAML file."""
+    content = parse_yaml(text, name)
+    sides = []
+    for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
+        if key not in content and other not in content:
+            # OpenCV itself does not require the size; its stereo sample writes none.
+            raise ConversionError(
+                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
+            )
+        sides.append(whole(first_of(content, (key, other), name), key, name))
+    width, height = sides
+    fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
+    d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
+    kind = content.get("fisheye_model", content.get("distortion_model", 0))
+    fisheye = kind.lower() in _FISHEYE if isinstance(kind, str) else kind == 1
+    model = opencv_model(d, fisheye=fisheye, name=name)
+    return foreign(name, model, width, height, (fx, fy, cx, cy), d)
+
+
+def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Model:
+    """The model that OpenCV uses for this number of coefficients."""
+    count = len(coefficients)
+    if fisheye:
+        if count != COEFFICIENTS["fisheye"]:
+            raise ConversionError(
+                f"{name}: {count} coefficients of a fisheye lens: expected k1 k2 k3 k4"
+            )
+        return "fisheye"
+    if count not in (0, 4, 5, 8, 12, 14):
+        raise ConversionError(
+            f"{name}: {count} distortion coefficients: expected 4, 5, 8, 12 or 14"
+        )
+    if any(coefficients[_TILT:]):
+        raise ConversionError(
+            f"{name}: a tilted sensor (tau {excerpt(coefficients[_TILT:])}) can't be converted"
+        )
+    return "radtan" if count <= 5 else "rational"
+
+
+def foreign(
+    name: str,
+    model: Model,
+    width: int,
+    height: int,
+    pinhole: tuple[float, float, float, float],
+    coefficients: list[float],
+) -> ForeignCamera:
+    """Make a camera; coefficients of the model that the file does not give are 0."""
+    count = COEFFICIENTS[model]
+    padded = (*coefficients, *(0.0,) * count)[:count]
+    try:
+        return ForeignCamera(model, width, height, *pinhole, padded)
+    except ConversionError as error:
+        raise ConversionError(f"{name}: {error}") from None
+
+
+def format_opencv(camera: ForeignCamera) -> str:
+    """The text of an OpenCV YAML file; OpenCV's FileStorage reads it."""
+    d = camera.printed_distortion
+    lines = ["%YAML:1.0", "---", f"image_width: {camera.width}", f"image_height: {camera.height}"]
+    lines += _opencv_matrix("camera_matrix", 3, 3, camera.matrix)
+    lines += _opencv_matrix("distortion_coefficients", len(d), 1, d)
+    lines.append(f"fisheye_model: {int(camera.model == 'fisheye')}")
+    return "\n".join([*lines, ""])
+
+
+def _opencv_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
+    data = ", ".join(shortest(value) for value in values)
+    return [
+        f"{key}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {data} ]",
+    ]
+
+
+#: Names of the models in ROS (sensor_msgs/distortion_models.h).
+ROS_NAMES: dict[Model, str] = {
+    "radtan": "plumb_bob",
+    "rational": "rational_polynomial",
+    "fisheye": "equidistant",
+}
+_ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
+    "fisheye": "fisheye"
+}
+_ROS_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+
+
+def camera_from_message(
+    width: int,
+    height: int,
+    distortion_model: str,
+    d: Sequence[float],
+    k: Sequence[float],
+    name: str = "camera_info",
+) -> ForeignCamera:
+    """A camera of the numbers of a ``sensor_msgs/CameraInfo`` message."""
+    if not any(k):
+        raise ConversionError(f"{name}: the camera matrix is 0: the camera is not calibrated")
+    pinhole = pinhole_matrix(list(k), "camera matrix", name)
+    d = [float(value) for value in d]
+    label = distortion_model or ("plumb_bob" if not any(d) else "")
+    if label not in _ROS_MODELS:
+        raise ConversionError(
+            f"{name}: distortion model {excerpt(distortion_model)}: expected "
+            f"{', '.join(_ROS_MODELS)}"
+        )
+    model = _ROS_MODELS[label]
+    allowed = {"radtan": (0, 4, 5), "rational": (8, 12, 14), "fisheye": (4,)}[model]
+    if len(d) not in allowed or any(d[12:]):
+        raise ConversionError(
+            f"{name}: {len(d)} coefficients of {label}: expected "
+            f"{' or '.join(str(count) for count in allowed)}, without tilt"
+        )
+    return foreign(name, model, width, height, pinhole, d)
+
+
+def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
+    """A camera of the text of a camera_info YAML file, or of an echoed message."""
+    content = parse_yaml(text, name)
+    width = whole(first_of(content, ("image_width", "width"), name), "image_width", name)
+    height = whole(first_of(content, ("image_height", "height"), name), "image_height", name)
+    for key in ("binning_x", "binning_y"):
+        binning = content.get(key)
+        if isinstance(binning, int) and binning > 1:
+            raise ConversionError(f"{name}: {key} is {binning}: only unbinned images are converted")
+    _demand_whole_image(content.get("roi"), width, height, name)
+    matrix = first_of(content, ("camera_matrix", "k", "K"), name)
+    coefficients = first_of(content, ("distortion_coefficients", "d", "D"), name)
+    label = content.get("distortion_model", "plumb_bob")
+    return camera_from_message(
+        width,
+        height,
+        label if isinstance(label, str) else excerpt(label),
+        numbers(coefficients, "distortion_coefficients", name),
+        numbers(matrix, "camera_matrix", name),
+        name,
+    )
+
+
+def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None:
+    """Refuse a region of interest other than none (all 0) or the whole image."""
+    if not isinstance(roi, dict):
+        return
+    found = tuple(roi.get(key, 0) for key in ("x_offset", "y_offset", "width", "height"))
+    if found not in ((0, 0, 0, 0), (0, 0, width, height)):
+        raise ConversionError(
+            f"{name}: roi is {excerpt(found)} (x_offset, y_offset, width, height): only whole "
+            f"images, here {width} x {height}, are converted"
+        )
+
+
+def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
+    """The text of a camera_info YAML file, as camera_calibration writes it.
+
+    A name that is no word, such as a number, is left out for ``camera``.
+    """
+    d, matrix = camera.printed_distortion, camera.matrix
+    projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
+    identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    lines = [
+        f"image_width: {camera.width}",
+        f"image_height: {camera.height}",
+        f"camera_name: {camera_name if _ROS_NAME.fullmatch(camera_name) else 'camera'}",
+        *_ros_matrix("camera_matrix", 3, 3, matrix),
+        f"distortion_model: {ROS_NAMES[camera.model]}",
+        *_ros_matrix("distortion_coefficients", 1, len(d), d),
+        *_ros_matrix("rectification_matrix", 3, 3, identity),
+        *_ros_matrix("projection_matrix", 3, 4, projection),
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _ros_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
+    data = ", ".join(shortest(value) for value in values)
+    return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+
+
+_KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
+_KALIBR_COEFFICIENTS = 4
+_LONGEST_LIST = 100
+_KALIBR_NAME = re.compile(r"cam\d+", re.ASCII)
+
+
+def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
+    """A camera of the text of a camchain; `camera_name` says which, such as ``cam0``."""
+    content = parse_yaml(text, name)
+    cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
+    cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
+    held = one_line(", ".join(cameras), _LONGEST_LIST)
+    if camera_name:
+        if camera_name not in cameras:
+            raise ConversionError(f"{name}: no {camera_name}: it holds {held}")
+    elif len(cameras) != 1:
+        there = f"it holds {held}: give --camera-name" if cameras else "it holds none"
+        raise ConversionError(f"{name}: expected one camera (cam0 with intrinsics), {there}")
+    else:
+        camera_name = next(iter(cameras))
+    entry: dict[str, Any] = cameras[camera_name]
+    where = f"{name}: {one_line(camera_name, _LONGEST_LIST)}"
+    if entry.get("camera_model", "pinhole") != "pinhole":
+        raise ConversionError(
+            f"{where}: camera_model {excerpt(entry['camera_model'])}: expected pinhole"
+        )
+    model = entry.get("distortion_model", "none")
+    label = model if isinstance(model, str) else excerpt(model)
+    d = numbers(entry.get("distortion_coeffs", []), "distortion_coeffs", where)
+    if label == "none":
+        if any(d):
+            raise ConversionError(
+                f"{where}: distortion_coeffs without a distortion_model: expected one of "
+                f"{', '.join(_KALIBR_MODELS)}"
+            )
+        label, d = "radtan", [0.0] * _KALIBR_COEFFICIENTS
+    if label not in _KALIBR_MODELS:
+        raise ConversionError(
+            f"{where}: distortion_model {label[:40]!r}: expected {', '.join(_KALIBR_MODELS)} or "
+            "none"
+        )
+    intrinsics = numbers(first_of(entry, ("intrinsics",), where), "intrinsics", where)
+    resolution = first_of(entry, ("resolution",), where)
+    if len(intrinsics) != 4 or len(d) != _KALIBR_COEFFICIENTS:
+        raise ConversionError(
+            f"{where}: {len(intrinsics)} intrinsics and {len(d)} distortion_coeffs: "
+            "expected 4 and 4"
+        )
+    if not isinstance(resolution, list) or len(resolution) != 2:
+        raise ConversionError(f"{where}: resolution is no pair: expected [width, height]")
+    width, height = (whole(side, "resolution", where) for side in resolution)
+    fx, fy, cx, cy = intrinsics
+    return foreign(where, _KALIBR_MODELS[label], width, height, (fx, fy, cx, cy), d)
+
+
+def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
+    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name."""
+    if camera.model == "rational" or any(camera.distortion[_KALIBR_COEFFICIENTS:]):
+        raise ConversionError("Kalibr has no rational model and no k3: expected radtan or fisheye")
+    d = ", ".join(shortest(value) for value in camera.distortion[:_KALIBR_COEFFICIENTS])
+    pinhole = ", ".join(shortest(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+    lines = [
+        f"{camera_name if _KALIBR_NAME.fullmatch(camera_name) else 'cam0'}:",
+        "  camera_model: pinhole",
+        f"  intrinsics: [{pinhole}]",
+        f"  distortion_model: {'equi' if camera.model == 'fisheye' else 'radtan'}",
+        f"  distortion_coeffs: [{d}]",
+        f"  resolution: [{camera.width}, {camera.height}]",
+    ]
+    return "\n".join([*lines, ""])

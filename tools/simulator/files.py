@@ -1,0 +1,44 @@
+"""Images and truths as the simulators write them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from redetect.storage import write_whole
+from tools.arrays import ByteArray
+
+
+def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:
+    """The bytes of a grey image's file; `quality` is that of a JPEG."""
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if ending == ".jpg" else []
+    done, content = cv2.imencode(ending, grey, options)
+    if not done:
+        raise ValueError(f"an image of {grey.shape} could not be encoded as {ending}")
+    return bytes(content)
+
+
+def write_bytes(path: Path, content: bytes, *, overwrite: bool) -> None:
+    """Write a file whole or not at all."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write(content)
+
+
+def write_truth(
+    path: Path, head: Mapping[str, Any], lists: Mapping[str, Sequence[Any]], *, overwrite: bool
+) -> None:
+    """Write all that is known as a JSON object: a head, then lists with one line per item."""
+    text = json.dumps(head, indent=1)[:-2]
+    for key, items in lists.items():
+        body = ",\n".join(json.dumps(item, separators=(",", ":")) for item in items)
+        text += f',\n "{key}": [\n{body}\n ]'
+    write_bytes(path, f"{text}\n}}\n".encode(), overwrite=overwrite)
+
+
+def rounded(values: Any, digits: int) -> list[float]:
+    """Numbers as plain ones with so many digits after the point."""
+    return [round(float(v), digits) for v in values]
