@@ -72,7 +72,7 @@ def checked_settings(name: str, values: Any, kind: type[Kind]) -> Kind:
 
 
 def _is_like(value: Any, usual: Any) -> bool:
-    """Whether a value of JSON can stand for one of a setting's type."""
+    """Whether a value of JSON is of the type of a setting."""
     if isinstance(usual, bool) or isinstance(value, bool):
         return isinstance(value, bool) and isinstance(usual, bool)
     if isinstance(usual, float):

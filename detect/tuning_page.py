@@ -36,7 +36,7 @@ from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
 from lut import cached_disc_table
 from redetect.landmarks import CircleLandmark, Frame
-from redetect.landmarks.writing import format_frame, format_head
+from redetect.landmarks.files import format_frame, format_head
 from redetect.storage import OutputExistsError, write_bytes
 from redetect.storage.messages import OneLineError
 
@@ -98,7 +98,7 @@ class TuningSession:
         image, camera = self.image(number), self.run.camera
         table = cached_disc_table(camera, disc_shape(settings))
         found = detect_circles(image, camera, table, settings)
-        told = explain_discs(image, camera, settings)
+        explained = explain_discs(image, camera, settings)
         discs = [
             {
                 "x": float(xy[0]),
@@ -122,10 +122,10 @@ class TuningSession:
                 "quality": candidate.quality,
                 "outline": self._outline((candidate.x_m, candidate.y_m), settings.radius_m),
             }
-            for candidate in told.candidates
+            for candidate in explained.candidates
             if not candidate.is_disc
         ]
-        return {"discs": discs, "rejected": rejected, "suggestions": list(told.suggestions)}
+        return {"discs": discs, "rejected": rejected, "suggestions": list(explained.suggestions)}
 
     def _outline(self, centre_xy: Any, radius_m: float) -> list[list[float]]:
         places = self.run.camera.project_floor(circle_on_floor(centre_xy, radius_m, _OUTLINE))

@@ -11,9 +11,18 @@ from dataclasses import make_dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union
 
-from redetect.programs import DIRECT, PROGRAMS
 from redetect.storage import __version__
 from redetect.storage.command_line import FOR_ALL, end_with, no_such
+
+PROGRAMS = {
+    "camera": "camera.cli",
+    "detect": "detect.cli",
+    "groundtruth": "redetect.groundtruth.cli",
+    "slam": "redetect.slam.cli",
+}
+#: Commands of `detect` that are commands of `redetect`, too.
+DIRECT = ("compare", "draw", "view", "report", "tune", "export", "explain", "demo")
+
 
 _QUIET = ("-q", "--quiet")
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from redetect.cli import main
-from redetect.programs import PROGRAMS
+from redetect.cli import PROGRAMS, main
 
 
 def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

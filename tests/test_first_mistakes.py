@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from redetect.programs import PROGRAMS
+from redetect.cli import PROGRAMS
 
 DEMO = Path(__file__).parent.parent / "images/e"
 

@@ -8,14 +8,12 @@ from collections.abc import Mapping
 from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_FILE_BYTES = 1 << 26
 _LARGEST_NUMBER = 1e100
@@ -30,28 +28,18 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     GroundTruthError
         If it cannot be read or is none.
     """
-    content = read_json_value(path)
-    if not isinstance(content, dict):
-        raise GroundTruthError(f"{path}: expected a JSON object")
-    return content
-
-
-def read_json_value(path: str | os.PathLike[str]) -> Any:
-    """Read a file that holds JSON, whatever its value is."""
+    text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
-        return json.loads(read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
+        content = json.loads(text)
     except json.JSONDecodeError as error:
         raise GroundTruthError(f"{path}:{error.lineno}: is no JSON: {error.msg}") from None
     except RecursionError:
         raise GroundTruthError(f"{path}: is no JSON that can be read: nested too deep") from None
-    except UnicodeDecodeError:
-        raise GroundTruthError(f"{path}: is no text: expected JSON") from None
     except ValueError:  # Python converts no more than some thousand digits
         raise GroundTruthError(f"{path}: is no JSON that can be read: a number too long") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+    if not isinstance(content, dict):
+        raise GroundTruthError(f"{path}: expected a JSON object")
+    return content
 
 
 def is_number(value: Any) -> TypeGuard[float]:
@@ -89,6 +77,25 @@ def covariance_of(place: str, value: Any, size: int) -> FloatArray:
     if np.linalg.eigvalsh(correlation)[0] < -_ROUNDING:
         raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
     return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def covariance_entry(
+    place: str, entry: Mapping[str, Any], size: int, sigmas: str = "sigmas"
+) -> FloatArray:
+    """(size, size) covariance of an object with ``covariance`` or standard deviations; else zeros.
+
+    The latter are named by `sigmas`; both are in the order of the covariance's rows.
+    """
+    if "covariance" in entry and sigmas in entry:
+        raise GroundTruthError(f"{place}: has covariance and {sigmas}: expected one of them")
+    if sigmas in entry:
+        values = numbers(f"{place}: {sigmas}", entry[sigmas], size)
+        if np.any(values < 0.0):
+            raise GroundTruthError(f"{place}: {sigmas}: expected 0 or more")
+        return np.diag(values**2)
+    if "covariance" in entry:
+        return covariance_of(f"{place}: covariance", entry["covariance"], size)
+    return np.zeros((size, size))
 
 
 def write_json(

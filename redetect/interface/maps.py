@@ -16,7 +16,9 @@ from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
+    read_joint_covariance,
     read_map,
+    write_joint_covariance,
     write_map,
     write_path,
 )
@@ -24,12 +26,8 @@ from redetect.slam.commands.localize import localized_run_of
 from redetect.slam.commands.map import MAP_NAME, PATH_NAME, mapped_run_of, weighting_of
 from redetect.slam.filters.frames import FilterRun
 from redetect.slam.filters.report import path_distance
-from redetect.slam.mapping.covariance_file import (
-    joint_covariance,
-    read_joint_covariance,
-    write_joint_covariance,
-)
 from redetect.slam.mapping.run_map import MappedRun, landmark_map, path_of
+from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, read_recording

@@ -5,95 +5,42 @@
 ...     print(frame.step.prefix, [circle.ids for circle in frame.circles])
 """
 
-from redetect.landmarks.arrays import (
-    CircleArrays,
-    circle_arrays,
-    circle_landmarks,
-    is_positive_definite,
-)
-from redetect.landmarks.association import (
-    Association,
-    associate,
-    associate_positions,
-    associate_within_covariance,
-    squared_mahalanobis,
-    wrap_angle,
-)
-from redetect.landmarks.errors import LandmarkError, LandmarkFileError
-from redetect.landmarks.reading import (
-    frames_of_rows,
-    parse_record,
-    parse_rows,
-    read_frames,
-    read_rows,
-    read_steps,
-)
-from redetect.landmarks.records import (
-    CircleLandmark,
-    Frame,
-    Landmark,
-    LineLandmark,
-    MarkerCorner,
-    MarkerLandmark,
-    Record,
-    Row,
-    Step,
-)
-from redetect.landmarks.tilts import (
-    FrameTilt,
-    format_no_tilt,
-    format_outline_tilt,
-    format_tilt,
-    read_tilts,
-    tilt_as_written,
-)
-from redetect.landmarks.writing import (
-    format_frame,
-    format_head,
-    format_levelling,
-    format_record,
-    write_frames,
-    write_rows,
-)
-
-__all__ = [
-    "Association",
-    "CircleArrays",
-    "CircleLandmark",
-    "Frame",
-    "FrameTilt",
-    "Landmark",
-    "LandmarkError",
-    "LandmarkFileError",
-    "LineLandmark",
-    "MarkerCorner",
-    "MarkerLandmark",
-    "Record",
-    "Row",
-    "Step",
-    "associate",
-    "associate_positions",
-    "associate_within_covariance",
-    "circle_arrays",
-    "circle_landmarks",
-    "format_frame",
-    "format_head",
-    "format_levelling",
-    "format_no_tilt",
-    "format_outline_tilt",
-    "format_record",
-    "format_tilt",
-    "frames_of_rows",
-    "is_positive_definite",
-    "parse_record",
-    "parse_rows",
-    "read_frames",
-    "read_rows",
-    "read_steps",
-    "read_tilts",
-    "squared_mahalanobis",
-    "tilt_as_written",
-    "wrap_angle",
-    "write_frames",
-    "write_rows",
-]
+from redetect.landmarks.arrays import Association as Association
+from redetect.landmarks.arrays import CircleArrays as CircleArrays
+from redetect.landmarks.arrays import associate as associate
+from redetect.landmarks.arrays import associate_positions as associate_positions
+from redetect.landmarks.arrays import associate_within_covariance as associate_within_covariance
+from redetect.landmarks.arrays import circle_arrays as circle_arrays
+from redetect.landmarks.arrays import circle_landmarks as circle_landmarks
+from redetect.landmarks.arrays import is_positive_definite as is_positive_definite
+from redetect.landmarks.arrays import squared_mahalanobis as squared_mahalanobis
+from redetect.landmarks.arrays import wrap_angle as wrap_angle
+from redetect.landmarks.files import format_frame as format_frame
+from redetect.landmarks.files import format_head as format_head
+from redetect.landmarks.files import format_levelling as format_levelling
+from redetect.landmarks.files import format_record as format_record
+from redetect.landmarks.files import frames_of_rows as frames_of_rows
+from redetect.landmarks.files import parse_record as parse_record
+from redetect.landmarks.files import parse_rows as parse_rows
+from redetect.landmarks.files import read_frames as read_frames
+from redetect.landmarks.files import read_rows as read_rows
+from redetect.landmarks.files import read_steps as read_steps
+from redetect.landmarks.files import write_frames as write_frames
+from redetect.landmarks.files import write_rows as write_rows
+from redetect.landmarks.records import CircleLandmark as CircleLandmark
+from redetect.landmarks.records import Frame as Frame
+from redetect.landmarks.records import Landmark as Landmark
+from redetect.landmarks.records import LandmarkError as LandmarkError
+from redetect.landmarks.records import LandmarkFileError as LandmarkFileError
+from redetect.landmarks.records import LineLandmark as LineLandmark
+from redetect.landmarks.records import MarkerCorner as MarkerCorner
+from redetect.landmarks.records import MarkerLandmark as MarkerLandmark
+from redetect.landmarks.records import Record as Record
+from redetect.landmarks.records import Row as Row
+from redetect.landmarks.records import Step as Step
+from redetect.landmarks.tilts import FrameTilt as FrameTilt
+from redetect.landmarks.tilts import format_no_tilt as format_no_tilt
+from redetect.landmarks.tilts import format_outline_tilt as format_outline_tilt
+from redetect.landmarks.tilts import format_tilt as format_tilt
+from redetect.landmarks.tilts import read_tilts as read_tilts
+from redetect.landmarks.tilts import tilt_as_written as tilt_as_written

@@ -1,4 +1,7 @@
-"""Landmark maps and paths on disk: comma-separated, with a head that says where they come from."""
+"""Landmark maps and paths on disk: comma-separated, with a head that says where they come from.
+
+The joint covariance of a map's landmarks is in a file beside it.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,16 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from redetect.landmarks.errors import LandmarkFileError
+from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_whole
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_bounded, read_plain_array
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
 
@@ -32,6 +34,9 @@ PATH_COLUMNS = (
 #: Of a path without covariances.
 SHORT_PATH_COLUMNS = PATH_COLUMNS[:4]
 _LARGEST_FILE_BYTES = 1 << 28
+# Both files of a map are written in full precision; sums may be in another order.
+_SMALL_BYTES = 1 << 20
+_SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +120,7 @@ def write_map(
         for kind, some in (("disc", landmark_map.discs), ("line", landmark_map.lines))
         for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
     ]
-    _write(path, MAP_COLUMNS, rows, comments, overwrite)
+    write_table(path, MAP_COLUMNS, rows, comments, overwrite=overwrite)
 
 
 def read_map(path: FilePath) -> LandmarkMap:
@@ -149,6 +154,91 @@ def read_map(path: FilePath) -> LandmarkMap:
     return LandmarkMap(discs=_landmarks(found["disc"]), lines=_landmarks(found["line"]))
 
 
+def covariance_file(map_file: Path) -> Path:
+    """Where the joint covariance of a map is: ``map_covariance.npy`` beside ``map.csv``.
+
+    A map's own file holds the covariance of each landmark by itself. Landmarks of a map made by
+    driving share most of their error with their neighbours (the drift from the start), which only
+    the joint covariance describes.
+    """
+    return map_file.with_name(f"{map_file.stem}_covariance.npy")
+
+
+def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite: bool) -> None:
+    """Write a map's joint covariance beside it.
+
+    Parameters
+    ----------
+    map_file : Path
+        The map.
+    covariance : (2 M, 2 M) float64
+        x and y of each landmark in the order of the map's rows (m^2).
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    redetect.storage.OutputExistsError
+        If the file exists and may not be replaced.
+    """
+    content = io.BytesIO()
+    np.save(content, np.ascontiguousarray(covariance, dtype=np.float64), allow_pickle=False)
+    with write_whole(covariance_file(map_file), overwrite=overwrite) as stream:
+        stream.write(content.getvalue())
+
+
+def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArray | None:
+    """Read the joint covariance of a map, if there is one beside it.
+
+    Parameters
+    ----------
+    map_file : Path
+        The map.
+    landmark_map : LandmarkMap
+        Its content.
+
+    Returns
+    -------
+    (2 M, 2 M) float64, or None
+        None if there is no such file.
+
+    Raises
+    ------
+    LandmarkFileError
+        If it is malformed, or not of this map.
+    """
+    path = covariance_file(map_file)
+    if not path.is_file():
+        return None
+    own = np.concatenate([landmark_map.discs.covariance, landmark_map.lines.covariance])
+    try:
+        with path.open("rb") as stream:
+            found = read_plain_array(
+                stream, np.dtype(np.float64), 2, max(32 * len(own) ** 2, _SMALL_BYTES)
+            )
+    except OSError as error:
+        raise LandmarkFileError(path, None, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise LandmarkFileError(path, None, f"cannot be read: {error}") from None
+    if found.shape != (2 * len(own), 2 * len(own)) or found.dtype != np.float64:
+        raise LandmarkFileError(
+            path,
+            None,
+            f"{found.dtype} of shape {found.shape}: expected float64 of "
+            f"{(2 * len(own), 2 * len(own))}, x and y of each landmark of {map_file}",
+        )
+    k = np.arange(len(own))
+    blocks = found.reshape(len(own), 2, len(own), 2)[k, :, k, :]
+    scale = float(np.max(np.abs(own), initial=0.0))
+    if not np.all(np.isfinite(found)) or not np.allclose(
+        blocks, own, rtol=_SAME, atol=_SAME * scale
+    ):
+        raise LandmarkFileError(
+            path, None, f"not the covariance of {map_file}: expected that of each landmark"
+        )
+    return np.asarray(0.5 * (found + found.T))
+
+
 def write_path(
     path: FilePath,
     poses: Path2D,
@@ -162,7 +252,7 @@ def write_path(
         columns = PATH_COLUMNS
         table = np.hstack([table, poses.covariance.reshape(-1, 9)])
     rows = [(prefix, *row) for prefix, row in zip(poses.prefixes, table.tolist())]
-    _write(path, columns, rows, comments, overwrite)
+    write_table(path, columns, rows, comments, overwrite=overwrite)
 
 
 def read_path(path: FilePath) -> Path2D:
@@ -190,13 +280,15 @@ def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
     )
 
 
-def _write(
+def write_table(
     path: FilePath,
     columns: Sequence[str],
     rows: Sequence[Sequence[object]],
-    comments: Sequence[str],
-    overwrite: bool,
+    comments: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
 ) -> None:
+    """Write rows between commas under comments and the columns' names; floats in full precision."""
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])

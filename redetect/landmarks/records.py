@@ -8,12 +8,37 @@ that are not one word.
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from math import isfinite
 
-from redetect.landmarks.errors import LandmarkError
-from redetect.storage.messages import excerpt
+from redetect.storage.messages import OneLineError, excerpt
+
+
+class LandmarkError(OneLineError, ValueError):
+    """An invalid record; the message names the quantity, its value and what was expected."""
+
+
+class LandmarkFileError(LandmarkError):
+    """A landmark file that cannot be read.
+
+    Parameters
+    ----------
+    file : path
+    line : int or None
+        The wrong line, counted from 1; None if the error concerns the whole file.
+    problem : str
+        What was found and what was expected.
+    """
+
+    def __init__(self, file: str | os.PathLike[str], line: int | None, problem: str) -> None:
+        self.file = os.fspath(file)
+        self.line = line
+        self.problem = problem
+        place = self.file if line is None else f"{self.file}:{line}"
+        super().__init__(f"{place}: {problem}")
+
 
 STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
 CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")

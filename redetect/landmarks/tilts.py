@@ -19,8 +19,8 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from redetect.landmarks.errors import LandmarkFileError
-from redetect.landmarks.reading import decode, opened, rows_of_words
+from redetect.landmarks.files import decode, opened, rows_of_words
+from redetect.landmarks.records import LandmarkFileError
 from redetect.storage.messages import excerpt
 
 

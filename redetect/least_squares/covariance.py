@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy import sparse
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import NormalEquations, factor, scaled_inverse
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Columns of the inverse that are computed at once.
 _CHUNK = 128

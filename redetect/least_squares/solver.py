@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.array_types import FloatArray, IntArray
+
 LossKind = Literal["none", "huber", "cauchy", "geman-mcclure"]
 X = TypeVar("X")
 
@@ -110,6 +109,11 @@ class NormalEquations:
             -self.corner_gradient - self.border.T @ step
         )
         return step - eliminated @ shared, shared
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """(..., d, d) lower triangular W with ``W C W^T = I``, of positive definite covariances C."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def robust(squared: FloatArray, loss: Loss) -> tuple[FloatArray, FloatArray]:

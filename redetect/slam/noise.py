@@ -5,43 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, wrap_angle
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import Recording
-from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import NotNegative, demand_fields, whole
 
 
 @dataclass(frozen=True)
 class AddedNoise:
-    """Standard deviations of the added noise, independent for each number.
+    """Standard deviations of the added noise, independent for each number."""
 
-    Raises
-    ------
-    SlamError
-        If a standard deviation is negative or not finite, or the seed is negative.
-    """
-
-    disc_m: float = 0.0  # to x and y of a disc
-    bearing_rad: float = 0.0  # to the bearing of a line. Its ends in the image stay as they are.
-    step_m: float = 0.0  # to dx and dy of a step
-    turn_rad: float = 0.0  # to dphi of a step
+    disc_m: NotNegative = 0.0  # to x and y of a disc
+    # To the bearing of a line. Its ends in the image stay as they are.
+    bearing_rad: NotNegative = 0.0
+    step_m: NotNegative = 0.0  # to dx and dy of a step
+    turn_rad: NotNegative = 0.0  # to dphi of a step
     # Steps and landmarks draw from streams of their own, so that the files of discs and of lines of
     # one run get the same odometry.
-    seed: int = 1
+    seed: Annotated[int, whole(0)] = 1
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            disc_m=NOT_NEGATIVE,
-            bearing_rad=NOT_NEGATIVE,
-            step_m=NOT_NEGATIVE,
-            turn_rad=NOT_NEGATIVE,
-            seed=whole(0),
-        )
+        demand_fields(self, SlamError)
 
     @property
     def nothing(self) -> bool:

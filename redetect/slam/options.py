@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Optional
 
 from tyro.conf import Positional, arg
 
-from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.models import OdometryNoise
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045

@@ -21,8 +21,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MultipleLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.slam.errors import SlamError
@@ -32,7 +33,6 @@ from redetect.storage import OutputExistsError, write_whole
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 
 #: Central 95 % of chi squared with 3 degrees of freedom.
 NEES_BAND = (0.21579528262389785, 9.348403604496145)
@@ -240,7 +240,7 @@ def draw_errors(
             figure.suptitle(title, fontsize=12)
 
 
-def _draw_nees(axes: Axes, step: NDArray[np.int64], nees: FloatArray) -> None:
+def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
     known = np.isfinite(nees)
     axes.axhspan(*NEES_BAND, color=_BAND, alpha=0.2, lw=0, label="95 % band", zorder=1)
     axes.axhline(3.0, color=_REFERENCE, lw=0.6, label="expected: 3", zorder=2)
@@ -300,7 +300,7 @@ def _grid_spacing(span: FloatArray) -> float:
     return float(next(n * power for n in (1.0, 2.0, 5.0, 10.0) if n * power >= finest))
 
 
-def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
     return np.asarray(np.all((xy >= low) & (xy <= high), axis=1))
 
 
@@ -364,17 +364,13 @@ def _draw_landmarks(
         filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
         patches = PolyCollection(
             list(outlines),
-            facecolors=[(*_rgb(colour), filling)],
-            edgecolors=[(*_rgb(colour), edge)],
+            facecolors=[(*to_rgb(colour), filling)],
+            edgecolors=[(*to_rgb(colour), edge)],
             linewidths=width,
             zorder=2,
         )
         patches.set_label(f"3 {_SIGMA} of {name}")
         axes.add_collection(patches, autolim=False)
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    return to_rgb(colour)
 
 
 class Crop(NamedTuple):

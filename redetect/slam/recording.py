@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from redetect.landmarks import CircleLandmark, Frame, LineLandmark, read_frames
+from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.landmarks import Frame, is_positive_definite, read_frames
 from redetect.slam.errors import SlamError
-from redetect.slam.models.odometry_noise import OdometryNoise
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.slam.models import OdometryNoise
 
 UNKNOWN_ID = -1
 
@@ -30,9 +27,6 @@ _STEP_COLUMNS = (
     *("cxy", "cyy", "cyphi"),
     *("cxphi", "cyphi", "cphiphi"),
 )
-
-# Below this share of its diagonal's product a covariance says that two quantities are one.
-_LEAST_EIGENVALUE_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +54,17 @@ class CircleRows:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def identified(self) -> BoolArray:
+        """(n,) which rows say what disc they show."""
+        return np.asarray(self.ids != UNKNOWN_ID)
+
+    def only(self, chosen: BoolArray) -> CircleRows:
+        """The chosen rows."""
+        return CircleRows(
+            self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
@@ -84,6 +89,11 @@ class LineRows:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def identified(self) -> BoolArray:
+        """(n,) which rows say what lines they show."""
+        return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,11 +200,8 @@ def read_recording(
         )
     if not circles and not lines:
         raise SlamError(f"{path}: neither circles nor lines: expected at least one to be used")
-    files = [
-        landmark_file(path, suffix, stem)
-        for suffix, wanted in ((".circles", circles), (".lines", lines))
-        if wanted
-    ]
+    kinds = (".circles", circles), (".lines", lines)
+    files = [landmark_file(path, suffix, stem) for suffix, wanted in kinds if wanted]
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)
@@ -217,7 +224,7 @@ def recording_of_frames(
         )
     unstated = ~np.any(covariance, axis=(1, 2))
     covariance[unstated] = noise.covariance(numbers[unstated, :3])
-    for bad in _not_positive_definite(covariance):
+    for bad in np.flatnonzero(~is_positive_definite(covariance)):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
             "definite: expected a covariance of dx, dy and dphi of full rank"
@@ -233,17 +240,12 @@ def recording_of_frames(
 
 
 def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
-    rows = [
-        (k, row)
-        for k, frame in enumerate(frames)
-        for row in frame.landmarks
-        if isinstance(row, CircleLandmark)
-    ]
+    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
     numbers = np.array(
         [(r.px, r.py, r.cxx, r.cxy, r.cxy, r.cyy) for _, r in rows], dtype=np.float64
     ).reshape(-1, 6)
     covariance = numbers[:, 2:].reshape(-1, 2, 2)
-    for bad in _not_positive_definite(covariance):
+    for bad in np.flatnonzero(~is_positive_definite(covariance)):
         k, row = rows[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
@@ -260,12 +262,7 @@ def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
 
 
 def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
-    rows = [
-        (k, row)
-        for k, frame in enumerate(frames)
-        for row in frame.landmarks
-        if isinstance(row, LineLandmark)
-    ]
+    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
     for k, row in rows:
         if not row.sigma > 0.0:
             raise SlamError(
@@ -278,19 +275,6 @@ def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
         sigma_rad=np.array([r.sigma for _, r in rows], dtype=np.float64),
         ids=tuple(tuple(i for i in r.ids if i >= 0) for _, r in rows),
     )
-
-
-def _not_positive_definite(covariances: FloatArray) -> IntArray:
-    """Indices of (n, d, d) covariances that no estimator can divide by."""
-    scale = np.sqrt(np.clip(np.diagonal(covariances, axis1=1, axis2=2), 0.0, None))
-    positive = np.all(scale > 0.0, axis=1)
-    safe = np.where(positive[:, None], scale, 1.0)
-    with np.errstate(over="ignore"):
-        correlation = covariances / safe[:, :, None] / safe[:, None, :]
-    sane = positive & np.all(np.isfinite(correlation), axis=(1, 2))
-    correlation[~sane] = 0.0
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    return np.flatnonzero(~(sane & (smallest > _LEAST_EIGENVALUE_SHARE)))
 
 
 def _merged(first: list[Frame], second: list[Frame], one: Path, other: Path) -> list[Frame]:

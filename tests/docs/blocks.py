@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from redetect.programs import PROGRAMS
+from redetect.cli import PROGRAMS
 
 RUNS = "<!-- runs -->"
 #: What stands for something else, and is no word of a command line: `RUN…`, `...`.

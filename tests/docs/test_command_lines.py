@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import tyro
 
-from redetect.programs import PROGRAMS
+from redetect.cli import PROGRAMS
 from tests.docs.blocks import blocks_of, commands_in, documents
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    matched_streams,
+    moved_poses,
+    planar_alignment,
+)
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 
 
@@ -20,5 +24,5 @@ def compare_streams(
         poses, truth, largest_gap_s=largest_gap_s, interpolate=interpolate
     )
     if align:
-        mine = align_poses(mine, theirs)
+        mine = moved_poses(mine, planar_alignment(mine, theirs))
     return score_poses(mine, theirs, unmatched)

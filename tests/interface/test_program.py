@@ -16,8 +16,7 @@ import pytest
 from tyro.conf import Positional
 
 from detect.demo_command import DEMO_RUN
-from redetect.cli import main
-from redetect.programs import DIRECT, PROGRAMS
+from redetect.cli import DIRECT, PROGRAMS, main
 from redetect.storage.command_line import flags_of
 from tools.demo_package import FRAMES, first_frames
 

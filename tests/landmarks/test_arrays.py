@@ -68,4 +68,5 @@ def test_positive_definite_matrices_are_told_from_the_others() -> None:
     matrices = np.array([good, singular, indefinite, negative, np.zeros((2, 2)).tolist()])
     assert is_positive_definite(matrices).tolist() == [True, False, False, False, False]
     assert is_positive_definite(1e-12 * np.array(good))
+    assert is_positive_definite(np.diag([1e-8, 1e-6, 1e-5]))
     assert is_positive_definite(np.zeros((0, 2, 2))).shape == (0,)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.plane import between
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
@@ -31,7 +31,7 @@ def small_run(seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14) -
     rng = np.random.default_rng(seed)
     true_steps = np.tile([0.01, -0.4, 4 * np.pi / steps], (steps, 1))
     poses = chain_steps(true_steps)
-    assert np.allclose(relative_pose(poses[:-1], poses[1:]), true_steps)
+    assert np.allclose(between(poses[:-1], poses[1:]), true_steps)
     centre = poses[:, :2].mean(axis=0)
     radius = np.linalg.norm(poses[0, :2] - centre)
     around = np.linspace(0.0, 2 * np.pi, discs, endpoint=False)

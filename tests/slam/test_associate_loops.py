@@ -8,28 +8,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from redetect.plane import apply, between, fitted, rotation
 from redetect.slam.association.loop_closing import (
     closed_path,
     in_order,
+    intersect_bearings,
     merge_labels,
     pairs_by_votes,
     pairs_in_place,
     seen_together,
+    solve_path,
 )
-from redetect.slam.association.loop_path import intersect_bearings, solve_path
 from redetect.slam.association.loops import (
     LoopSettings,
     Match,
     Stretch,
+    best_motion,
     find_matches,
-    fit_motion,
     log10_false_alarms,
     mutual_pairs,
     stretches_of,
 )
-from redetect.slam.association.loops_kernels import best_motion
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
@@ -52,9 +52,9 @@ def test_motion_of_least_squares_is_the_motion_that_was_made(
 ) -> None:
     points = np.random.default_rng(seed).uniform(-3.0, 3.0, (6, 2))
     moved = points @ rotation(turn).T + [x, y]
-    found, shift = fit_motion(points, moved)
-    assert np.exp(1j * found) == pytest.approx(np.exp(1j * turn), abs=1e-9)
-    assert points @ rotation(found).T + shift == pytest.approx(moved, abs=1e-9)
+    found = fitted(points, moved)
+    assert np.exp(1j * found[2]) == pytest.approx(np.exp(1j * turn), abs=1e-9)
+    assert apply(found, points) == pytest.approx(moved, abs=1e-9)
 
 
 @given(seed=st.integers(0, 2**32 - 1), turn=st.floats(-3.1, 3.1))
@@ -235,7 +235,7 @@ def _seen_exactly(seed: int) -> tuple[Recording, FloatArray, FloatArray, IntArra
     bearing = bearing_of_vertical(path[line_frame + 1], lines[upright], (0.02, -0.08))
     recording = Recording(
         tuple(map(str, range(30))),
-        relative_pose(path[:-1], path[1:]),
+        between(path[:-1], path[1:]),
         np.tile(1e-4 * np.eye(3), (30, 1, 1)),
         CircleRows(
             frame,
@@ -275,7 +275,7 @@ def test_bearings_intersect_where_the_line_stands() -> None:
     empty = np.zeros(0, dtype=np.int64)
     recording = Recording(
         tuple(map(str, range(20))),
-        relative_pose(path[:-1], path[1:]),
+        between(path[:-1], path[1:]),
         np.tile(np.eye(3), (20, 1, 1)),
         CircleRows(empty, np.zeros((0, 2)), np.zeros((0, 2, 2)), empty),
         LineRows(frame, bearing, np.full(60, 0.002), tuple((int(i),) for i in label)),

@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
-from redetect.slam.association.frame_to_frame import LocalSettings, Method, associate_locally
-from redetect.slam.association.local_map import LocalMap, moved, tilt_jacobian
+from redetect.plane import between
+from redetect.slam.association.frame_to_frame import (
+    LocalMap,
+    LocalSettings,
+    Method,
+    associate_locally,
+    moved,
+    tilt_jacobian,
+)
 from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.association.score import score_association
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]
@@ -40,7 +46,7 @@ def drive(
     """What a robot on a path measures: discs within 3.5 m ahead, lines within 6 m."""
     rng = np.random.default_rng(seed)
     count = len(path) - 1
-    steps = relative_pose(path[:-1], path[1:]) + STEP_SIGMA * rng.normal(size=(count, 3))
+    steps = between(path[:-1], path[1:]) + STEP_SIGMA * rng.normal(size=(count, 3))
     steps[:, 2] += bias_rad
     sigma = STEP_SIGMA + np.array([0.0, 0.0, abs(bias_rad)])
     seen: list[tuple[int, int, FloatArray]] = []

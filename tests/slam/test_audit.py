@@ -11,9 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import read_frames
+from redetect.plane import apply
 from redetect.slam.cli import main
 from redetect.slam.mapping.audit import audit_run
-from redetect.slam.models.measurement import disc_in_map, disc_in_robot
+from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.small_run import SmallRun, small_run
 
@@ -88,7 +89,7 @@ def test_a_landmark_that_lay_elsewhere_becomes_one_of_its_own(seed: int) -> None
     moved = second_lap(run, 5)[:6]
     pose = run.poses[circles.frame[moved] + 1]
     xy = circles.xy.copy()
-    xy[moved] = disc_in_robot(pose, disc_in_map(pose, xy[moved]) + np.array([0.7, -0.5]))
+    xy[moved] = disc_in_robot(pose, apply(pose, xy[moved]) + np.array([0.7, -0.5]))
     audit = audit_run(spoilt(run, xy=xy))
     (group,) = audit.groups
     assert group.rows.tolist() == moved.tolist()
@@ -103,7 +104,7 @@ def test_rows_of_a_moving_thing_are_no_landmark() -> None:
     rows = second_lap(run, 5)[:6]
     pose = run.poses[circles.frame[rows] + 1]
     xy = circles.xy.copy()
-    xy[rows] = disc_in_robot(pose, disc_in_map(pose, xy[rows]) + np.arange(2, 8)[:, None] * 0.3)
+    xy[rows] = disc_in_robot(pose, apply(pose, xy[rows]) + np.arange(2, 8)[:, None] * 0.3)
     audit = audit_run(spoilt(run, xy=xy))
     assert sorted(np.concatenate([g.rows for g in audit.groups])) == rows.tolist()
     assert {group.kind for group in audit.groups} == {"drop"}

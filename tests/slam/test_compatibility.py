@@ -183,13 +183,6 @@ def test_gate_probability_outside_its_range_is_refused(probability: float) -> No
         )
 
 
-def test_shapes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(SlamError, match="expected"):
-        nearest_compatible(np.zeros((2, 3, 2)), np.eye(4), np.zeros((2, 2, 2)))
-    with pytest.raises(SlamError, match="expected"):
-        joint_compatible(np.zeros((2, 3)), np.eye(6), np.zeros((2, 2, 2)))
-
-
 def test_a_pair_without_positive_definite_covariance_is_never_made() -> None:
     innovations = np.zeros((1, 2, 2))
     predicted = np.diag([-1.0, 1.0, 1.0, 1.0])

@@ -14,7 +14,7 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.cli import main
 from redetect.slam.formats.data_sets import discs_of_ranges, trees_of
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 
 FloatArray = NDArray[np.float64]

@@ -9,17 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.filters.joint_covariance import JointCovariance
-from redetect.slam.models.measurement import (
-    disc_in_map,
-    disc_in_robot,
-    disc_jacobians,
-)
-from redetect.slam.models.motion import move, move_jacobians
+from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
 from redetect.slam.recording import CircleRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
 
@@ -90,14 +85,14 @@ def dense_filter(recording: Recording) -> tuple[FloatArray, FloatArray, list[int
         for i in here:
             if i in old:
                 continue
-            measured_by = disc_jacobians(state[:3], disc_in_map(state[:3], circles.xy[i]))
+            measured_by = disc_jacobians(state[:3], apply(state[:3], circles.xy[i]))
             by_seen = np.linalg.inv(measured_by[1])
             by_pose = -by_seen @ measured_by[0]
             G = np.zeros((2, len(state)))
             G[:, :3] = by_pose
             own = G @ covariance @ G.T + by_seen @ circles.covariance[i] @ by_seen.T
             covariance = np.block([[covariance, covariance @ G.T], [G @ covariance, own]])
-            state = np.concatenate([state, disc_in_map(state[:3], circles.xy[i])])
+            state = np.concatenate([state, apply(state[:3], circles.xy[i])])
             known.append(int(circles.ids[i]))
     return state, covariance, known
 
@@ -121,20 +116,21 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
 def batch_solution(recording: Recording, size: int) -> tuple[FloatArray, FloatArray]:
     """Last pose and discs by Gauss-Newton on all poses and discs, and their covariance."""
     steps, circles = len(recording), recording.circles
-    from redetect.slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from redetect.plane import between
+    from redetect.slam.models import between_jacobians, chain_steps
 
     poses = chain_steps(recording.steps)
     discs = np.zeros((size, 2))
     for i in reversed(range(len(circles))):
-        discs[circles.ids[i] - 1] = disc_in_map(poses[circles.frame[i] + 1], circles.xy[i])
+        discs[circles.ids[i] - 1] = apply(poses[circles.frame[i] + 1], circles.xy[i])
     unknowns = 3 * steps + 2 * size
     for _ in range(20):
         normal, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         for k in range(steps):
-            error = recording.steps[k] - relative_pose(poses[k], poses[k + 1])
+            error = recording.steps[k] - between(poses[k], poses[k + 1])
             error[2] = wrap_angle(error[2])
             J = np.zeros((3, unknowns))
-            first, second = relative_pose_jacobians(poses[k], poses[k + 1])
+            first, second = between_jacobians(poses[k], poses[k + 1])
             if k:
                 J[:, 3 * k - 3 : 3 * k] = first
             J[:, 3 * k : 3 * k + 3] = second
@@ -182,7 +178,7 @@ def test_covariance_of_a_new_disc_by_monte_carlo() -> None:
     ekf = EkfSlam(pose, spread)
     ekf.measure(rows_of([(5, seen, noise)]))
     poses = rng.multivariate_normal(pose, spread, 200_000)
-    sampled = disc_in_map(poses, rng.multivariate_normal(seen, noise, len(poses)))
+    sampled = apply(poses, rng.multivariate_normal(seen, noise, len(poses)))
     joint = np.cov(np.column_stack([poses, sampled]).T)
     found = ekf.covariance.dense()
     sigma = np.sqrt(np.diag(found))
@@ -234,7 +230,7 @@ def test_the_start_may_be_anywhere() -> None:
     here, there = EkfSlam(), EkfSlam(np.array([3.0, 1.0, 2.0]))
     run_ekf(recording, here)
     run_ekf(recording, there)
-    moved = disc_in_map(np.array([3.0, 1.0, 2.0]), here.landmark_map().discs.xy)
+    moved = apply(np.array([3.0, 1.0, 2.0]), here.landmark_map().discs.xy)
     np.testing.assert_allclose(there.landmark_map().discs.xy, moved, atol=1e-9)
 
 

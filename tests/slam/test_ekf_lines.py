@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from redetect.plane import apply
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.models.measurement import (
-    bearing_jacobians,
-    bearing_of_vertical,
-    disc_in_map,
-    disc_jacobians,
-)
-from redetect.slam.models.motion import move
+from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_jacobians, move
 from redetect.slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, NO_DISCS, bearings_of, spd
 
@@ -46,7 +40,7 @@ def test_covariance_of_a_new_line_by_monte_carlo() -> None:
         # The ray looks along (sin, -cos) of its bearing, turned by the heading.
         angle += samples[:, 2]
         normals.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-        origins.append(disc_in_map(samples, CAMERA_XY))
+        origins.append(apply(samples, CAMERA_XY))
     rays = np.stack(normals, axis=1)
     places = np.linalg.solve(rays, np.sum(rays * np.stack(origins, axis=1), -1)[..., None])[..., 0]
     joint = np.cov(np.column_stack([poses, places]).T)
@@ -142,7 +136,8 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
     assert run.count.lines == len(rows)
     # Pose and two lines come before the last, and several kept poses.
     assert max(ekf.line_slots.values()) >= 3 + 4 + 9
-    from redetect.slam.models.motion import chain_steps, relative_pose, relative_pose_jacobians
+    from redetect.plane import between
+    from redetect.slam.models import between_jacobians, chain_steps
 
     poses, places = chain_steps(recording.steps), lines.copy()
     unknowns = 3 * steps + 6
@@ -151,12 +146,12 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
         weight = np.linalg.inv(covariance)
         for k in range(steps):
             J = np.zeros((3, unknowns))
-            first, second = relative_pose_jacobians(poses[k], poses[k + 1])
+            first, second = between_jacobians(poses[k], poses[k + 1])
             if k:
                 J[:, 3 * k - 3 : 3 * k] = first
             J[:, 3 * k : 3 * k + 3] = second
             normal += J.T @ weight @ J
-            right += J.T @ weight @ (recording.steps[k] - relative_pose(poses[k], poses[k + 1]))
+            right += J.T @ weight @ (recording.steps[k] - between(poses[k], poses[k + 1]))
         for k, bearing, (i,) in rows:
             row = np.zeros(unknowns)
             at = 3 * steps + 2 * i

@@ -20,9 +20,9 @@ from redetect.landmarks.map_file import (
     write_path,
 )
 from redetect.slam.cli import main
-from redetect.slam.formats.axes import covariance_from_dataset, from_dataset
 from redetect.slam.formats.g2o_reading import read_g2o
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.formats.text import covariance_from_dataset, from_dataset
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 
 DEMO = Path(__file__).parents[2] / "images" / "e"

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from camera import read_camera
 from redetect.landmarks import wrap_angle
-from redetect.slam.formats.axes import Axes, from_dataset
-from redetect.slam.formats.tables import write_bearings, write_discs, write_odometry
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, relative_pose, rotation
+from redetect.landmarks.map_file import write_table
+from redetect.plane import between, rotation
+from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
+from redetect.slam.formats.text import Axes, from_dataset
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 
 FloatArray = NDArray[np.float64]
@@ -57,18 +58,18 @@ TRIANGLE = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi
 
 @pytest.mark.parametrize("axes", ["robotics", "dataset"])
 def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes) -> None:
-    write_odometry(tmp_path / "o.csv", recording, axes, ["a comment"])
+    write_table(tmp_path / "o.csv", *odometry_table(recording, axes), ["a comment"])
     rows = rows_of(tmp_path / "o.csv")
     assert [row["prefix"] for row in rows] == list(recording.prefixes)
     assert [row["step"] for row in rows] == [str(k + 1) for k in range(80)]
     poses = estimates(recording)
-    ours = relative_pose(poses[:-1], poses[1:]) - recording.steps
+    ours = between(poses[:-1], poses[1:]) - recording.steps
     ours[:, 2] = wrap_angle(ours[:, 2])
     expected = squared(ours, recording.step_covariance)
 
     steps = numbers(rows, "dx_m", "dy_m", "dphi_rad")
     turned = from_dataset(poses, axes)
-    error = relative_pose(turned[:-1], turned[1:]) - steps
+    error = between(turned[:-1], turned[1:]) - steps
     error[:, 2] = wrap_angle(error[:, 2])
     before = symmetric(numbers(rows, *TRIANGLE), 3)
     assert squared(error, before) == pytest.approx(expected, rel=1e-9)
@@ -82,7 +83,7 @@ def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes)
 
 @pytest.mark.parametrize("axes", ["robotics", "dataset"])
 def test_the_error_of_discs(tmp_path: Path, recording: Recording, axes: Axes) -> None:
-    write_discs(tmp_path / "d.csv", recording, axes)
+    write_table(tmp_path / "d.csv", *disc_table(recording, axes))
     rows = rows_of(tmp_path / "d.csv")
     some = recording.circles
     known = some.ids >= 0
@@ -109,7 +110,7 @@ def test_the_bearings(tmp_path: Path, recording: Recording, axes: Axes) -> None:
     camera_xy = np.array(read_camera(DEMO / "e.cam").robot_from_camera)[:2, 3]
     ids = ((3, 8), (), *recording.lines.ids[2:])
     recording = replace(recording, lines=replace(recording.lines, ids=ids))
-    write_bearings(tmp_path / "b.csv", recording, camera_xy, axes)
+    write_table(tmp_path / "b.csv", *bearing_table(recording, camera_xy, axes))
     rows = rows_of(tmp_path / "b.csv")
     some = recording.lines
     known = [0, *range(2, len(some))]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes
+from redetect.slam.formats.text import Axes
 from redetect.slam.formats.tum import read_tum, write_tum
 from redetect.storage import OutputExistsError
 

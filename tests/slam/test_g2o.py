@@ -13,19 +13,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from redetect.landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
+from redetect.plane import between, rotation
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes
 from redetect.slam.formats.g2o import (
     RunGraph,
     end_covariance,
     first_disc_vertex,
+    frames_of_graph,
+    graph_of_frames,
     start_covariance,
     write_g2o,
 )
-from redetect.slam.formats.g2o_frames import frames_of_graph, graph_of_frames
 from redetect.slam.formats.g2o_reading import read_g2o
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose, rotation
+from redetect.slam.formats.text import Axes
+from redetect.slam.models import disc_in_robot
 
 FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
@@ -54,7 +55,7 @@ def text(frames: list[Frame]) -> bytes:
 
 def chi2(graph: RunGraph) -> float:
     """The error of a graph by this project's models, in the data set's axes."""
-    error = relative_pose(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
     error[:, 2] = wrap_angle(error[:, 2])
     place = dict(zip(graph.disc_ids.tolist(), graph.discs))
     rows = graph.circles

@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import read_frames, wrap_angle
-from redetect.slam.formats.axes import from_dataset
-from redetect.slam.formats.g2o import RunGraph, write_g2o
-from redetect.slam.formats.g2o_frames import graph_of_frames
-from redetect.slam.formats.tables import write_odometry
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
+from redetect.landmarks.map_file import write_table
+from redetect.plane import between
+from redetect.slam.formats.g2o import RunGraph, graph_of_frames, write_g2o
+from redetect.slam.formats.tables import odometry_table
+from redetect.slam.formats.text import from_dataset
+from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import read_recording
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
@@ -35,7 +35,7 @@ def estimates_with_error(file: Path) -> RunGraph:
 
 
 def step_errors(graph: RunGraph) -> FloatArray:
-    error = relative_pose(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
     error[:, 2] = wrap_angle(error[:, 2])
     return error
 
@@ -128,9 +128,8 @@ def test_the_documented_way_from_the_tables_to_factors(
     write_g2o(tmp_path / "e.g2o", graph)
     factors, values = gtsam.readG2o(str(tmp_path / "e.g2o"), False)
     (tmp_path / "TABLES").mkdir()
-    write_odometry(
-        tmp_path / "TABLES" / "odometry.csv", read_recording(DEMO), "robotics", ["a comment"]
-    )
+    table = odometry_table(read_recording(DEMO), "robotics")
+    write_table(tmp_path / "TABLES" / "odometry.csv", *table, ["a comment"])
     program = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     made: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import place_lines, triangulate, well_placed
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.models.measurement import bearing_of_vertical
+from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import small_run
 

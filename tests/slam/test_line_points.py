@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.line_points import (
     PointSettings,
+    Rays,
     find_points,
     lines_by_points,
     rays_of,
 )
-from redetect.slam.association.line_points_kernels import Rays
 from redetect.slam.association.score import score_association
 from redetect.slam.errors import SlamError
-from redetect.slam.models.measurement import bearing_of_vertical
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.models import bearing_of_vertical, chain_steps
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 FloatArray = NDArray[np.float64]

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
-from redetect.slam.filters.frames import frames_of
-from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
-from redetect.slam.models.measurement import (
+from redetect.slam.filters.frames import Associator, frames_of, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
     disc_in_robot,
     disc_jacobians,
+    move,
+    move_jacobians,
 )
-from redetect.slam.models.motion import move, move_jacobians
 from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
 
 FloatArray = NDArray[np.float64]
@@ -156,7 +156,7 @@ def dense(
 @pytest.mark.parametrize("map_errors", ["considered", "white", "ignored"])
 def test_the_localizer_is_the_plain_dense_filter(map_errors: MapErrors) -> None:
     recording, some, _ = drive(1)
-    run = run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY, map_errors=map_errors))
+    run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY, map_errors=map_errors))
     poses, covariances = dense(recording, some, map_errors)
     np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
     assert run.path.covariance is not None
@@ -169,7 +169,7 @@ def test_errors_that_landmarks_have_in_common_are_considered() -> None:
     recording, some, _ = drive(8)
     joint = spd(np.random.default_rng(8), 40, 0.1)
     localizer = Localizer(some, camera_xy=CAMERA_XY, joint_covariance=joint)
-    run = run_localizer(recording, localizer)
+    run = run_filter(recording, localizer)
     poses, covariances = dense(recording, some, "considered", joint)
     np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
     assert run.path.covariance is not None
@@ -190,7 +190,7 @@ def test_a_map_moved_as_a_whole_moves_the_path() -> None:
     # Next to nothing is known of the start, so that all there is to know comes from the map.
     start = 1e4 * np.eye(3)
     localizer = Localizer(some, start_covariance=start, camera_xy=CAMERA_XY, joint_covariance=joint)
-    run = run_localizer(recording, localizer)
+    run = run_filter(recording, localizer)
     np.testing.assert_allclose(run.path.poses, truth, atol=1e-6)
     assert run.path.covariance is not None
     for pose, found in zip(truth[20:], run.path.covariance[20:]):
@@ -204,7 +204,7 @@ def test_a_map_moved_as_a_whole_moves_the_path() -> None:
 
 def test_without_noise_the_path_is_the_true_one() -> None:
     recording, some, truth = drive(2, noise=0.0)
-    run = run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY))
+    run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY))
     np.testing.assert_allclose(run.path.poses, truth, atol=1e-9)
     assert run.path.prefixes[:2] == ("start", "b.0")
     assert run.count.innovation_squared == pytest.approx(0.0, abs=1e-12)
@@ -220,7 +220,7 @@ def test_a_wrong_start_is_forgotten_when_it_is_said_to_be_uncertain() -> None:
         CAMERA_XY,
         map_errors="ignored",
     )
-    run = run_localizer(recording, localizer)
+    run = run_filter(recording, localizer)
     assert np.hypot(*(run.path.poses[-1] - truth[-1])[:2]) < 0.01
 
 
@@ -237,7 +237,7 @@ def test_rows_that_show_nothing_in_the_map_are_left_out_and_counted() -> None:
         recording.circles,
         LineRows(lines.frame, lines.bearing_rad, lines.sigma_rad, ids),
     )
-    run = run_localizer(changed, Localizer(some, camera_xy=CAMERA_XY))
+    run = run_filter(changed, Localizer(some, camera_xy=CAMERA_XY))
     assert run.count.left_out == {
         "disc without ID": 2,
         "disc not in the map": 1,
@@ -271,7 +271,7 @@ def test_identities_are_found_in_the_map(method: str) -> None:
         some.discs.ids, some.discs.xy, some.discs.covariance * 1e-3, some.discs.rows
     )
     exact = Landmarks(some.lines.ids, some.lines.xy, some.lines.covariance * 1e-3, some.lines.rows)
-    run = run_localizer(
+    run = run_filter(
         one,
         Localizer(LandmarkMap(certain, exact), camera_xy=CAMERA_XY),
         Associator("joint" if method == "joint" else "nearest"),
@@ -286,7 +286,7 @@ def test_covariances_that_contradict_each_other_are_refused() -> None:
     recording, some, _ = drive(6)
     recording.circles.covariance[recording.circles.frame == 1] = -1e3 * np.eye(2)
     with pytest.raises(SlamError, match=r"step 2 \(b\.1\): the covariance of the innovation"):
-        run_localizer(recording, Localizer(some, camera_xy=CAMERA_XY))
+        run_filter(recording, Localizer(some, camera_xy=CAMERA_XY))
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
@@ -298,7 +298,7 @@ def test_a_gate_that_is_no_probability_is_refused(probability: float) -> None:
 def test_a_run_without_rows_is_odometry() -> None:
     recording, _, _ = drive(7)
     empty = LandmarkMap(no_landmarks(), no_landmarks())
-    run = run_localizer(recording, Localizer(empty))
+    run = run_filter(recording, Localizer(empty))
     pose = np.zeros(3)
     for k, step in enumerate(recording.steps):
         pose = move(pose, step)
@@ -309,9 +309,9 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     """The filters on the demo run: its rows are exact, so that only odometry is wrong."""
     import json
 
-    from redetect.slam.commands.inputs import camera_xy_of
+    from redetect.plane import between
+    from redetect.slam.commands.files import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-    from redetect.slam.models.motion import relative_pose
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)
@@ -319,10 +319,10 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     truth = json.loads((run_folder / "truth.json").read_text())
     start = np.array(truth["start"])
     poses = np.array([start] + [frame["pose"] for frame in truth["frames"]])
-    true_poses = relative_pose(start, poses)
+    true_poses = between(start, poses)
     ekf = EkfSlam(camera_xy=camera_xy)
     mapped = run_ekf(recording, ekf)
-    located = run_localizer(recording, Localizer(ekf.landmark_map(), camera_xy=camera_xy))
+    located = run_filter(recording, Localizer(ekf.landmark_map(), camera_xy=camera_xy))
     for run in (mapped, located):
         error = run.path.poses - true_poses
         assert np.max(np.hypot(error[:, 0], error[:, 1])) < 0.25

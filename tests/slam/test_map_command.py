@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.plane import between
 from redetect.slam.cli import main
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
+from redetect.slam.models import disc_in_robot
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_landmarks_stand_where_they_truly_are(demo_run: Path, both_kinds: Path) 
         assert np.max(squared) < 13.8  # 99.9 % of chi-squared with two degrees of freedom
         assert np.max(np.abs(off)) < 0.3
     world = np.array([truth["start"], *(frame["pose"] for frame in truth["frames"])])
-    poses = relative_pose(start, world)
+    poses = between(start, world)
     path = read_path(both_kinds / "path.csv")
     assert path.prefixes[:2] == ("start", "e.0000")
     np.testing.assert_allclose(path.poses[:, :2], poses[:, :2], atol=0.25)

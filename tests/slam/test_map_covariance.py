@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
-from redetect.slam.commands.inputs import camera_of_run
-from redetect.slam.errors import SlamError
-from redetect.slam.mapping.covariance_file import (
+from redetect.landmarks import LandmarkFileError
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    Landmarks,
     covariance_file,
-    joint_covariance,
+    no_landmarks,
     read_joint_covariance,
     write_joint_covariance,
 )
+from redetect.slam.commands.files import camera_of_run
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.mapping.solve import equations_at
+from redetect.slam.mapping.solve import equations_at, joint_covariance
 from redetect.slam.recording import read_recording
 from redetect.storage import OutputExistsError
 
@@ -80,8 +81,8 @@ def test_files_of_another_map_are_refused(
 ) -> None:
     place = tmp_path / "map.csv"
     np.save(covariance_file(place), content)
-    with pytest.raises(SlamError, match=message):
+    with pytest.raises(LandmarkFileError, match=message):
         read_joint_covariance(place, some)
     covariance_file(place).write_bytes(b"no array")
-    with pytest.raises(SlamError, match="cannot be read"):
+    with pytest.raises(LandmarkFileError, match="cannot be read"):
         read_joint_covariance(place, some)

@@ -18,8 +18,8 @@ from redetect.slam.mapping.initial_lines import place_lines
 from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
-from redetect.slam.models.motion import move
-from redetect.slam.models.mounting import directions_of_rows, rotation_exp, rows_through_mounting
+from redetect.slam.models import move
+from redetect.slam.mounting import directions_of_rows, rotation_exp, rows_through_mounting
 from redetect.slam.recording import LineRows, Recording, read_recording, recording_of_frames
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 

@@ -15,16 +15,10 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import (
-    RowErrors,
-    Weighting,
-    errors,
-    layout_of,
-    linearise,
-)
+from redetect.slam.mapping.graph_terms import RowErrors, Weighting, errors, layout_of, linearise
 from redetect.slam.mapping.solve import marginals, moved, solve
-from redetect.slam.models.measurement import bearing_of_vertical
-from redetect.slam.models.mounting import mounting_change, rotation_exp
+from redetect.slam.models import bearing_of_vertical
+from redetect.slam.mounting import mounting_change, rotation_exp
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, small_run
 

@@ -9,20 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
-from redetect.slam.models.measurement import (
+from redetect.plane import apply, between, rotation
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
-    disc_in_map,
+    between_jacobians,
+    chain_steps,
     disc_in_robot,
     disc_jacobians,
-)
-from redetect.slam.models.motion import (
-    chain_steps,
     move,
     move_jacobians,
-    relative_pose,
-    relative_pose_jacobians,
-    rotation,
 )
 
 FloatArray = NDArray[np.float64]
@@ -63,16 +59,16 @@ def test_relative_pose_jacobians(some: tuple[FloatArray, ...]) -> None:
     # Away from the wrap, where a difference of angles would jump.
     others = others.copy()
     others[:, 2] = poses[:, 2] + np.clip(others[:, 2], -3.0, 3.0)
-    by_first, by_second = relative_pose_jacobians(poses, others)
-    first = derivative(lambda p: relative_pose(p, others), poses)
-    second = derivative(lambda p: relative_pose(poses, p), others)
+    by_first, by_second = between_jacobians(poses, others)
+    first = derivative(lambda p: between(p, others), poses)
+    second = derivative(lambda p: between(poses, p), others)
     np.testing.assert_allclose(by_first, first, atol=1e-8)
     np.testing.assert_allclose(by_second, second, atol=1e-8)
 
 
 def test_relative_pose_undoes_a_move(some: tuple[FloatArray, ...]) -> None:
     poses, _, steps, _ = some
-    again = relative_pose(poses, move(poses, steps))
+    again = between(poses, move(poses, steps))
     np.testing.assert_allclose(again[:, :2], steps[:, :2], atol=1e-12)
     np.testing.assert_allclose(wrap_angle(again[:, 2] - steps[:, 2]), 0.0, atol=1e-12)
 
@@ -98,7 +94,7 @@ def test_disc_jacobians(some: tuple[FloatArray, ...]) -> None:
 
 def test_inverse_disc_model(some: tuple[FloatArray, ...]) -> None:
     poses, _, _, seen = some
-    np.testing.assert_allclose(disc_in_robot(poses, disc_in_map(poses, seen)), seen, atol=1e-12)
+    np.testing.assert_allclose(disc_in_robot(poses, apply(poses, seen)), seen, atol=1e-12)
 
 
 def test_bearing_jacobians(some: tuple[FloatArray, ...]) -> None:
@@ -125,5 +121,5 @@ def test_bearings_are_zero_forward_and_positive_to_the_left() -> None:
 
 def test_rotation_takes_the_robots_axes_to_the_maps() -> None:
     np.testing.assert_allclose(rotation(np.pi / 2) @ [1.0, 0.0], [0.0, 1.0], atol=1e-15)
-    offset = disc_in_map(np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0]))
+    offset = apply(np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0]))
     np.testing.assert_allclose(offset, [0.0, 1.0], atol=1e-15)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from detect.cli import main as detect
 from redetect.landmarks.map_file import read_path
+from redetect.plane import between
 from redetect.slam.cli import main as slam
-from redetect.slam.formats.axes import from_dataset
-from redetect.slam.models.motion import chain_steps, relative_pose
-from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.formats.text import from_dataset
+from redetect.slam.models import OdometryNoise, chain_steps
 from tests.detect.recordings import Ros, Said
 
 FloatArray = NDArray[np.float64]
@@ -31,12 +31,12 @@ STATED = np.array([0.02, 0.01, 0.015])
 
 def steps_with_noise(true_poses: FloatArray, sigma: FloatArray) -> FloatArray:
     """True steps with errors of standard deviations (left, backward, turn)."""
-    steps = relative_pose(true_poses[:-1], true_poses[1:])
+    steps = between(true_poses[:-1], true_poses[1:])
     return steps + sigma * np.random.default_rng(3).standard_normal(steps.shape)
 
 
 def assumed_sigma(true_poses: FloatArray) -> FloatArray:
-    steps = relative_pose(true_poses[:-1], true_poses[1:])
+    steps = between(true_poses[:-1], true_poses[1:])
     return np.sqrt(np.diagonal(OdometryNoise().covariance(steps), axis1=1, axis2=2))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from redetect.landmarks import LandmarkFileError
 from redetect.slam.errors import SlamError
-from redetect.slam.models.odometry_noise import OdometryNoise
+from redetect.slam.models import OdometryNoise
 from redetect.slam.recording import read_recording
 
 STEP = "STEP a.{k} 0.1 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.commands.associate import score_run
-from redetect.slam.commands.inputs import camera_xy_of
+from redetect.slam.commands.files import camera_xy_of
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import read_recording
 from tools.evaluation.tables import Table

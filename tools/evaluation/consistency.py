@@ -11,10 +11,9 @@ from scipy.stats import chi2
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.frames import FilterRun
-from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps
+from redetect.slam.filters.frames import FilterRun, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from tools.arrays import FloatArray
 from tools.evaluation.tables import Table
@@ -195,7 +194,7 @@ def assess(
 
 def localized(sigma_m: float, map_errors: MapErrors) -> Callable[[SimulatedRun, int], FilterRun]:
     """Localisation in the true map, or in one with errors of a standard deviation."""
-    return lambda run, seed: run_localizer(
+    return lambda run, seed: run_filter(
         run.recording,
         Localizer(
             true_map(run, sigma_m, seed + 1_000_000), camera_xy=CAMERA_XY, map_errors=map_errors

@@ -15,14 +15,14 @@ from scipy.stats import chi2
 from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, fuse
 from redetect.groundtruth.fusion.inputs import FuseSettings
-from redetect.groundtruth.trajectories.matching import (
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
     matched_streams,
     pose_differences,
-    squared_lengths,
+    read_planar_poses,
 )
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
 from redetect.groundtruth.validation.scoring import score_poses
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.lasers import run_groundtruth, table_of_sessions
 from tools.evaluation.tables import Table
@@ -217,7 +217,7 @@ def _figures(fusion: Fusion, route: Route, begin: float, end: float) -> list[flo
     assert found.covariances is not None
     exact = route.poses(found.times_s)
     error = pose_differences(found.poses, exact)
-    squared = squared_lengths(error, found.covariances) / 3.0
+    squared = squared_mahalanobis(error, found.covariances) / 3.0
     inside = (found.times_s > begin) & (found.times_s < end)
     middle = int(np.argmin(np.abs(found.times_s - 0.5 * (begin + end))))
     late = int(np.argmin(np.abs(found.times_s - (0.1 * begin + 0.9 * end))))

@@ -30,14 +30,14 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.trajectories.matching import (
+from redetect.groundtruth.trajectories.streams import (
     matched_streams,
     pose_differences,
-    squared_lengths,
+    read_planar_poses,
 )
-from redetect.groundtruth.trajectories.plane import between
-from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.validation.scoring import score_poses
+from redetect.landmarks import squared_mahalanobis
+from redetect.plane import between
 from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table
@@ -172,7 +172,7 @@ def scanner_errors(found: tuple[Scanner, ...], exact: tuple[Scanner, ...]) -> di
     error = pose_differences(*(np.array([s.pose for s in of]) for of in (found, exact)))
     covariances = np.array([scanner.covariance for scanner in found])
     known = covariances.any()
-    nees = squared_lengths(error, covariances).mean() / 3.0 if known else 0.0
+    nees = squared_mahalanobis(error, covariances).mean() / 3.0 if known else 0.0
     return {
         "scanner_mm": float(1e3 * np.hypot(error[:, 0], error[:, 1]).mean()),
         "scanner_deg": float(np.degrees(np.abs(error[:, 2])).mean()),
@@ -244,7 +244,7 @@ class LaserLog:
         )
         rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
         if rows.any():
-            normalised = np.median(squared_lengths(error[rows], covariances[rows])) / 3
+            normalised = np.median(squared_mahalanobis(error[rows], covariances[rows])) / 3
             print(f"gross failures: median squared error, normalised, {normalised:.1f}")
         for percent in (50, 90, 95):
             print(

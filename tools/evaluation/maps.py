@@ -15,16 +15,16 @@ from tyro.conf import Positional
 
 from camera import Camera
 from redetect.landmarks import squared_mahalanobis
-from redetect.slam.commands.inputs import camera_of_run
+from redetect.plane import between
+from redetect.slam.commands.files import camera_of_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import RowErrors, Weighting, cost, errors
 from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
-from redetect.slam.models.mounting import rotation_exp, rows_through_mounting
+from redetect.slam.models import disc_in_robot
+from redetect.slam.mounting import rotation_exp, rows_through_mounting
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, Recording, read_recording
 from tools.arrays import BoolArray, FloatArray, IntArray
 from tools.evaluation.tables import Table
@@ -55,7 +55,7 @@ def read_truth(run: Path) -> Truth:
     truth = json.loads((run / "truth.json").read_text(encoding="utf-8"))
     start = np.array(truth["start"])
     world = np.array([truth["start"], *(frame["pose"] for frame in truth["frames"])])
-    poses = relative_pose(start, world)
+    poses = between(start, world)
     poses[:, 2] = np.unwrap(poses[:, 2])
     return Truth(
         poses=poses,
@@ -89,7 +89,7 @@ def drawn(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
 def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Recording:
     """A run whose wrong steps are measured anew, with errors as their covariances say."""
     rng = np.random.default_rng(seed)
-    true = relative_pose(truth.poses[:-1], truth.poses[1:])
+    true = between(truth.poses[:-1], truth.poses[1:])
     fresh = true + drawn(step_covariance(true), rng)
     wrong = truth.wrong_odometry
     steps, covariance = recording.steps.copy(), recording.step_covariance.copy()

@@ -23,13 +23,11 @@ from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import read_robot, read_scanners
-from redetect.groundtruth.lasers.scans import read_scans
-from redetect.groundtruth.trajectories.plane import apply
+from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import read_path
-from redetect.slam.models.measurement import disc_in_map
+from redetect.plane import apply
 from tools.evaluation.maps import read_truth
 from tools.evaluation.tables import picture
 
@@ -182,7 +180,7 @@ def draw_association(figure: Any, run: Path) -> None:
             for row in frame.circles:
                 # Neighbouring numbers in colours far from each other.
                 colour = mpl.colormaps["hsv"]((row.ids[0] * 0.381966) % 1.0)
-                axes.plot(*disc_in_map(pose, (row.px, row.py)), ".", markersize=2.5, color=colour)
+                axes.plot(*apply(pose, (row.px, row.py)), ".", markersize=2.5, color=colour)
         axes.set_title(title, fontsize=10)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=8)

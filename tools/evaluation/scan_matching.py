@@ -26,8 +26,8 @@ from redetect.groundtruth.lasers.icp import (
     pose_uncertainty,
     scan_normals,
 )
-from redetect.groundtruth.trajectories.plane import apply
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply
 from tools.arrays import FloatArray
 
 _COARSE_GATES_M = (1.0, 0.8, 0.6, 0.5, 0.4, 0.3)

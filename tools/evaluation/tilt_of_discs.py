@@ -15,7 +15,7 @@ from detect.seen import image_positions
 from detect.sources.image_files import image_name
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models import disc_in_robot
 from tools.arrays import FloatArray
 
 #: An error of the image smaller than this is not believed, pixels along u.

@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from camera import CameraError
-from redetect.groundtruth.clocks.clock import read_clock
-from redetect.groundtruth.clocks.ptpd import read_ptpd
+from redetect.groundtruth.clocks.clock import read_clock, read_ptpd
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import read_robot, read_scanners
-from redetect.groundtruth.lasers.scans import read_scans
+from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
 from redetect.groundtruth.markers.boards import read_boards
 from redetect.groundtruth.markers.calibration import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import (
@@ -24,7 +22,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_rows_of_numbers,
     read_times,
 )
-from redetect.groundtruth.validation.fiducials import Survey, read_distances, read_survey
+from redetect.groundtruth.validation.reference_poses import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.scoring import read_relations
 from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NUMBERS, Reader
 

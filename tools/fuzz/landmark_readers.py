@@ -8,19 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
-from redetect.landmarks.map_file import read_map, read_path
+from redetect.landmarks.map_file import covariance_file, read_joint_covariance, read_map, read_path
 from redetect.landmarks.tilts import read_tilts
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.tum import read_tum
-from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from tools.fuzz.reader import NUMBERS, Reader
 
 
 def _landmarks(path: Path) -> object:
     """Frames of a file; what was accepted is given back byte by byte, and its records too."""
     from redetect.landmarks import parse_rows
-    from redetect.landmarks.writing import format_record
+    from redetect.landmarks.files import format_record
 
     rows = list(read_rows(path))
     assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"
@@ -90,7 +89,7 @@ LANDMARK_READERS: tuple[Reader, ...] = (
            (b"disc,", b"line,", b'"', *NUMBERS)),
     Reader("path", "path.csv", read_path, _LANDMARK, (_PATH.encode(),),
            (b"start,", b'"', *NUMBERS)),
-    Reader("map covariance", covariance_file(Path("map.csv")).name, _joint, _SLAM,
+    Reader("map covariance", covariance_file(Path("map.csv")).name, _joint, _LANDMARK,
            (_npy(0.01 * np.eye(2)),), (b"NUMPY", b"'descr': '|O'", b"(2, 2)"),
            {"map.csv": _MAP_OF_ONE}, needed=False),
     Reader("g2o", "e.g2o", read_g2o, _SLAM, (_G2O,), _G2O_WORDS),

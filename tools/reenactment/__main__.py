@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from camera import read_camera
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import graph_of_recording
-from redetect.slam.models.mounting import check_rows_fit_camera
+from redetect.slam.mounting import check_rows_fit_camera
 from redetect.slam.recording import read_recording
 from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of

@@ -16,11 +16,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from camera import Camera
-from redetect.slam.mapping.graph import Estimate, Graph, first_sight, whitening
+from redetect.least_squares.solver import whitening
+from redetect.plane import apply
+from redetect.slam.mapping.graph import Estimate, Graph, first_sight
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.solve import solve
-from redetect.slam.models.measurement import disc_in_map, disc_in_robot
-from redetect.slam.models.mounting import (
+from redetect.slam.models import disc_in_robot
+from redetect.slam.mounting import (
     directions_of_rows,
     mounting_change,
     nominal_mounting,
@@ -256,7 +258,7 @@ def map_positions(graph: Graph, estimate: Estimate, rows: IntArray) -> FloatArra
     ray = np.einsum("nij,nj->ni", turn, directions_of_rows(camera, graph.disc_xy[rows]))
     down = np.where(ray[:, 2] < 0.0, ray[:, 2], np.nan)
     floor = mounting[:2, 3] - (mounting[2, 3] / down)[:, None] * ray[:, :2]
-    return disc_in_map(estimate.poses[pose], floor)
+    return apply(estimate.poses[pose], floor)
 
 
 def _merge_overlapping(graph: Graph, disc_xy: FloatArray) -> IntArray:

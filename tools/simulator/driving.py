@@ -12,7 +12,8 @@ from camera import Camera
 from camera.uncertainty import with_pose
 from redetect.groundtruth.trajectories.transforms import transform
 from redetect.landmarks import Step
-from redetect.slam.models.motion import move, move_jacobians, relative_pose
+from redetect.plane import between
+from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import Recording
 from tools.arrays import FloatArray
 
@@ -197,7 +198,7 @@ def measured_steps(
 ) -> FloatArray:
     """Steps as odometry measures them. `poses` (N + 1, 3); `wrong` (N,); returns (N, 3)."""
     pose = np.asarray(poses, dtype=np.float64)
-    true = relative_pose(pose[:-1], pose[1:])
+    true = between(pose[:-1], pose[1:])
     root = np.linalg.cholesky(step_covariance(true) + 1e-18 * np.eye(3))
     noise = rng.standard_normal(true.shape)
     measured = true + np.einsum("nij,nj->ni", root, noise)

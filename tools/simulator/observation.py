@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.landmarks import CircleLandmark, LineLandmark
-from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models import disc_in_robot
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge

@@ -3,27 +3,32 @@
 Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``, `time` being the
 ground truth's; between segments the offset is interpolated, before the first and after the last
 their lines are extrapolated.
+
+Logs of ptpd say what the clocks' own synchronisation knows of offset and drift. Two layouts are
+read, as ptpd writes them: comma-separated statistics under a head that names the columns, and debug
+messages, of which ``offset from master`` and ``observed drift`` count.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_json_value
-
-FloatArray = NDArray[np.float64]
-
+from redetect.array_types import FloatArray
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.files import read_json
+from redetect.storage.bounded import read_bounded
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
 
@@ -68,18 +73,14 @@ class ClockModel:
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
         """Robot times of times on the ground truth's clock."""
-        knots, offsets = self._knots()
+        knots, offsets = knots_of(self.segments)
         times = np.asarray(times_s, dtype=np.float64)
-        offset = np.interp(times, knots, offsets)
-        first, last = self.segments[0], self.segments[-1]
-        early, late = times < knots[0], times > knots[-1]
-        offset[early] += (first.rate - 1.0) * (times[early] - knots[0])
-        offset[late] += (last.rate - 1.0) * (times[late] - knots[-1])
-        return np.asarray(times + offset)
+        drifts = (self.segments[0].rate - 1.0, self.segments[-1].rate - 1.0)
+        return times + _extended(times, knots, offsets, drifts)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
         """Times on the ground truth's clock of robot times: the inverse of `robot_times`."""
-        knots, offsets = self._knots()
+        knots, offsets = knots_of(self.segments)
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
         if backward.size:
@@ -89,23 +90,29 @@ class ClockModel:
                 "its times are ambiguous there"
             )
         times = np.asarray(robot_times_s, dtype=np.float64)
-        result = np.interp(times, robot, knots)
-        first, last = self.segments[0], self.segments[-1]
-        early, late = times < robot[0], times > robot[-1]
-        result[early] = knots[0] + (times[early] - robot[0]) / first.rate
-        result[late] = knots[-1] + (times[late] - robot[-1]) / last.rate
-        return np.asarray(result)
+        slopes = (1.0 / self.segments[0].rate, 1.0 / self.segments[-1].rate)
+        return _extended(times, robot, knots, slopes)
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        """The segments' ends and the offsets there."""
-        knots, offsets = [], []
-        for segment in self.segments:
-            for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9)):
-                knots.append(time)
-                offsets.append(
-                    segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s)
-                )
-        return np.array(knots), np.array(offsets)
+
+def knots_of(segments: Sequence[ClockSegment]) -> tuple[FloatArray, FloatArray]:
+    """The ends of segments and the offsets there."""
+    ends = [
+        (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
+        for segment in segments
+        for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9))
+    ]
+    times, offsets = np.array(ends).T
+    return times, offsets
+
+
+def _extended(
+    at: FloatArray, knots: FloatArray, values: FloatArray, slopes: tuple[float, float]
+) -> FloatArray:
+    """Values between knots, and beyond the first and the last along straight lines."""
+    beyond = slopes[0] * np.minimum(at - knots[0], 0.0) + slopes[1] * np.maximum(
+        at - knots[-1], 0.0
+    )
+    return np.asarray(np.interp(at, knots, values) + beyond)
 
 
 def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
@@ -128,8 +135,7 @@ def read_clock(path: str | os.PathLike[str]) -> ClockModel:
         If the file cannot be read or a value is missing or impossible; the message names it.
     """
     place = Path(path)
-    document = read_json_value(place)
-    rows = document.get("segments") if isinstance(document, dict) else None
+    rows = read_json(place).get("segments")
     if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SEGMENTS:
         raise GroundTruthError(f"{place}: no list of segments: expected what `sync` writes")
     segments = tuple(_segment(place, k, row) for k, row in enumerate(rows, 1))
@@ -213,3 +219,121 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
             )
         result.append(segment)
     return result
+
+
+_LARGEST_FILE_BYTES = 1 << 28
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_OFFSET_MESSAGE = re.compile(
+    r"offset from master:\s*([+-]?[0-9]{1,12})\s*s(?:ec)?\s+([+-]?[0-9]{1,12})\s*n"
+)
+_OFFSET_SECONDS = re.compile(rf"offset from master:\s*({_NUMBER})\s*(?:s\b|$)")
+_DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({_NUMBER})")
+_LEADING_TIME = re.compile(rf"^\s*\[?({_NUMBER})\]?[\s,:]")
+_CALENDAR = (
+    "%Y-%m-%d %H:%M:%S.%f",
+    "%Y-%m-%d %H:%M:%S",
+    "%m/%d/%Y %H:%M:%S:%f",
+    "%m/%d/%y %H:%M:%S:%f",
+)
+_PARTS_PER_BILLION = 1e-9
+_OFFSET = "offset from master"
+
+
+@dataclass(frozen=True, eq=False)
+class PtpdLog:
+    """Reports of ptpd."""
+
+    times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
+    offset_s: FloatArray  # (N,): clock minus master
+    # (N,): observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
+    drift: FloatArray
+
+
+def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
+    """Read a log of ptpd.
+
+    Raises
+    ------
+    StreamError
+        If the file cannot be read, or no line of it reports an offset from the master.
+    """
+    rows = list(_rows(Path(path)))
+    if not rows:
+        raise StreamError(
+            path, None, "no line reports an offset from master: expected a log of ptpd"
+        )
+    table = np.array(rows, dtype=np.float64)
+    return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
+
+
+def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
+    """Time, offset (s) and drift (ppb) of each report."""
+    columns: dict[str, int] = {}
+    pending: tuple[float, float] | None = None
+    for line in _lines(path):
+        lowered = line.lower()
+        message = _OFFSET_MESSAGE.search(lowered)
+        seconds = _OFFSET_SECONDS.search(lowered)
+        drift = _DRIFT_MESSAGE.search(lowered)
+        if message or seconds:
+            if pending is not None:
+                yield (*pending, math.nan)
+            if message:
+                offset = int(message[1]) + 1e-9 * int(message[2])
+            else:
+                assert seconds is not None
+                offset = float(seconds[1])
+            pending = (_leading_time(line), offset)
+        elif drift:
+            if pending is not None:
+                yield (*pending, float(drift[1]))
+            pending = None
+        elif "offset from master" in lowered and "," in lowered:
+            names = [name.strip(" #\t") for name in lowered.split(",")]
+            found = {name: k for k, name in enumerate(names)}
+            columns = found if _OFFSET in found else {}
+        elif columns:
+            row = _table_row(line, columns)
+            if row is not None:
+                yield row
+    if pending is not None:
+        yield (*pending, math.nan)
+
+
+def _table_row(line: str, columns: dict[str, int]) -> tuple[float, float, float] | None:
+    """A row of the comma-separated layout; None for states in which there is no offset."""
+    words = [word.strip() for word in line.split(",")]
+    at = columns[_OFFSET]
+    if at >= len(words) or not re.fullmatch(_NUMBER, words[at]):
+        return None
+    time_at = columns.get("timestamp", len(words))
+    time = _calendar_time(words[time_at]) if time_at < len(words) else math.nan
+    drift_at = columns.get("observed drift", columns.get("drift"))
+    drift = math.nan
+    if drift_at is not None and drift_at < len(words) and re.fullmatch(_NUMBER, words[drift_at]):
+        drift = float(words[drift_at])
+    return time, float(words[at]), drift
+
+
+def _leading_time(line: str) -> float:
+    found = _LEADING_TIME.match(line)
+    return float(found[1]) if found else math.nan
+
+
+def _calendar_time(text: str) -> float:
+    if re.fullmatch(_NUMBER, text):
+        return float(text)
+    for layout in _CALENDAR:
+        try:
+            return datetime.strptime(text, layout).replace(tzinfo=UTC).timestamp()
+        except ValueError:
+            continue
+    return math.nan
+
+
+def _lines(path: Path) -> Iterator[str]:
+    try:
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", errors="replace")
+    except OSError as error:
+        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+    yield from text.splitlines()

@@ -6,33 +6,49 @@ form (RAWSEEDS D2.1 part 2). The search is global and derivative-free and depend
 value. Odometry's heading drifts, so that a plain sum of squares would explain drift by a time
 offset. A second search around the first result therefore whitens the residuals, from which the
 noise of the samples and the rate of the random walk are estimated.
+
+Headings determine the time only through turns, and only as well as odometry's heading drift allows.
+Where the ground truth has positions and covariances, the clock is refined, near the estimate by
+headings, to maximise the likelihood of all measured poses given odometry's movements. Curves of the
+path and changes of speed then contribute as well.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, direct, minimize
 
-from redetect.groundtruth.clocks.clock import ClockSegment, Status, on_one_line
+from redetect.array_types import BoolArray, FloatArray
+from redetect.groundtruth.clocks.clock import (
+    ClockModel,
+    ClockSegment,
+    Status,
+    knots_of,
+    on_one_line,
+)
 from redetect.groundtruth.clocks.headings import (
     HeadingPair,
+    Wandering,
     continuous_headings,
+    estimate_wandering,
+    find_jump,
     pair_headings,
     segments_between_gaps,
     without_turns,
 )
-from redetect.groundtruth.clocks.refinement import refine_by_movement
-from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering, find_jump
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import likeliest_noise, noise_of
+from redetect.groundtruth.fusion.inputs import FuseSettings
+from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
+from redetect.storage.bounds import Positive, demand_fields, inside
 
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
@@ -52,27 +68,17 @@ _MUCH_LESS_CERTAIN = 4.0
 
 @dataclass(frozen=True)
 class SyncSettings:
-    """Bounds of the search.
+    """Bounds of the search."""
 
-    Raises
-    ------
-    GroundTruthError
-        If one is not finite or not positive, or the drift is half or more.
-    """
-
-    largest_offset_s: float = 1.0  # Of the time offset, either way (s)
-    largest_drift: float = 0.01  # The clocks' rates differ by at most this share
-    segment_gap_s: float = 5.0  # A longer pause in the ground truth begins a new segment (s)
+    largest_offset_s: Positive = 1.0  # Of the time offset, either way (s)
+    # The clocks' rates differ by at most this share
+    largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
+    segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s)
     # Refine the estimate by headings with the whole movement if the ground truth has covariances
     use_movement: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("largest_offset_s", "largest_drift", "segment_gap_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise GroundTruthError(f"{name} is {value}: expected above 0")
-        if self.largest_drift >= 0.5:
-            raise GroundTruthError(f"largest_drift is {self.largest_drift}: expected below 0.5")
+        demand_fields(self, GroundTruthError)
 
 
 def synchronise(
@@ -278,7 +284,7 @@ def _simplex(start: FloatArray) -> FloatArray:
     return np.asarray(start + np.vstack([np.zeros(len(start)), np.diag(inward)]))
 
 
-def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> NDArray[np.bool_]:
+def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> BoolArray:
     """Which samples are no gross errors of one of the streams."""
     level = without_turns(pair.differences(offset_s, drift))
     centre = float(np.median(level))
@@ -354,15 +360,129 @@ def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
     determined = [segment for segment in segments if segment.status != "no turns"]
     if not determined:
         return segments
-    ends = [
-        (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
-        for segment in determined
-        for time in (segment.from_s, segment.to_s)
-    ]
-    times, offsets = np.array(ends).T
+    times, offsets = knots_of(determined)
     return [
         replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
         if segment.status == "no turns"
         else segment
         for segment in segments
     ]
+
+
+_MARGIN_S = 2.0
+_LEAST_WAY_M = 1.0
+_FEWEST_POSES = 20
+_ROUNDS = 2
+# Ratio of the errors in simulated sessions to the deviations by the likelihood's curvature: errors
+# of wheels do not follow the model exactly.
+_SIGMA_FACTOR = 2.0
+
+
+def refine_by_movement(
+    segments: Sequence[ClockSegment],
+    odometry: PlanarPoses,
+    groundtruth: PlanarPoses,
+    largest: tuple[float, float],
+) -> list[ClockSegment]:
+    """Move each segment's offset and rate to where the movements fit best.
+
+    Refined are segments with the status `ok` or `jump` in which the robot drove a metre or more, if
+    the result is near the estimate by headings and within the bounds `largest` of offset (s) and
+    drift; the ground truth has covariances.
+    """
+    if groundtruth.covariances is None:
+        return list(segments)
+    return [
+        _refined(segment, odometry, groundtruth, largest)
+        if segment.status in ("ok", "jump")
+        else segment
+        for segment in segments
+    ]
+
+
+def _refined(
+    segment: ClockSegment,
+    odometry: PlanarPoses,
+    groundtruth: PlanarPoses,
+    largest: tuple[float, float],
+) -> ClockSegment:
+    assert groundtruth.covariances is not None
+    here = (groundtruth.times_s >= segment.from_s) & (groundtruth.times_s <= segment.to_s)
+    near = (odometry.times_s >= segment.from_s + segment.offset_s - _MARGIN_S) & (
+        odometry.times_s <= segment.to_s + segment.offset_s + _MARGIN_S
+    )
+    steps = np.diff(odometry.poses[near][:, :2], axis=0)
+    if (
+        np.count_nonzero(here) < _FEWEST_POSES
+        or np.count_nonzero(near) < _FEWEST_POSES
+        or float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))) < _LEAST_WAY_M
+    ):
+        return segment
+    measured = groundtruth.only(here)
+    robot_times, own = odometry.times_s[near], odometry.poses[near]
+    settings = FuseSettings()
+    noise = noise_of(settings)
+    # One unit of the search: what the headings leave open, but no less than a millisecond at the
+    # segment's middle and at its ends.
+    half = 0.5 * (segment.to_s - segment.from_s)
+    unit = np.array([max(segment.sigma_offset_s, 1e-3), max(segment.sigma_rate, 1e-3 / half)])
+    start = np.array([segment.offset_s, segment.rate - 1.0])
+    bounds = Bounds((-np.array(largest) - start) / unit, (np.array(largest) - start) / unit)
+
+    def moved(x: FloatArray) -> ClockSegment:
+        offset_s, rate = (segment.offset_s, segment.rate) + unit * x
+        return replace(segment, offset_s=float(offset_s), rate=float(rate))
+
+    def problem_at(x: FloatArray) -> MovementProblem:
+        times = ClockModel((moved(x),)).groundtruth_times(robot_times)
+        return movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
+
+    def surprise(x: FloatArray) -> float:
+        return problem_at(x).surprise(noise)
+
+    best = np.zeros(2)
+    try:
+        for _ in range(_ROUNDS):
+            noise = likeliest_noise(problem_at(best))
+            found = minimize(
+                surprise,
+                best,
+                method="Nelder-Mead",
+                bounds=bounds,
+                options={"xatol": 0.01, "fatol": 0.01, "initial_simplex": best + _SIMPLEX},
+            )
+            best = found.x
+    except GroundTruthError:
+        return segment
+    at_bound = np.abs(start + unit * best) > _AT_A_BOUND * np.array(largest)
+    if np.max(np.abs(best)) > _FARTHEST or np.any(at_bound):
+        return segment
+    covariance = _curvature_covariance(surprise, best)
+    if covariance is None:
+        return segment
+    sigma = _SIGMA_FACTOR * unit * np.sqrt(np.diag(covariance))
+    return replace(moved(best), sigma_offset_s=float(sigma[0]), sigma_rate=float(sigma[1]))
+
+
+_SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+# Largest distance from the estimate by headings, in its deviations; beyond it is rejected.
+_FARTHEST = 8.0
+# Share of the bounds beyond which the search has not found a minimum within them.
+_AT_A_BOUND = 0.999
+
+
+def _curvature_covariance(
+    surprise: Callable[[FloatArray], float], at: FloatArray
+) -> FloatArray | None:
+    """Of the two unknowns, from the curvature of minus twice the logarithm of the likelihood."""
+    h = 0.7
+    e, f = h * np.eye(2)
+    hessian = np.empty((2, 2))
+    for i, step in enumerate((e, f)):
+        hessian[i, i] = (surprise(at + step) + surprise(at - step) - 2.0 * surprise(at)) / h**2
+    hessian[0, 1] = hessian[1, 0] = (
+        surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
+    ) / (2.0 * h) ** 2
+    if not (np.linalg.eigvalsh(hessian)[0] > 0.0 and math.isfinite(hessian.sum())):
+        return None
+    return np.asarray(2.0 * np.linalg.inv(hessian))

@@ -7,11 +7,11 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
-from redetect.groundtruth.lasers.outline import LaserSettings
+from redetect.groundtruth.lasers.acquisition import LaserSettings
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
@@ -29,8 +29,6 @@ from redetect.groundtruth.lasers.tracking import (
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_whole
-
-FloatArray = NDArray[np.float64]
 
 #: A set is disturbed by this many readings that hide the robot or are of objects beside it.
 _DISTURBED = 3

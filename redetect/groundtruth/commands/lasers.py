@@ -11,8 +11,13 @@ from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.lasers.alignment import AlignmentSettings, align_scanners, still_scan
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.lasers.scanners import Scanner, read_scanners, write_scanners
-from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import (
+    Scanner,
+    find_scans,
+    read_scanners,
+    read_scans,
+    write_scanners,
+)
 from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.landmarks import wrap_angle
 from redetect.storage import write_whole

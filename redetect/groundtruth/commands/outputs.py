@@ -13,13 +13,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from redetect.groundtruth import __version__
 from redetect.groundtruth.errors import GroundTruthError
@@ -46,7 +40,7 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     """Metadata of a result: version, settings, and the files that it depends on."""
     return {
         "version": __version__,
-        "settings": asdict(settings),
+        "settings": settings if isinstance(settings, dict) else asdict(settings),
         "files": {
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
         },

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.commands.outputs import (
     check_outputs,
@@ -33,8 +33,6 @@ from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, rea
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_whole
-
-FloatArray = NDArray[np.float64]
 
 
 def perform(command: RigCommand) -> int:
@@ -61,7 +59,13 @@ def perform(command: RigCommand) -> int:
     estimate, frame = _in_robot_frame(command, estimate)
     rig = estimate.rig
     table = [
-        {"marker": marker, **residual_figures(estimate.adjusted, _views_of(estimate, index))}
+        {
+            "marker": marker,
+            **residual_figures(
+                estimate.adjusted,
+                [i for i, view in enumerate(estimate.views) if view.rig_index == index],
+            ),
+        }
         for index, marker in enumerate(rig.ids)
     ]
     pairs = [
@@ -172,12 +176,8 @@ def _markers(
     return dictionary, widths
 
 
-def _listed(ids: Sequence[int], most: int = 10) -> str:
-    return ", ".join(map(str, ids[:most])) + (", ..." if len(ids) > most else "")
-
-
-def _views_of(estimate: RigEstimate, index: int) -> list[int]:
-    return [i for i, view in enumerate(estimate.views) if view.rig_index == index]
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
 
 
 def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:

@@ -9,12 +9,12 @@ from typing import Any
 from redetect.groundtruth.commands.options import Score
 from redetect.groundtruth.commands.outputs import check_outputs
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.trajectories.matching import (
+from redetect.groundtruth.trajectories.streams import (
     matched_streams,
     moved_poses,
     planar_alignment,
+    read_planar_poses,
 )
-from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.validation.scoring import (
     read_relations,
     score_poses,

@@ -7,8 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document
-from redetect.groundtruth.clocks.ptpd import PtpdLog, read_ptpd
+from redetect.groundtruth.clocks.clock import (
+    ClockModel,
+    ClockSegment,
+    PtpdLog,
+    clock_document,
+    read_ptpd,
+)
 from redetect.groundtruth.clocks.sync import SyncSettings, synchronise
 from redetect.groundtruth.commands.options import Sync
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account

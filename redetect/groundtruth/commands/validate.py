@@ -6,7 +6,6 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,14 @@ from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.lasers.scanners import read_robot
-from redetect.groundtruth.lasers.scans import find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
-from redetect.groundtruth.validation.fiducials import read_distances, read_survey
-from redetect.groundtruth.validation.reference_poses import poses_from_distances
+from redetect.groundtruth.validation.reference_poses import (
+    poses_from_distances,
+    read_distances,
+    read_survey,
+)
 from redetect.groundtruth.validation.reference_poses_scans import Onboard
 from redetect.groundtruth.validation.validate import (
     PUBLISHED,
@@ -31,6 +32,7 @@ from redetect.groundtruth.validation.validate import (
     Refused,
     document,
     figures_of,
+    finite_or_none,
     pose_errors,
     reference_poses,
     stream_of,
@@ -40,11 +42,6 @@ from redetect.storage import write_whole
 
 #: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
-
-
-@dataclass(frozen=True)
-class _Settings:
-    refine: str
 
 
 def perform(options: Validate) -> int:
@@ -64,7 +61,8 @@ def perform(options: Validate) -> int:
         map_file = find_building(session)
         segments = read_building(map_file)
         onboard, scan_files = _onboard(session)
-        clock_path = _clock_path(session, options.clock)
+        beside = session / "clock.json"
+        clock_path = options.clock or (beside if beside.is_file() else None)
         if onboard and clock_path is None:
             print(
                 "warning: no clock.json: the times of the on-board scans are not corrected",
@@ -90,18 +88,18 @@ def perform(options: Validate) -> int:
     figures = figures_of(errors)
     rows = table_rows(references, errors)
     content = {
-        **provenance(_Settings(options.refine), files),
+        **provenance({"refine": options.refine}, files),
         "poses": str(options.poses.name),
         "clock": None if clock_path is None else clock_path.name,
         **document(figures, [*refused, *without]),
         "distances": _distance_figures(solved, survey.sigma_m),
         "rows": [
-            {**row, "note": r.note, "points": r.points, "rms_m": _finite(r.rms_m)}
+            {**row, "note": r.note, "points": r.points, "rms_m": finite_or_none(r.rms_m)}
             for row, r in zip(rows, references)
         ],
         "sigma": [
-            {"pose": e.index, "linear_m": _finite(e.sigma_linear_m),
-             "angular_rad": _finite(e.sigma_angular_rad)}
+            {"pose": e.index, "linear_m": finite_or_none(e.sigma_linear_m),
+             "angular_rad": finite_or_none(e.sigma_angular_rad)}
             for e in errors
         ],
     }  # fmt: skip
@@ -143,24 +141,19 @@ def account(
 ) -> list[str]:
     """The printed figures, with RAWSEEDS' beside them."""
     refined = sum(reference.scans == "used" for reference in references)
-    lines = [
-        f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by scans"
-    ]
     chi2 = distances["chi2_per_freedom"]
-    lines.append(
+    lines = [
+        f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by "
+        "scans",
         f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
         f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}, "
-        f"{distances['gross']} gross errors"
-    )
-    lines.append(
+        f"{distances['gross']} gross errors",
         f"linear error       mean {1e3 * figures.linear_mean_m:.2f} mm, sigma "
-        f"{1e3 * figures.linear_sigma_m:.2f}, worst {1e3 * figures.linear_worst_m:.2f}"
-    )
-    lines.append(
+        f"{1e3 * figures.linear_sigma_m:.2f}, worst {1e3 * figures.linear_worst_m:.2f}",
         f"angular error      mean {math.degrees(figures.angular_mean_rad):+.3f} deg, sigma "
         f"{math.degrees(figures.angular_sigma_rad):.3f}, worst "
-        f"{math.degrees(figures.angular_worst_rad):.3f}"
-    )
+        f"{math.degrees(figures.angular_worst_rad):.3f}",
+    ]
     for p in PUBLISHED:
         lines.append(
             f"{p.name:<18} mean {1e3 * p.position_mean_m:.0f} mm, sigma "
@@ -196,15 +189,7 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
     return boards, files
 
 
-def _clock_path(session: Path, given: Path | None) -> Path | None:
-    if given is not None:
-        return given
-    path = session / "clock.json"
-    return path if path.is_file() else None
-
-
 def _distance_figures(solved: Any, sigma_m: float) -> dict[str, Any]:
-
     good = [d for d in solved if d.status in ("ok", "ambiguous")]
     residuals = np.concatenate([d.residuals_m[d.used] for d in good]) if good else np.zeros(0)
     freedom = sum(d.freedom for d in good)
@@ -214,7 +199,3 @@ def _distance_figures(solved: Any, sigma_m: float) -> dict[str, Any]:
         "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
         "gross": int(sum((~d.used).sum() for d in good)),
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -2,72 +2,49 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.plane import between, log_motion
 from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
-
-FloatArray = NDArray[np.float64]
-
-
-_DEVIATIONS = (
-    "distance_sigma",
-    "lateral_sigma",
-    "turn_sigma",
-    "turn_per_metre_sigma",
-    "turn_scale_sigma",
-    "turn_bias_per_metre_sigma",
-    "distance_scale_sigma",
-)
+from redetect.plane import between, log_motion
+from redetect.storage.bounds import ABOVE_0, PROBABILITY, NotNegative, demand_fields
 
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """How odometry errs, and how far a measurement may be off.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is not finite, negative, or no probability.
-    """
+    """How odometry errs, and how far a measurement may be off."""
 
     # Standard deviation of odometry's distance after a metre (m); it grows with the root.
-    distance_sigma: float = 0.02
+    distance_sigma: NotNegative = 0.02
     # How far the robot slips sideways within a metre (m), its standard deviation; it grows with the
     # root. The lateral error by a wrong heading is not part of it.
-    lateral_sigma: float = 0.01
-    turn_sigma: float = 0.02  # Standard deviation of its heading after turning a radian (rad)
-    turn_per_metre_sigma: float = 0.01  # The same after a metre driven (rad)
+    lateral_sigma: NotNegative = 0.01
+    # Standard deviation of its heading after turning a radian (rad)
+    turn_sigma: NotNegative = 0.02
+    turn_per_metre_sigma: NotNegative = 0.01  # The same after a metre driven (rad)
     # Scale these deviations (distance's, the sideways one, and both of the heading together) by
     # what makes the measurements likeliest; they only begin the search then.
     learn_noise: bool = True
     # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Standard deviations,
     # before anything was measured, of what odometry is off by: the share of each turn, the turn per
     # metre (rad), the share of each way. Terms that make no better predictions are left out.
-    turn_scale_sigma: float = 0.03
-    turn_bias_per_metre_sigma: float = 0.01
-    distance_scale_sigma: float = 0.03
-    gate_probability: float = 0.9999  # Share of right poses that pass the gate
+    turn_scale_sigma: NotNegative = 0.03
+    turn_bias_per_metre_sigma: NotNegative = 0.01
+    distance_scale_sigma: NotNegative = 0.03
+    # Share of right poses that pass the gate
+    gate_probability: Annotated[float, PROBABILITY] = 0.9999
     # Factors on the measurements' covariances, by the stream's name; others count as 1.
     covariance_scale: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in _DEVIATIONS:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise GroundTruthError(f"{name} is {value}: expected 0 or more")
-        if not 0.0 < self.gate_probability < 1.0:
-            raise GroundTruthError(
-                f"gate_probability is {self.gate_probability}: expected between 0 and 1"
-            )
+        demand_fields(self, GroundTruthError)
         for name, value in (self.covariance_scale or {}).items():
-            if not (math.isfinite(value) and value > 0.0):
+            if not ABOVE_0.hold(value):
                 raise GroundTruthError(f"covariance scale of {name} is {value}: expected above 0")
 
     def systematic_sigmas(self) -> FloatArray:
@@ -76,7 +53,7 @@ class FuseSettings:
             [self.turn_scale_sigma, self.turn_bias_per_metre_sigma, self.distance_scale_sigma]
         )
 
-    def with_terms(self, kept: NDArray[np.bool_]) -> FuseSettings:
+    def with_terms(self, kept: BoolArray) -> FuseSettings:
         """With some of these three alone; the others are taken to be 0."""
         turn, bend, way = np.where(kept, self.systematic_sigmas(), 0.0).tolist()
         return replace(
@@ -111,7 +88,7 @@ def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
 
 
-def _paused(times_s: FloatArray) -> NDArray[np.bool_]:
+def _paused(times_s: FloatArray) -> BoolArray:
     interval = np.diff(times_s)
     if len(interval) == 0:
         return np.zeros(0, dtype=np.bool_)
@@ -149,7 +126,7 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
 
 def _distinct(
     times_s: FloatArray, way: FloatArray, turn: FloatArray, settings: FuseSettings
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Between which samples the robot turned by more than odometry's random errors explain.
 
     Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
@@ -198,7 +175,7 @@ def variances_of(
     known, and what a wrong heading leads aside is taken to be that of a way out and back.
 
     `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
-    `redetect.groundtruth.fusion.learning.noise_of`.
+    `redetect.groundtruth.fusion.fuse.noise_of`.
     """
     along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])
@@ -261,14 +238,14 @@ def gather(
     )
 
 
-def _repeats(stream: PlanarPoses, covariances: FloatArray) -> NDArray[np.bool_]:
+def _repeats(stream: PlanarPoses, covariances: FloatArray) -> BoolArray:
     """(N,) which rows are those before them."""
     rows = np.column_stack([stream.times_s, stream.poses, covariances.reshape(len(stream), 9)])
     same = np.all(rows[1:] == rows[:-1], axis=1)
     return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
 
 
-def _usable(name: str, covariances: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, int]:
+def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:
     """Covariances of rows made symmetric, and raised where rounding made them singular."""
     symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
     smallest = np.linalg.eigvalsh(symmetric)[:, 0]

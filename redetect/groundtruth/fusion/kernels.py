@@ -22,10 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
-
+from redetect.array_types import BoolArray, FloatArray, IntArray
 
 #: Length of the state, and of the pose at its beginning.
 STATE = 6

@@ -16,21 +16,19 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
-from redetect.groundtruth.trajectories.matching import (
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
     interpolate_poses,
     moved_poses,
     planar_alignment,
     pose_differences,
 )
-from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 # Errors of x, y (m) and heading (rad); then the rigid motion about the measured poses' centroid
 # beyond the first alignment, and the angle at which its heading is mounted.

@@ -1,23 +1,20 @@
-"""Finding the robot anywhere in the covered area: every heap of new readings, every heading."""
+"""The robot's outline, and finding it anywhere: every heap of new readings, every heading."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from redetect.groundtruth.lasers.icp import fit_outline
-from redetect.groundtruth.lasers.outline import (
-    LaserSettings,
-    outline_faces,
-    outline_radius_m,
-    outline_symmetries,
-)
+from redetect.array_types import FloatArray
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import (
     BeamCounts,
@@ -28,10 +25,142 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     new_points,
     refine_outline,
 )
-from redetect.groundtruth.trajectories.plane import compose
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose, invert, rotation
+from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class LaserSettings:
+    """Settings of laser tracking."""
+
+    gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m)
+    kept: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best
+
+    # The ICP ends when its root mean square error changes by less, or after as many steps.
+    threshold_m: ClassVar[float] = 1e-5
+    most_steps: ClassVar[int] = 60
+    # Standard deviation of a reading's distance from the outline that does not depend on the
+    # scanner's noise: the outline is drawn to millimetres.
+    floor_m: ClassVar[float] = 0.001
+    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
+    # their distances from the face are small whatever the pose.
+    least_slope: ClassVar[float] = 0.35
+    # The final pose uses readings up to this many standard deviations off.
+    gate_sigma: ClassVar[float] = 3.5
+    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
+    # by what it does to the farthest corner).
+    weak_sigma_m: ClassVar[float] = 0.03
+    # Readings that a pose needs, and that a robot needs which is found again.
+    least_readings: ClassVar[int] = 8
+    acquire_readings: ClassVar[int] = 16
+    # The robot is lost after so long without a pose; then it is searched this often.
+    coast_s: ClassVar[float] = 0.25
+    acquire_s: ClassVar[float] = 0.05
+    # Headings that the search begins from.
+    headings: ClassVar[int] = 24
+    # New readings nearer to each other than this may be of one object.
+    link_m: ClassVar[float] = 0.3
+    # Share of the beams that should see the robot, or see something beside it, that must agree.
+    least_agreement: ClassVar[float] = 0.75
+    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
+    symmetry_m: ClassVar[float] = 0.12
+    # The readings identify the front if the residuals differ by this many standard errors; else it
+    # is known after the robot has driven this much farther forward than backward.
+    front_sigma: ClassVar[float] = 5.0
+    forward_m: ClassVar[float] = 0.3
+
+    def __post_init__(self) -> None:
+        demand_fields(self, GroundTruthError)
+
+
+def outline_faces(outline: ArrayLike) -> FloatArray:
+    """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
+
+    Of corners (k, 2) in order, either way round (m).
+
+    Raises
+    ------
+    GroundTruthError
+        If two corners that follow each other are one, faces cross, or the outline encloses nothing.
+    """
+    corners = np.asarray(outline, dtype=np.float64)
+    following = np.roll(corners, -1, axis=0)
+    if np.any(np.hypot(*(following - corners).T) < 1e-6):
+        raise GroundTruthError("outline: two corners that follow each other are the same")
+    area = 0.5 * float(np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]))
+    if abs(area) < 1e-6:
+        raise GroundTruthError(f"outline: encloses {abs(area):g} m2")
+    if area < 0.0:
+        corners = corners[::-1]
+    faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
+    for i in range(len(faces)):
+        for j in range(i + 2, len(faces) - (i == 0)):
+            if _cross(faces[i], faces[j]):
+                raise GroundTruthError(f"outline: faces {i + 1} and {j + 1} cross")
+    return faces
+
+
+def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
+    """Middle (2,) of the outline's bounding box, and its farthest corner's distance from it (m)."""
+    corners = faces[:, :2]
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    return middle, float(np.max(np.hypot(*(corners - middle).T)))
+
+
+def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
+    """Motions (s, 3) other than none that map the outline onto itself, by rising theta from -pi on.
+
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
+    0 for an outline that shows where the front is, 1 for a box, 3 for a square. No point of the
+    turned outline is farther from the outline than the tolerance.
+    """
+    along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
+    points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)
+    points = np.ascontiguousarray(points)
+    # A symmetry keeps the centre of the area where it is.
+    x1, y1, x2, y2 = faces.T
+    twice = x1 * y2 - x2 * y1
+    centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
+    poses, errors = [], []
+    for degrees in range(-180, 180, 3):
+        angle = math.radians(degrees)
+        pose = np.array([*(centre - rotation(angle) @ centre), angle])
+        poses.append(pose)
+        errors.append(_farthest_m(points, faces, pose))
+    found: list[FloatArray] = []
+    for i, error in enumerate(errors):
+        if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
+            continue
+        # Where an ICP of the whole outline to itself ends.
+        pose, _, _ = fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)
+        pose = invert(pose)
+        pose[2] = _turn(pose[2])
+        far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
+        if far and _farthest_m(points, faces, pose) <= tolerance_m:
+            found.append(pose)
+    return np.array(sorted(found, key=lambda p: p[2])).reshape(-1, 3)
+
+
+def _farthest_m(points: FloatArray, faces: FloatArray, pose: FloatArray) -> float:
+    _, _, squared = nearest_on_segments(moved(points, pose), faces)
+    return math.sqrt(float(squared.max()))
+
+
+def _turn(angle: float) -> float:
+    """An angle taken to [-pi, pi), -pi also where rounding made it just less than pi."""
+    return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
+
+
+def _cross(a: FloatArray, b: FloatArray) -> bool:
+    def side(face: FloatArray, x: float, y: float) -> float:
+        return float((face[2] - face[0]) * (y - face[1]) - (face[3] - face[1]) * (x - face[0]))
+
+    return (
+        side(a, b[0], b[1]) * side(a, b[2], b[3]) < 0.0
+        and side(b, a[0], a[1]) * side(b, a[2], a[3]) < 0.0
+    )
+
 
 #: A reading within this of where a beam should meet the robot agrees (m).
 AGREES_M = 0.05
@@ -157,14 +286,12 @@ def _search(
     tried: list[FloatArray] = []
     for k in range(settings.headings):
         theta = 2.0 * math.pi * k / settings.headings
-        c, s = math.cos(theta), math.sin(theta)
-        x, y = body.middle
-        start = np.array([place[0] - c * x + s * y, place[1] - s * x - c * y, theta])
+        start = np.array([*(place - rotation(theta) @ body.middle), theta])
         pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
         pose, _, count = fit_outline(
             seen.points, body.faces, pose, settings.gate_m, settings.kept, 1e-4, settings.most_steps
         )
-        if count < settings.acquire_readings or any(_close(pose, other) for other in tried):
+        if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
         refined = refine(seen, pose, tables, body, settings, 0.1)
@@ -179,15 +306,12 @@ def _search(
     return found
 
 
-def _close(a: FloatArray, b: FloatArray) -> bool:
-    near = math.hypot(a[0] - b[0], a[1] - b[1]) < 0.02
-    return near and abs(float(wrap_angle(a[2] - b[2]))) < math.radians(2.0)
+def _close(a: FloatArray, b: FloatArray, metres: float, degrees: float) -> bool:
+    near = math.hypot(a[0] - b[0], a[1] - b[1]) < metres
+    return near and abs(float(wrap_angle(a[2] - b[2]))) < math.radians(degrees)
 
 
 def _same(a: FloatArray, b: FloatArray, body: Body) -> bool:
     """Whether two poses are equal up to noise and the outline's symmetries."""
-    for other in (b, *(compose(b, symmetry) for symmetry in body.symmetries)):
-        near = math.hypot(a[0] - other[0], a[1] - other[1]) < 0.1
-        if near and abs(float(wrap_angle(a[2] - other[2]))) < math.radians(8.0):
-            return True
-    return False
+    others = (b, *(compose(b, symmetry) for symmetry in body.symmetries))
+    return any(_close(a, other, 0.1, 8.0) for other in others)

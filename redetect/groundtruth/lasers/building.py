@@ -15,14 +15,12 @@ import numpy as np
 from ezdxf import units
 from ezdxf.enums import InsertUnits
 from ezdxf.filemanagement import readfile
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import read_rows_of_numbers
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import one_line
-
-FloatArray = NDArray[np.float64]
 
 #: Curved walls are cut into straight pieces no farther from the curve than this (m).
 CURVE_TOLERANCE_M = 0.002

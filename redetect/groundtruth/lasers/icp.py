@@ -19,17 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.trajectories.plane import apply, invert
-from redetect.storage.bounds import ABOVE_0, SHARE_ABOVE_0, demand
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from redetect.plane import apply, invert
+from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 _MOST_STEPS = 500
 # How often the last gate of a match of scans is repeated at most, and its damping: a millimetre's
@@ -39,31 +36,18 @@ _REPEATED, _DAMPING = 10, 1e-3
 
 @dataclass(frozen=True)
 class IcpSettings:
-    """Settings of an ICP.
+    """Settings of an ICP."""
 
-    Raises
-    ------
-    GroundTruthError
-        If a number is out of range.
-    """
-
-    gate_m: float = 0.2  # Pairs farther apart than this do not count (m)
-    kept: float = 0.95  # Share of the pairs within the gate that counts: the best
+    gate_m: Positive = 0.2  # Pairs farther apart than this do not count (m)
+    kept: ShareAbove0 = 0.95  # Share of the pairs within the gate that counts: the best
     # The ICP ends when the root mean square error changes by less than this (m)
-    threshold_m: float = 1e-7
+    threshold_m: Positive = 1e-7
     # A direction is undetermined if the pose's standard deviation along it is larger than this (m;
     # a rotation counts by what it does to the points, root mean square).
-    weak_sigma_m: float = 0.05
+    weak_sigma_m: Positive = 0.05
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            GroundTruthError,
-            gate_m=ABOVE_0,
-            kept=SHARE_ABOVE_0,
-            threshold_m=ABOVE_0,
-            weak_sigma_m=ABOVE_0,
-        )
+        demand_fields(self, GroundTruthError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +77,10 @@ def icp_to_segments(
     start from.
     """
     s = IcpSettings() if settings is None else settings
-    lines, cloud = _checked(segments, 4, "segments"), _checked(points, 2, "points")
-    begin = np.array(start, dtype=np.float64)
-    if begin.shape != (3,) or not np.isfinite(begin).all():
-        raise GroundTruthError(f"start {start!r}: expected three finite numbers")
+    lines = np.ascontiguousarray(segments, dtype=np.float64)
+    cloud = np.ascontiguousarray(points, dtype=np.float64)
     found, rms, count = fit_outline(
-        cloud, lines, invert(begin), s.gate_m, s.kept, s.threshold_m, _MOST_STEPS
+        cloud, lines, invert(start), s.gate_m, s.kept, s.threshold_m, _MOST_STEPS
     )
     if count < 3:
         raise GeometryError(
@@ -391,12 +373,3 @@ def fit_outline(
         before = rms
         pose = rigid_fit(nearest, points, used)
         step += 1
-
-
-def _checked(values: ArrayLike, columns: int, name: str) -> FloatArray:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != columns or len(array) == 0:
-        raise GroundTruthError(f"{name} of shape {array.shape}: expected (n, {columns}), n > 0")
-    if not np.isfinite(array).all():
-        raise GroundTruthError(f"{name} with a number that is not finite")
-    return array

@@ -1,26 +1,37 @@
-"""Laser scanners in a plane and the robot that they see; ``scanners.json`` and ``robot.json``.
+"""Laser scanners in a plane, the robot that they see, their readings over time; and the files.
 
-A scanner has its x axis along its middle beam where its beams lie symmetrically, as SICK's do;
-beams are counted counter-clockwise. Its pose is that of the scanner in the world for a fixed one,
-in the robot's frame for one on board.
+``scanners.json``, ``robot.json``
+    A scanner has its x axis along its middle beam where its beams lie symmetrically, as SICK's do;
+    beams are counted counter-clockwise. Its pose is that of the scanner in the world for a fixed
+    one, in the robot's frame for one on board.
+``<name>.scans.npz``
+    `times_s` (N,) float64 and `ranges_mm` (N, readings) uint16, nothing pickled.
+``<name>.scans.csv``, ``<name>.scans.csv.gz``
+    rows t, r0, r1, ... in seconds and metres, perhaps with a running number before t.
 """
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import covariance_of, numbers, read_json, write_json
-from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import BoolArray, FloatArray
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.files import covariance_entry, numbers, read_json, write_json
+from redetect.storage.bounded import read_plain_array
+from redetect.storage.messages import excerpt, one_line
 
 MOST_READINGS = 4096
 MOST_SCANNERS = 256
@@ -55,10 +66,6 @@ class Scanner:
         place = f"scanner {excerpt(self.name)}"
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", self.name):
             raise GroundTruthError(f"{place}: expected a name of letters, digits, '-', '_', '.'")
-        if self.pose.shape != (3,) or self.covariance.shape != (3, 3):
-            raise GroundTruthError(f"{place}: expected a pose of 3 numbers and a 3x3 covariance")
-        if not (np.isfinite(self.pose).all() and np.isfinite(self.covariance).all()):
-            raise GroundTruthError(f"{place}: its pose has a number that is not finite")
         if not 1 <= self.readings <= MOST_READINGS:
             raise GroundTruthError(
                 f"{place}: {self.readings} readings: expected 1 to {MOST_READINGS}"
@@ -81,7 +88,7 @@ class Scanner:
         """(readings,) directions of the beams in the scanner's frame."""
         return np.asarray(self.first_angle_rad + self.angle_step_rad * np.arange(self.readings))
 
-    def has_return(self, ranges_mm: ArrayLike) -> NDArray[np.bool_]:
+    def has_return(self, ranges_mm: ArrayLike) -> BoolArray:
         """Which of (..., readings) readings in millimetres hit something within range."""
         ranges = np.asarray(ranges_mm)
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
@@ -109,12 +116,10 @@ class Robot:
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
     def __post_init__(self) -> None:
-        if self.outline.ndim != 2 or self.outline.shape[1:] != (2,) or len(self.outline) < 3:
+        if len(self.outline) < 3:
             raise GroundTruthError(
-                f"outline of shape {self.outline.shape}: expected three or more corners (x, y)"
+                f"outline of {len(self.outline)} corners: expected three or more corners (x, y)"
             )
-        if not np.isfinite(self.outline).all():
-            raise GroundTruthError("outline with a number that is not finite")
         for limit in (self.largest_speed_m_s, self.largest_turn_rad_s):
             if not 0.0 < limit < float("inf"):
                 raise GroundTruthError(f"largest speed or turn {limit!r}: expected above 0")
@@ -165,16 +170,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
 
 def scanner_entry(scanner: Scanner) -> dict[str, Any]:
     """A scanner as files have it."""
-    return {
-        "name": scanner.name,
-        "pose": scanner.pose.tolist(),
-        "covariance": scanner.covariance.tolist(),
-        "first_angle_rad": scanner.first_angle_rad,
-        "angle_step_rad": scanner.angle_step_rad,
-        "readings": scanner.readings,
-        "max_range_m": scanner.max_range_m,
-        "sigma_m": scanner.sigma_m,
-    }
+    values = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
 def _scanners(path: str | os.PathLike[str], content: dict[str, Any]) -> tuple[Scanner, ...]:
@@ -205,21 +202,218 @@ def _scanner(place: str, entry: dict[str, Any]) -> Scanner:
         for key in ("first_angle_rad", "angle_step_rad", "max_range_m", "sigma_m")
     )
     try:
-        covariance = _pose_covariance(place, entry)
+        covariance = covariance_entry(place, entry, 3, "pose_sigma")
         return Scanner(name, pose, covariance, first, step, readings, most, sigma)
     except GroundTruthError as error:
         raise GroundTruthError(f"{place}: {error}") from None
 
 
-def _pose_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
-    """The covariance of an entry, from `covariance` or `pose_sigma`; zeros without both."""
-    if "covariance" in entry and "pose_sigma" in entry:
-        raise GroundTruthError(f"{place}: has covariance and pose_sigma: expected one of them")
-    if "pose_sigma" in entry:
-        sigma = numbers(f"{place}: pose_sigma", entry["pose_sigma"], 3)
-        if np.any(sigma < 0.0):
-            raise GroundTruthError(f"{place}: pose_sigma: expected 0 or more")
-        return np.diag(sigma**2)
-    if "covariance" not in entry:
-        return np.zeros((3, 3))
-    return covariance_of(f"{place}: covariance", entry["covariance"], 3)
+_LARGEST_FILE_BYTES = 1 << 30
+_LONGEST_LINE = 1 << 17
+_FARTHEST_M = 1e3
+_ROW = re.compile(r"[-+0-9.eE,\s]+")
+_ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
+
+
+@dataclass(frozen=True, eq=False)
+class Scans:
+    """Scans of one scanner over time.
+
+    Raises
+    ------
+    GroundTruthError
+        If shapes or types disagree or a time is not finite.
+    """
+
+    # (N,): seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In
+    # some real logs they step back.
+    times_s: FloatArray
+    # (N, readings): readings in millimetres, 0 where nothing came back
+    ranges_mm: NDArray[np.uint16]
+
+    def __post_init__(self) -> None:
+        count = len(self.times_s)
+        if len(self.ranges_mm) != count or not 1 <= self.ranges_mm.shape[1] <= MOST_READINGS:
+            raise GroundTruthError(
+                f"ranges_mm of shape {self.ranges_mm.shape}: expected {count} scans of 1 to "
+                f"{MOST_READINGS} readings"
+            )
+        if not np.isfinite(self.times_s).all():
+            raise GroundTruthError("times_s with a number that is not finite")
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+
+def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
+    """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
+
+    Raises
+    ------
+    GroundTruthError
+        If there is none, or more than one.
+    """
+    found = [path for end in _ENDINGS if (path := Path(folder) / (name + end)).is_file()]
+    if len(found) != 1:
+        what = "no scans" if not found else f"scans in {len(found)} files"
+        raise GroundTruthError(
+            f"{Path(folder)}: {what} of scanner {excerpt(name)}: expected one file "
+            f"{name}{_ENDINGS[0]}, {_ENDINGS[1]} or {_ENDINGS[2]}"
+        )
+    return found[0]
+
+
+def read_scans(
+    path: str | os.PathLike[str], readings: int | None = None, *, ordered: bool = True
+) -> Scans:
+    """Read scans.
+
+    Parameters
+    ----------
+    path : path
+        ``.npz``, or rows of numbers, ``.gz`` or not.
+    readings : int, optional
+        Readings per scan. In rows with one number more, the first is a running number and is left
+        out; without `readings` the first number of a row is the time.
+    ordered : bool
+        Whether times that step back are refused.
+
+    Returns
+    -------
+    Scans
+        Readings rounded to millimetres; those of 65.536 m and more, which these files cannot
+        hold, are taken for none.
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read, holds pickled objects, arrays of other shapes or types than
+        expected, times that step back, or more than a GiB.
+    """
+    scans = _read_npz(path) if Path(path).suffix == ".npz" else _read_rows(path, readings)
+    if readings is not None and scans.ranges_mm.shape[1] != readings:
+        raise GroundTruthError(
+            f"{path}: {scans.ranges_mm.shape[1]} readings per scan: expected {readings}"
+        )
+    back = np.flatnonzero(np.diff(scans.times_s) < 0.0)
+    if ordered and back.size:
+        i = int(back[0])
+        raise GroundTruthError(
+            f"{path}: scan {i + 2} of {len(scans)} is from {scans.times_s[i + 1]:.6f} s, the one "
+            f"before it from {scans.times_s[i]:.6f} s: expected times in order"
+        )
+    return scans
+
+
+def _read_npz(path: str | os.PathLike[str]) -> Scans:
+    """Read the two arrays, checking sizes that the file claims and without unpickling."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
+            ranges = _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
+    except GroundTruthError:
+        raise
+    except FileNotFoundError:
+        raise GroundTruthError(f"{path}: no such file") from None
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+    # Errors of damaged archives: names that are no UTF-8, offsets beyond any file, ...
+    except (
+        zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
+        struct.error,
+    ) as error:  # fmt: skip
+        said = one_line(str(error), 200)
+        raise GroundTruthError(f"{path}: is no .npz that can be read: {said}") from None
+    try:
+        return Scans(times, ranges)
+    except GroundTruthError as error:
+        raise GroundTruthError(f"{path}: {error}") from None
+
+
+def _member(
+    path: str | os.PathLike[str],
+    archive: zipfile.ZipFile,
+    name: str,
+    dtype: np.dtype[Any],
+    dimensions: int,
+) -> NDArray[Any]:
+    place = f"{path}: {name}"
+    try:
+        info = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        raise GroundTruthError(f"{place}: no such array: expected times_s and ranges_mm") from None
+    if info.file_size > _LARGEST_FILE_BYTES:
+        raise GroundTruthError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
+    try:
+        with archive.open(info) as stream:
+            return read_plain_array(cast(BinaryIO, stream), dtype, dimensions, info.file_size)
+    except (ValueError, zlib.error) as error:
+        raise GroundTruthError(f"{place}: {error}") from None
+
+
+def _read_rows(path: str | os.PathLike[str], readings: int | None) -> Scans:
+    times: list[float] = []
+    rows: list[NDArray[np.uint16]] = []
+    columns: int | None = None
+    for number, line in _lines(path):
+        words = line.split(",") if "," in line else line.split()
+        if number == 1 and words[0].strip().lower() in ("t", "t_s", "time"):
+            continue
+        values = _row(path, number, line, words)
+        if readings is not None and len(values) == readings + 2:
+            values = values[1:]
+        if columns is None:
+            columns = len(values) if readings is None else readings + 1
+        if len(values) != columns or columns < 2:
+            wanted = "a time and readings" if columns < 2 else f"{columns}: time and readings"
+            raise StreamError(path, number, f"{len(words)} numbers: expected {wanted}")
+        if np.any(values[1:] < 0.0):
+            raise StreamError(path, number, "a reading below 0: expected metres")
+        millimetres = np.rint(np.minimum(values[1:], _FARTHEST_M) / _MILLIMETRE)
+        times.append(float(values[0]))
+        rows.append(np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16))
+    if not rows:
+        raise StreamError(path, None, "no scans in it")
+    try:
+        return Scans(np.array(times), np.stack(rows))
+    except GroundTruthError as error:
+        raise StreamError(path, None, str(error)) from None
+
+
+def _row(path: str | os.PathLike[str], number: int, line: str, words: list[str]) -> FloatArray:
+    try:
+        values = np.array(words, dtype=np.float64) if _ROW.fullmatch(line) else None
+    except ValueError:
+        values = None
+    if values is None or not np.isfinite(values).all():
+        raise StreamError(path, number, f"{excerpt(line)}: expected finite numbers")
+    return values
+
+
+def _lines(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
+    """Yield numbers and lines, without comments and blank lines; bounded, however well packed."""
+    packed = Path(path).suffix == ".gz"
+    try:
+        with Path(path).open("rb") as file, ExitStack() as stack:
+            stream = stack.enter_context(gzip.GzipFile(fileobj=file)) if packed else file
+            number = total = 0
+            while line := stream.readline(_LONGEST_LINE + 1):
+                number += 1
+                total += len(line)
+                if len(line) > _LONGEST_LINE or total > _LARGEST_FILE_BYTES:
+                    raise StreamError(
+                        path, number,
+                        f"a line of more than {_LONGEST_LINE} bytes, or a file of more than "
+                        f"{_LARGEST_FILE_BYTES}",
+                    )  # fmt: skip
+                content = line.decode("utf-8-sig").partition("#")[0].strip()
+                if content:
+                    yield number, content
+    except FileNotFoundError:
+        raise StreamError(path, None, "no such file") from None
+    except UnicodeDecodeError:
+        raise StreamError(path, None, "is no text: expected rows of numbers") from None
+    except (gzip.BadGzipFile, EOFError, zlib.error):
+        raise StreamError(path, None, "is no complete gzip file") from None
+    except OSError as error:
+        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None

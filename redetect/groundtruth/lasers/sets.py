@@ -10,14 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, read_robot, read_scanners
-from redetect.groundtruth.lasers.scans import Scans, find_scans, read_scans
+from redetect.groundtruth.lasers.scanners import (
+    Robot,
+    Scanner,
+    Scans,
+    find_scans,
+    read_robot,
+    read_scanners,
+    read_scans,
+)
 from redetect.groundtruth.lasers.tracking_kernels import Beams
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 # A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
 # than the nearest object that the beam saw, which is at this quantile of its readings.
@@ -104,20 +108,13 @@ class ScanSets:
 
 def scanner_tables(scanners: Sequence[Scanner], backgrounds: Sequence[Background]) -> ScannerTables:
     """Arrange scanners and their backgrounds for the kernels."""
-    if not scanners or len(scanners) != len(backgrounds):
-        raise GroundTruthError(
-            f"{len(scanners)} scanners, {len(backgrounds)} backgrounds: expected as many, some"
-        )
+    if not scanners:
+        raise GroundTruthError("no scanners: expected some")
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
     beams = np.zeros((len(scanners), width, 2))
     covariance = np.zeros((3 * len(scanners), 3 * len(scanners)))
     for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
-        if background.near_m.shape != (scanner.readings,):
-            raise GroundTruthError(
-                f"scanner {scanner.name}: background of {len(background.near_m)} beams: "
-                f"expected {scanner.readings}"
-            )
         reach = np.minimum(background.near_m, scanner.max_range_m)
         near[i, : scanner.readings] = 1e3 * reach
         angle = scanner.pose[2] + scanner.angles_rad
@@ -168,16 +165,12 @@ def _group(
     order: IntArray, owner: IntArray, times: FloatArray, scanners: int, window_s: float
 ) -> IntArray:
     rows: list[list[int]] = []
-    current = [-1] * scanners
     begun = -np.inf
     for i, scanner, t in zip(order.tolist(), owner[order].tolist(), times[order].tolist()):
-        if rows and current[scanner] < 0 and t - begun <= window_s:
-            current[scanner] = i
-            continue
-        current = [-1] * scanners
-        current[scanner] = i
-        begun = t
-        rows.append(current)
+        if not rows or rows[-1][scanner] >= 0 or t - begun > window_s:
+            rows.append([-1] * scanners)
+            begun = t
+        rows[-1][scanner] = i
     return np.array(rows, dtype=np.int64).reshape(-1, scanners)
 
 
@@ -193,12 +186,10 @@ def load_session(
     """
     scanners = read_scanners(calibration)
     robot = read_robot(folder / "robot.json")
-    backgrounds = []
-    for scanner in scanners:
-        path = find_scans(folder / "empty", scanner.name)
-        backgrounds.append(
-            learn_background(read_scans(path, scanner.readings).ranges_mm, scanner.max_range_m)
-        )
+    empties, scans = (
+        [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
+        for place in (folder / "empty", folder)
+    )
+    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
     tables = scanner_tables(scanners, backgrounds)
-    scans = [read_scans(find_scans(folder, s.name), s.readings) for s in scanners]
     return scanners, robot, tables, sets_of_scans(scans)

@@ -11,22 +11,24 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import Body, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import (
+    Body,
+    LaserSettings,
+    acquire,
+    explain,
+    refine,
+    robot_body,
+)
 from redetect.groundtruth.lasers.icp import fit_outline
-from redetect.groundtruth.lasers.outline import LaserSettings
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose, Seen, new_points
-from redetect.groundtruth.trajectories.plane import compose
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
+from redetect.plane import apply, compose
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
@@ -134,9 +136,8 @@ class Tracker:
                 pose, motion, segment, tracked = fitted, np.zeros(3), segment + 1, True
                 last, before, sure, begun = t, t, t, i
                 self.track.segment[i] = segment
-                self.track.status[i] = (
-                    REACQUIRED if self.track.status[i] == OK else self.track.status[i]
-                )
+                if self.track.status[i] == OK:
+                    self.track.status[i] = REACQUIRED
                 continue
             step = t - before
             before = t
@@ -163,14 +164,12 @@ class Tracker:
         self, i: int, predicted: FloatArray, motion: FloatArray, alone_s: float
     ) -> FloatArray | None:
         """Pose of set i, or None and the reason."""
-        s, body = self.settings, self.body
+        s = self.settings
         seen = self._points(i, predicted, motion, alone_s)
         if len(seen.points) < s.least_readings:
             self.track.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
             return None
-        start, _, count = fit_outline(
-            seen.points, body.faces, predicted, s.gate_m, s.kept, s.threshold_m, s.most_steps
-        )
+        start, count = self._aligned(seen, predicted)
         if count < s.least_readings:
             self.track.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
             return None
@@ -186,7 +185,7 @@ class Tracker:
         if far > 0.1 + 2.0 * self.speed * alone_s:
             self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
             return None
-        beams = self._explain(i, pose)
+        beams = explain(self.sets, i, self.tables, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
             self.track.reasons[i] = (
                 f"{beams.through} beams see through the robot, {beams.agree} see it"
@@ -195,10 +194,16 @@ class Tracker:
         self._store(i, found, beams)
         return pose
 
+    def _aligned(self, seen: Seen, start: FloatArray) -> tuple[FloatArray, int]:
+        """Pose by the trimmed ICP from a start, and how many readings it rests on."""
+        s = self.settings
+        pose, _, count = fit_outline(
+            seen.points, self.body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
+        )
+        return pose, count
+
     def _points(self, i: int, pose: FloatArray, motion: FloatArray, alone_s: float) -> Seen:
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        x, y = self.body.middle
-        centre = np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y])
+        centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
         about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
         return new_points(
@@ -215,9 +220,6 @@ class Tracker:
         self.track.weak[i] = found.weak
         self._evidence = found.information, found.gradient
         return found
-
-    def _explain(self, i: int, pose: FloatArray) -> BeamCounts:
-        return explain(self.sets, i, self.tables, self.body, pose)
 
     def _store(self, i: int, found: OutlinePose, beams: BeamCounts) -> None:
         self.track.poses[i] = found.pose
@@ -253,7 +255,7 @@ class Tracker:
             self.track.reasons[i] = f"{found.used} readings on the outline"
             self.track.status[i], self.track.poses[i] = COASTING, np.nan
             return
-        self._store(i, found, self._explain(i, found.pose))
+        self._store(i, found, explain(self.sets, i, self.tables, self.body, found.pose))
         # Keeps what the whole visit, or its first set, has determined.
         if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
             self.track.status[i] = status
@@ -287,10 +289,7 @@ class Tracker:
             self.track.poses[rows] = compose(self.track.poses[rows], choices[best])
             for i in rows.tolist():
                 seen = self._points(i, self.track.poses[i], np.zeros(3), 0.0)
-                self.track.poses[i] = fit_outline(
-                    seen.points, self.body.faces, self.track.poses[i], self.settings.gate_m,
-                    self.settings.kept, self.settings.threshold_m, self.settings.most_steps,
-                )[0]  # fmt: skip
+                self.track.poses[i], _ = self._aligned(seen, self.track.poses[i])
         return by
 
     def _cost(self, i: int, choice: FloatArray) -> float:
@@ -298,11 +297,9 @@ class Tracker:
         s, body = self.settings, self.body
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
-        start, _, _ = fit_outline(
-            seen.points, body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
-        )
+        start, _ = self._aligned(seen, start)
         found = refine(seen, start, self.tables, body, s, 0.02)
-        _, _, through, hidden, _, beside = self._explain(i, found.pose)
+        _, _, through, hidden, _, beside = explain(self.sets, i, self.tables, self.body, found.pose)
         return float(found.chi2 + s.gate_sigma**2 * (through + hidden + beside))
 
     def _ahead(
@@ -330,8 +327,7 @@ class Tracker:
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
         chi2 = self.track.chi2[good] * freedom
         for i in range(len(good)):
-            first, last = max(0, i - 18), i + 19
-            part = slice(first, last)
+            part = slice(max(0, i - 18), i + 19)
             total = float(freedom[part].sum())
             ratio = float(chi2[part].sum()) / total
             # Within its own scatter a ratio above 1 is none.
@@ -357,10 +353,8 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     last = np.searchsorted(times_s, times_s + _VELOCITY_WINDOW_S, side="right")
     origin = times_s[0] if len(times_s) else 0.0
     t = times_s - origin
-    sums = [
-        np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v, axis=0)])
-        for v in (t[:, None], t[:, None] ** 2, values, values * t[:, None])
-    ]
+    terms = (t[:, None], t[:, None] ** 2, values, values * t[:, None])
+    sums = [np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v, axis=0)]) for v in terms]
     n = (last - first)[:, None].astype(np.float64)
     st, stt, sx, stx = (total[last] - total[first] for total in sums)
     spread = stt - st * st / n

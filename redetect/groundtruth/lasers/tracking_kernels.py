@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.array_types import BoolArray, FloatArray, IntArray
 
 
 class Beams(NamedTuple):
@@ -35,7 +34,7 @@ class Seen(NamedTuple):
     direction: FloatArray  # (n, 2): of the beams
     range_m: FloatArray  # (n,)
 
-    def where(self, chosen: NDArray[np.bool_]) -> Seen:
+    def where(self, chosen: BoolArray) -> Seen:
         """Those chosen."""
         return Seen(
             self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]
@@ -138,6 +137,77 @@ def new_points(
 
 
 @njit(cache=True, error_model="numpy")
+def _face_of(
+    x: float,
+    y: float,
+    bx: float,
+    by: float,
+    range_m: float,
+    faces: FloatArray,
+    normal: FloatArray,
+    gate_m: float,
+) -> int:
+    """The face that a reading at (x, y) belongs to, -1 for none; (bx, by) is its beam's direction.
+
+    Of faces turned to the scanner that which the beam meets first; where its range is not given
+    (below 0), the nearest one within the gate.
+    """
+    best, face = np.inf, -1
+    for k in range(faces.shape[0]):
+        slope = normal[k, 0] * bx + normal[k, 1] * by
+        if slope >= 0.0:
+            continue
+        x1, y1 = faces[k, 0], faces[k, 1]
+        ex, ey = faces[k, 2] - x1, faces[k, 3] - y1
+        length2 = ex * ex + ey * ey
+        if range_m < 0.0:
+            t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
+            d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
+            if d > gate_m:
+                continue
+        else:
+            # From the reading along its beam to the face: the beam's point there.
+            ahead = (normal[k, 0] * (x1 - x) + normal[k, 1] * (y1 - y)) / slope
+            t = ((x + ahead * bx - x1) * ex + (y + ahead * by - y1) * ey) / length2
+            d = range_m + ahead
+            if t < 0.0 or t > 1.0 or d <= 0.0:
+                continue
+        if d < best:
+            best, face = d, k
+    return face
+
+
+@njit(cache=True, error_model="numpy")
+def _hold_open(
+    h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
+) -> tuple[int, FloatArray]:
+    """Add the start as a prior of the directions that the readings leave open, in place.
+
+    `h` (3, 3) and `g` (3,) are the normal equations; directions are evaluated about the `middle`
+    (2,) of the points, theta in metres. Returns how many are open, and the least determined one.
+    """
+    scale = fit.scale_m
+    # Turning about the middle: xi' = (t + theta x middle, theta * scale).
+    back = np.array(
+        [[1.0, 0.0, middle[1] / scale], [0.0, 1.0, -middle[0] / scale], [0.0, 0.0, 1.0 / scale]]
+    )
+    values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
+    there = np.linalg.inv(back)
+    open_count = 0
+    for k in range(3):
+        if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
+            open_count += 1
+            row = np.ascontiguousarray(vectors[:, k]) @ there
+            p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
+            ahead = row @ to_start
+            for a in range(3):
+                g[a] -= p * row[a] * ahead
+                for b in range(3):
+                    h[a, b] += p * row[a] * row[b]
+    return open_count, vectors[:, 0].copy()
+
+
+@njit(cache=True, error_model="numpy")
 def refine_outline(
     seen: Seen,
     faces: FloatArray,
@@ -181,32 +251,11 @@ def refine_outline(
         for i in range(points.shape[0]):
             dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
             x, y = c * dx + s * dy, -s * dx + c * dy
-            bx, by = (
-                c * direction[i, 0] + s * direction[i, 1],
-                (-s * direction[i, 0] + c * direction[i, 1]),
-            )
-            best, face = np.inf, -1
-            for k in range(faces.shape[0]):
-                slope = normal[k, 0] * bx + normal[k, 1] * by
-                if slope >= 0.0:
-                    continue
-                x1, y1 = faces[k, 0], faces[k, 1]
-                ex, ey = faces[k, 2] - x1, faces[k, 3] - y1
-                length2 = ex * ex + ey * ey
-                if step == 0:
-                    t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
-                    d = math.sqrt((x - x1 - t * ex) ** 2 + (y - y1 - t * ey) ** 2)
-                    if d > fit.gate_m:
-                        continue
-                else:
-                    # From the reading along its beam to the face: the beam's point there.
-                    ahead = (normal[k, 0] * (x1 - x) + normal[k, 1] * (y1 - y)) / slope
-                    t = ((x + ahead * bx - x1) * ex + (y + ahead * by - y1) * ey) / length2
-                    d = range_m[i] + ahead
-                    if t < 0.0 or t > 1.0 or d <= 0.0:
-                        continue
-                if d < best:
-                    best, face = d, k
+            bx = c * direction[i, 0] + s * direction[i, 1]
+            by = -s * direction[i, 0] + c * direction[i, 1]
+            # While the pose may be off, the nearest face.
+            reach = -1.0 if step == 0 else range_m[i]
+            face = _face_of(x, y, bx, by, reach, faces, normal, fit.gate_m)
             if face < 0:
                 continue
             nx, ny = normal[face, 0], normal[face, 1]
@@ -237,28 +286,9 @@ def refine_outline(
         if used < 3:
             break
         rms = math.sqrt(squares / used)
-        # Undetermined directions are evaluated about the middle of the points, theta in metres.
-        mx, my = sx / used, sy / used
-        scale = fit.scale_m
-        # Turning about the middle: xi' = (t + theta x middle, theta * scale).
-        back = np.array([[1.0, 0.0, my / scale], [0.0, 1.0, -mx / scale], [0.0, 0.0, 1.0 / scale]])
-        values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
-        there = np.linalg.inv(back)
-        open_count = 0
         dx, dy = start[0] - pose[0], start[1] - pose[1]
-        turn = start[2] - pose[2]
-        to_start = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
-        for k in range(3):
-            if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
-                open_count += 1
-                row = np.ascontiguousarray(vectors[:, k]) @ there
-                p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
-                ahead = row @ to_start
-                for a in range(3):
-                    g[a] -= p * row[a] * ahead
-                    for b in range(3):
-                        h[a, b] += p * row[a] * row[b]
-        v = vectors[:, 0]
+        to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
+        open_count, v = _hold_open(h, g, np.array([sx / used, sy / used]), to_start, fit)
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance[:, :] = np.linalg.inv(h)
         delta = -local_covariance @ g

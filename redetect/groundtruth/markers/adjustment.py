@@ -1,49 +1,145 @@
 """All poses of a chain at once: bundle adjustment of cameras, bodies and parts.
 
+    point in the part's frame --body_from_part--> body --world_from_body--> world
+          --inverse of world_from_camera--> camera --projection--> pixel
+
+Every estimation here is of this form. A robot's pose: the body is the robot, its parts are the
+markers. A rig: the same with the parts unknown. A network of cameras: bodies are the boards held
+before the cameras, their parts the two faces.
+
 The unknowns are poses, not points: a marker's four corners and a board's are rigid and of known
 size, which gives the result its scale. Bundle adjusters for reconstruction (as pycolmap's) move
 each point independently and cannot keep a square rigid.
-
-No two bodies (times at which something was seen) share a residual, so that the normal equations are
-sparse, and bodies are eliminated by 6x6 blocks from the covariance of cameras and parts (Triggs et
-al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array, diags_array
 
 from camera import Camera
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.chain import (
-    ChainPoints,
-    project_chain,
-    project_chain_with_jacobians,
+from redetect.groundtruth.trajectories.transforms import (
+    apply,
+    exp_se3,
+    hat,
+    inverse,
+    log_se3,
+    right_jacobian,
 )
-from redetect.groundtruth.markers.least_squares import (
-    UNDETERMINED,
-    Linearised,
-    inverted_information,
-    minimised,
-    solved,
+from redetect.landmarks import squared_mahalanobis
+from redetect.least_squares.solver import (
+    Block,
+    Linear,
+    Loss,
+    StartError,
+    factor,
+    minimise,
+    normal_equations,
+    robust_cost,
+    stack,
+    whitening,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, right_jacobian
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+UNDETERMINED = "the points do not determine all poses"
+
+
+@dataclass(frozen=True, eq=False)
+class ChainPoints:
+    """Points seen in images."""
+
+    # `camera`, `body`, `part`: (N,): which camera, body and part each point belongs to
+    camera: IntArray
+    body: IntArray
+    part: IntArray
+    points: FloatArray  # (N, 3): in the part's frame (m)
+    pixels: FloatArray  # (N, 2): where they were seen, lens distortion included (px)
+    covariances: FloatArray  # (N, 2, 2): of the pixels (px^2), positive definite
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+    def only(self, chosen: BoolArray | IntArray) -> ChainPoints:
+        """The chosen ones."""
+        return ChainPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class ChainProjection:
+    """Pixels of points and how they move with right perturbations of the three poses."""
+
+    # (N, 2): naN where a point is not in front of its camera or past the distortion's fold
+    pixels: FloatArray
+    # `by_camera`, `by_body`, `by_part`: (N, 2, 6): d(u, v) / d(translation m, rotation rad)
+    by_camera: FloatArray
+    by_body: FloatArray
+    by_part: FloatArray
+
+
+def project_chain(
+    cameras: Sequence[Camera],
+    world_from_camera: FloatArray,
+    world_from_body: FloatArray,
+    body_from_part: FloatArray,
+    seen: ChainPoints,
+) -> FloatArray:
+    """(N, 2) pixels at which the points would be seen (see `ChainProjection.pixels`).
+
+    `cameras`: their lenses; the mounting that a `Camera` holds is not used. `world_from_camera`,
+    `world_from_body`, `body_from_part` (C | B | P, 4, 4). `seen`: its pixels are not used.
+    """
+    in_body = apply(body_from_part[seen.part], seen.points)
+    in_world = apply(world_from_body[seen.body], in_body)
+    in_camera = apply(inverse(world_from_camera)[seen.camera], in_world)
+    pixels = np.empty((len(seen), 2))
+    for index in np.unique(seen.camera):
+        chosen = seen.camera == index
+        pixels[chosen] = cameras[index].project(in_camera[chosen])
+    return pixels
+
+
+def project_chain_with_jacobians(
+    cameras: Sequence[Camera],
+    world_from_camera: FloatArray,
+    world_from_body: FloatArray,
+    body_from_part: FloatArray,
+    seen: ChainPoints,
+) -> ChainProjection:
+    """Pixels and Jacobians; parameters as in `project_chain`."""
+    camera_from_world = inverse(world_from_camera)[seen.camera]
+    camera_from_body = camera_from_world @ world_from_body[seen.body]
+    in_body = apply(body_from_part[seen.part], seen.points)
+    in_camera = apply(camera_from_body, in_body)
+    pixels = np.empty((len(seen), 2))
+    by_point = np.empty((len(seen), 2, 3))
+    for index in np.unique(seen.camera):
+        chosen = seen.camera == index
+        pixels[chosen] = cameras[index].project(in_camera[chosen])
+        by_point[chosen] = cameras[index].project_jacobian(in_camera[chosen])
+    by_body_point = by_point @ camera_from_body[:, :3, :3]
+    by_part_point = by_body_point @ body_from_part[seen.part][:, :3, :3]
+    return ChainProjection(
+        pixels,
+        -_by_tangent(by_point, in_camera),
+        _by_tangent(by_body_point, in_body),
+        _by_tangent(by_part_point, seen.points),
+    )
+
+
+def _by_tangent(by_point: FloatArray, points: FloatArray) -> FloatArray:
+    """Chain d(u, v) / d(point) with d(point) / d(v, w) = [I, -[point]x]."""
+    return np.concatenate([by_point, -(by_point @ hat(points))], axis=-1)
+
+
 PoseKind = Literal["camera", "body", "part"]
 
-# Of whitened residuals: where the robust loss of the first pass begins to flatten.
-_ROBUST_SCALE = 3.0
-# Steps (m, rad) that are as good as none; the robust pass only has to come near.
-_STEP_TOLERANCE = 1e-10
-_ROBUST_STEP_TOLERANCE = 1e-6
+# Of the first pass, which only has to come near: points farther off than this pull less.
+_PLAIN, _ROBUST, _NEAR = Loss(), Loss("huber", 3.0), 1e-6
+_TOLERANCE = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +252,7 @@ def adjust_bundle(
         If the start has a point behind its camera, or the points do not determine the poses.
     """
     everything = np.ones(len(bundle.seen), dtype=np.bool_)
-    bundle = _minimised(bundle, everything, robust=True)
+    bundle = _minimised(bundle, everything, _ROBUST, _NEAR)
     used = everything
     for _ in range(5):
         errors, rms = _view_figures(bundle)
@@ -168,23 +264,15 @@ def adjust_bundle(
         # A body of which nothing is left to be used stays where it is.
         seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body[used])
         bundle = replace(bundle, free_body=bundle.free_body & seen)
-        bundle = _minimised(bundle, used, robust=False)
+        bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)
     return _result(bundle, used)
 
 
-def whitened_residuals(bundle: Bundle) -> FloatArray:
-    """(2 N + 6 priors,) residuals of variance 1; NaN where a point cannot be seen."""
-    difference = bundle.seen.pixels - bundle.pixels()
-    return np.concatenate(
-        [
-            (whitening(bundle.seen.covariances) @ difference[..., None]).ravel(),
-            *(whitening(prior.covariance) @ bundle.prior_error(prior) for prior in bundle.priors),
-        ]
-    )
+def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
+    """The problem near a bundle's poses; the unknowns are right perturbations, ordered as `free`.
 
-
-def whitened_jacobian(bundle: Bundle) -> Any:
-    """Sparse (2 N + 6 priors, unknowns) derivatives of the residuals, in the order of `free`."""
+    Residuals are in standard deviations: those of the points, then those of the priors.
+    """
     seen, free = bundle.seen, bundle.free
     projection = project_chain_with_jacobians(
         bundle.cameras,
@@ -193,115 +281,117 @@ def whitened_jacobian(bundle: Bundle) -> Any:
         bundle.body_from_part,
         seen,
     )
-    white = -whitening(seen.covariances)
     cameras, parts = len(bundle.free_camera), len(bundle.free_part)
     begin = {"camera": 0, "part": cameras, "body": cameras + parts}
-    first_row = np.arange(0, 2 * len(seen), 2)
-    blocks = [
-        (white @ projection.by_camera, first_row, seen.camera),
-        (white @ projection.by_part, first_row, begin["part"] + seen.part),
-        (white @ projection.by_body, first_row, begin["body"] + seen.body),
+    unknown = np.where(free, 6 * (np.cumsum(free) - 1), -1)
+    white = whitening(seen.covariances)
+    derivatives = [
+        (unknown[seen.camera], -white @ projection.by_camera),
+        (unknown[begin["part"] + seen.part], -white @ projection.by_part),
+        (unknown[begin["body"] + seen.body], -white @ projection.by_body),
     ]
-    for number, prior in enumerate(bundle.priors):
-        block = np.linalg.inv(right_jacobian(bundle.prior_error(prior)))
-        row = np.array([2 * len(seen) + 6 * number])
-        pose = np.array([begin[prior.kind] + prior.index])
-        blocks.append(((whitening(prior.covariance) @ block)[None], row, pose))
-    number_of = np.cumsum(free) - 1
-    entries = []
-    for values, row, pose in blocks:
-        kept = free[pose]
-        rows = row[kept, None, None] + np.arange(values.shape[1])[:, None]
-        columns = 6 * number_of[pose[kept], None, None] + np.arange(6)
-        entries.append([part.ravel() for part in np.broadcast_arrays(values[kept], rows, columns)])
-    values, rows, columns = (np.concatenate(part) for part in zip(*entries))
-    shape = (2 * len(seen) + 6 * len(bundle.priors), bundle.unknowns)
-    return coo_array((values, (rows.astype(int), columns.astype(int))), shape).tocsr()
+    residuals = (white @ (seen.pixels - projection.pixels)[..., None])[..., 0]
+    blocks = [Block(residuals, derivatives, loss=loss)]
+    for prior in bundle.priors:
+        error, root = bundle.prior_error(prior), whitening(prior.covariance)
+        by_pose = root @ np.linalg.inv(right_jacobian(error))
+        pose = begin[prior.kind] + prior.index
+        blocks.append(Block((root @ error)[None], [(unknown[pose : pose + 1], by_pose[None])]))
+    return stack(blocks, bundle.unknowns, 0)
 
 
-def whitening(covariances: FloatArray) -> FloatArray:
-    """(..., d, d) inverse Cholesky factors."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+class _Adjustment(NamedTuple):
+    """The sum of squares of a bundle as `redetect.least_squares.solver.minimise` takes it."""
+
+    loss: Loss
+
+    def cost(self, at: Bundle) -> float:
+        residuals = whitening(at.seen.covariances) @ (at.seen.pixels - at.pixels())[..., None]
+        priors = [whitening(p.covariance) @ at.prior_error(p) for p in at.priors]
+        return robust_cost(
+            [(residuals[..., 0], self.loss), *((prior[None], _PLAIN) for prior in priors)]
+        )
+
+    def linear(self, at: Bundle) -> Linear:
+        return linearised(at, self.loss)
+
+    def moved(self, at: Bundle, step: FloatArray, _: FloatArray) -> Bundle:
+        return at.moved(step)
 
 
-def _minimised(bundle: Bundle, used: BoolArray, *, robust: bool) -> Bundle:
+def _minimised(bundle: Bundle, used: BoolArray, loss: Loss, tolerance: float) -> Bundle:
     """The bundle at the minimum of the used points' cost."""
     if bundle.unknowns == 0:
         return bundle
     part = bundle.only(used)
-    residuals = whitened_residuals(part)
-    if not np.all(np.isfinite(residuals)):
-        raise GeometryError("the start has a point behind its camera or outside its lens")
-    if len(residuals) < bundle.unknowns:
+    residuals = 2 * len(part.seen) + 6 * len(part.priors)
+    if residuals < bundle.unknowns:
         raise GeometryError(
-            f"{len(residuals)} residuals for {bundle.unknowns} unknowns: too little was seen"
+            f"{residuals} residuals for {bundle.unknowns} unknowns: too little was seen"
         )
-
-    def cost_at(bundle: Bundle) -> float:
-        return _cost(whitened_residuals(bundle), robust)
-
-    def linearise(bundle: Bundle) -> Linearised[Bundle]:
-        residuals, jacobian = whitened_residuals(bundle), whitened_jacobian(bundle)
-        # Soft l1 if robust, with its curvature (Triggs, section 4.3).
-        squares = np.square(residuals / _ROBUST_SCALE) if robust else np.zeros_like(residuals)
-        normal = jacobian.T @ (diags_array((1.0 + squares) ** -1.5) @ jacobian)
-        gradient = jacobian.T @ ((1.0 + squares) ** -0.5 * residuals)
-        return Linearised(_cost(residuals, robust), gradient, normal, cost_at)
-
-    tolerance = _ROBUST_STEP_TOLERANCE if robust else _STEP_TOLERANCE
-    part = minimised(part, linearise, Bundle.moved, tolerance)
+    try:
+        part = minimise(_Adjustment(loss), part, tolerance=tolerance).at
+    except StartError:
+        raise GeometryError("the start has a point behind its camera or outside its lens") from None
+    except np.linalg.LinAlgError:
+        raise GeometryError(UNDETERMINED) from None
     return replace(part, seen=bundle.seen, view=bundle.view)
-
-
-def _cost(residuals: FloatArray, robust: bool) -> float:
-    """Half the sum of the losses; infinite where a point cannot be seen."""
-    if not np.all(np.isfinite(residuals)):
-        return np.inf
-    if not robust:
-        return 0.5 * float(residuals @ residuals)
-    squares = np.square(residuals / _ROBUST_SCALE)
-    return _ROBUST_SCALE**2 * float(np.sum(np.sqrt(1.0 + squares) - 1.0))
 
 
 def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
     """Each view's normalised error, and its root mean square residual in pixels."""
     difference = bundle.seen.pixels - bundle.pixels()
-    white = (whitening(bundle.seen.covariances) @ difference[..., None])[..., 0]
     count = 2 * np.maximum(np.bincount(bundle.view), 1)
-    errors = np.sqrt(np.bincount(bundle.view, np.sum(white**2, axis=1)) / count)
+    squares = squared_mahalanobis(difference, bundle.seen.covariances)
+    errors = np.sqrt(np.bincount(bundle.view, squares) / count)
     rms = np.sqrt(np.bincount(bundle.view, np.sum(difference**2, axis=1)) / count)
     return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(rms, nan=np.inf)
 
 
 def _result(bundle: Bundle, used: BoolArray) -> AdjustedBundle:
-    part = bundle.only(used)
-    residuals = whitened_residuals(part)
+    problem = linearised(bundle.only(used))
     shared = len(bundle.free_camera) + len(bundle.free_part)
-    free = bundle.free[:shared]
+    at = np.flatnonzero(np.repeat(bundle.free[:shared], 6))
     covariance = np.zeros((6 * shared, 6 * shared))
-    at = np.flatnonzero(np.repeat(free, 6))
-    covariance[np.ix_(at, at)] = inverted_information(_shared_information(part, len(at)))
+    covariance[np.ix_(at, at)] = inverted_information(_shared_information(problem, len(at)))
     cameras = 6 * len(bundle.free_camera)
     return AdjustedBundle(
         bundle,
         used,
         bundle.seen.pixels - bundle.pixels(),
-        float(residuals @ residuals),
-        len(residuals) - bundle.unknowns,
+        float(problem.residual @ problem.residual),
+        len(problem.residual) - bundle.unknowns,
         covariance[:cameras, :cameras],
         covariance[cameras:, cameras:],
     )
 
 
-def _shared_information(bundle: Bundle, shared: int) -> FloatArray:
-    """Inverse covariance of the first unknowns, those of cameras and parts; bodies marginalised."""
-    jacobian = whitened_jacobian(bundle)
-    normal = (jacobian.T @ jacobian).tocsr()
-    coupling = normal[shared:, :shared].toarray()
-    information = normal[:shared, :shared].toarray()
+def _shared_information(problem: Linear, shared: int) -> FloatArray:
+    """Inverse covariance of the first unknowns, those of cameras and parts; bodies marginalised.
+
+    No two bodies share a residual, so that their part of the normal equations is sparse (Triggs et
+    al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
+    """
+    normal = normal_equations(problem).matrix
+    information, coupling = normal[:shared, :shared].toarray(), normal[shared:, :shared].toarray()
     if not len(coupling):
         return np.asarray(information)
     try:
-        return np.asarray(information - coupling.T @ solved(normal[shared:, shared:], coupling))
+        bodies = factor(normal[shared:, shared:].tocsc())
     except np.linalg.LinAlgError:
         raise GeometryError(UNDETERMINED) from None
+    return np.asarray(information - coupling.T @ bodies.solve(coupling))
+
+
+def inverted_information(information: FloatArray) -> FloatArray:
+    """Covariance of an information matrix."""
+    if not len(information):
+        return information
+    scale = np.sqrt(np.clip(np.diagonal(information), 0.0, None))
+    if not np.all(scale > 0.0):
+        raise GeometryError(UNDETERMINED)
+    normalised = information / scale[:, None] / scale[None, :]
+    if np.linalg.eigvalsh(normalised)[0] < 1e-12:
+        raise GeometryError(UNDETERMINED)
+    covariance = np.linalg.inv(normalised) / scale[:, None] / scale[None, :]
+    return np.asarray(0.5 * (covariance + covariance.T))

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,12 @@ from camera.boards.board import Board
 from camera.boards.points import find_board
 from camera.calibration.images import grey_of_content
 from camera.errors import CalibrationError
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.files import numbers, read_json
-from redetect.groundtruth.markers.calibration import parse_covariance, parse_pose
+from redetect.groundtruth.files import covariance_entry, is_number, numbers, read_json
+from redetect.groundtruth.markers.calibration import parse_pose
 from redetect.storage.bounded import claimed_size, path_inside, read_bounded
 from redetect.storage.messages import excerpt, one_line
-
-FloatArray = NDArray[np.float64]
-
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
 #: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
@@ -183,7 +181,7 @@ def read_boards(path: Path) -> BoardsFile:
             FIRST,
             SECOND,
             None if entry is None else parse_pose(place, entry),
-            np.zeros((6, 6)) if entry is None else parse_covariance(place, entry),
+            np.zeros((6, 6)) if entry is None else covariance_entry(place, entry, 6),
         )
     rows = content.get("images")
     if not isinstance(rows, list) or not rows:
@@ -219,17 +217,15 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     except OSError as error:
         raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
     size = claimed_size(content)
-    # Larger claims are not decoded: memory is allocated for the expected size only.
-    if size is not None and size != (camera.width, camera.height):
-        raise _other_size(image.image, size, camera)
     if size is None:
         raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")
+    # Larger claims are not decoded: memory is allocated for the expected size only.
+    _demand_size(image.image, size, camera)
     try:
         grey = grey_of_content(content, image.image)
     except CalibrationError as error:
         raise GroundTruthError(str(error)) from None
-    if grey.shape != (camera.height, camera.width):
-        raise _other_size(image.image, (grey.shape[1], grey.shape[0]), camera)
+    _demand_size(image.image, (grey.shape[1], grey.shape[0]), camera)
     try:
         corners = find_checkerboard(grey, board)
     except GeometryError as error:
@@ -237,11 +233,12 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
     return BoardView(image.camera, image.board, corners)
 
 
-def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> GroundTruthError:
-    return GroundTruthError(
-        f"{path}: is {size[0]}x{size[1]} px: expected {camera.width}x{camera.height}, the "
-        "calibration's size"
-    )
+def _demand_size(path: Path, size: tuple[int, int], camera: Camera) -> None:
+    if size != (camera.width, camera.height):
+        raise GroundTruthError(
+            f"{path}: is {size[0]}x{size[1]} px: expected {camera.width}x{camera.height}, the "
+            "calibration's size"
+        )
 
 
 def _inside(place: str, folder: Path, name: str) -> Path:
@@ -257,15 +254,19 @@ def _objects(place: str, value: Any) -> dict[str, Any]:
     return value
 
 
+def _is_whole(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
 def _board(place: str, entry: Any) -> Checkerboard:
-    numbers = [entry.get(key) if isinstance(entry, dict) else None for key in ("columns", "rows")]
-    square = entry.get("square_m") if isinstance(entry, dict) else None
-    if any(not isinstance(n, int) or isinstance(n, bool) for n in numbers) or (
-        not isinstance(square, int | float) or isinstance(square, bool)
-    ):
+    columns, rows, square = (
+        entry.get(key) if isinstance(entry, dict) else None
+        for key in ("columns", "rows", "square_m")
+    )
+    if not (_is_whole(columns) and _is_whole(rows) and is_number(square)):
         raise GroundTruthError(f"{place}: expected whole columns and rows, and square_m")
     try:
-        return Checkerboard(int(numbers[0] or 0), int(numbers[1] or 0), float(square))
+        return Checkerboard(columns, rows, float(square))
     except GroundTruthError as error:
         raise GroundTruthError(f"{place}: {error}") from None
 
@@ -279,7 +280,7 @@ def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) 
         raise GroundTruthError(
             f"{place}: board is {excerpt(board)}: expected one of {sorted(boards)}"
         )
-    if not isinstance(placement, int) or isinstance(placement, bool):
+    if not _is_whole(placement):
         raise GroundTruthError(
             f"{place}: placement is {excerpt(placement)}: expected a whole number"
         )

@@ -13,15 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import covariance_of, is_number, numbers, read_json, write_json
+from redetect.groundtruth.files import (
+    covariance_entry,
+    covariance_of,
+    is_number,
+    numbers,
+    read_json,
+    write_json,
+)
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.storage.messages import excerpt, one_line
-
-FloatArray = NDArray[np.float64]
 
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -98,7 +103,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
                 f"{path}: marker {marker}: width_m is {excerpt(width)}: expected metres above 0"
             )
         widths.append(float(width))
-    poses = np.stack([_pose(f"{path}: marker {m}", by_id[m]) for m in ids])
+    poses = np.stack([parse_pose(f"{path}: marker {m}", by_id[m]) for m in ids])
     names = [str(marker) for marker in ids]
     covariance = _joint_covariance(
         str(path), content, "markers", names, [by_id[marker] for marker in ids]
@@ -132,11 +137,8 @@ def read_network(path: str | os.PathLike[str]) -> Network:
                 "expected a file"
             )
         # It may well lie beside the network's folder; but only a calibration is ever opened.
-        if (
-            Path(calibration).is_absolute()
-            or not calibration.endswith(".cam")
-            or "\0" in calibration
-        ):
+        relative = not Path(calibration).is_absolute() and "\0" not in calibration
+        if not relative or not calibration.endswith(".cam"):
             raise GroundTruthError(
                 f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} "
                 "is no .cam file by a relative path: expected one"
@@ -147,7 +149,9 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         names,
         tuple(read_camera(place) for place in paths),
         tuple(calibrations),
-        np.stack([_pose(f"{path}: camera {one_line(name, 60)}", cameras[name]) for name in names]),
+        np.stack(
+            [parse_pose(f"{path}: camera {one_line(name, 60)}", cameras[name]) for name in names]
+        ),
         _joint_covariance(
             str(path), content, "cameras", list(names), [cameras[name] for name in names]
         ),
@@ -166,13 +170,9 @@ def write_rig(
         str(marker): {"width_m": float(width), **_pose_entries(pose)}
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
     }
-    content: dict[str, Any] = {"dictionary": rig.dictionary, "markers": entries}
-    if np.any(rig.covariance):
-        content["covariance"] = {
-            "markers": [str(marker) for marker in rig.ids],
-            "matrix": rig.covariance.tolist(),
-        }
-    write_json(path, {**content, **(extra or {})}, overwrite=overwrite)
+    head = {"dictionary": rig.dictionary}
+    content = {**head, **_with_covariance("markers", entries, rig.covariance), **(extra or {})}
+    write_json(path, content, overwrite=overwrite)
 
 
 def write_network(
@@ -189,13 +189,16 @@ def write_network(
             network.names, network.calibrations, network.world_from_camera
         )
     }
-    content: dict[str, Any] = {"cameras": entries}
-    if np.any(network.covariance):
-        content["covariance"] = {
-            "cameras": list(network.names),
-            "matrix": network.covariance.tolist(),
-        }
-    write_json(path, {**content, **(extra or {})}, overwrite=overwrite)
+    content = {**_with_covariance("cameras", entries, network.covariance), **(extra or {})}
+    write_json(path, content, overwrite=overwrite)
+
+
+def _with_covariance(key: str, entries: dict[str, Any], covariance: FloatArray) -> dict[str, Any]:
+    """Entries, and their joint covariance if there is one."""
+    content: dict[str, Any] = {key: entries}
+    if np.any(covariance):
+        content["covariance"] = {key: list(entries), "matrix": covariance.tolist()}
+    return content
 
 
 def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
@@ -217,7 +220,10 @@ def _entries(
     return entries
 
 
-def _pose(place: str, entry: dict[str, Any]) -> FloatArray:
+def parse_pose(place: str, entry: Any) -> FloatArray:
+    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw."""
+    if not isinstance(entry, dict):
+        raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
     translation = numbers(f"{place}: translation_m", entry.get("translation_m"), 3)
     quaternion = numbers(f"{place}: quaternion_xyzw", entry.get("quaternion_xyzw"), 4)
     length = float(np.linalg.norm(quaternion))
@@ -226,32 +232,6 @@ def _pose(place: str, entry: dict[str, Any]) -> FloatArray:
             f"{place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
     return transform_from_quaternion(quaternion / length, translation)
-
-
-def parse_pose(place: str, entry: Any) -> FloatArray:
-    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw."""
-    if not isinstance(entry, dict):
-        raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
-    return _pose(place, entry)
-
-
-def parse_covariance(place: str, entry: dict[str, Any]) -> FloatArray:
-    """(6, 6) covariance of a JSON object with ``covariance`` or ``sigmas``; zeros without both.
-
-    ``covariance`` is a 6x6 matrix of the right perturbation (translation m, rotation rad);
-    ``sigmas`` six standard deviations in the same order.
-    """
-    matrix, sigmas = entry.get("covariance"), entry.get("sigmas")
-    if matrix is not None and sigmas is not None:
-        raise GroundTruthError(f"{place}: has covariance and sigmas: expected one of them")
-    if sigmas is not None:
-        values = numbers(f"{place}: sigmas", sigmas, 6)
-        if np.any(values < 0.0):
-            raise GroundTruthError(f"{place}: sigmas: expected 0 or more")
-        return np.diag(values**2)
-    if matrix is not None:
-        return covariance_of(f"{place}: covariance", matrix, 6)
-    return np.zeros((6, 6))
 
 
 def _joint_covariance(
@@ -264,9 +244,8 @@ def _joint_covariance(
         covariance = np.zeros((size, size))
         for i, (name, entry) in enumerate(zip(names, entries)):
             block = slice(6 * i, 6 * i + 6)
-            covariance[block, block] = parse_covariance(
-                f"{path}: {single} {one_line(name, 60)}", entry
-            )
+            place = f"{path}: {single} {one_line(name, 60)}"
+            covariance[block, block] = covariance_entry(place, entry, 6)
         return covariance
     if any("covariance" in entry or "sigmas" in entry for entry in entries):
         raise GroundTruthError(

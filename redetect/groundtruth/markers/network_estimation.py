@@ -6,22 +6,25 @@ sees one face of the double board while another sees the other face. Then all is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.adjustment import (
+    AdjustedBundle,
+    Bundle,
+    ChainPoints,
+    PosePrior,
+    adjust_bundle,
+)
 from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
-from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.pnp import solve_camera
+from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.markers.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +66,9 @@ def estimate_network(
     names = tuple(sorted(cameras))
     seen = [[(view, _camera_from_board(view, cameras, boards)) for view in shot] for shot in shots]
     offset = None
+    parts = dict(world_from_board)
     if double is not None:
         offset = double.offset if double.offset is not None else _estimated_offset(seen, double)
-    parts = dict(world_from_board)
-    if double is not None and offset is not None:
         parts[double.first], parts[double.second] = np.eye(4), offset
     poses, bodies = _chained(names, seen, world_from_board, parts)
     bundle, views = _bundle(
@@ -78,7 +80,7 @@ def estimate_network(
         )
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
-    if double is not None and offset is not None:
+    if double is not None:
         offset = adjusted.bundle.body_from_part[sorted(parts).index(double.second)]
     return NetworkEstimate(
         names,
@@ -151,7 +153,6 @@ def _chained(
     parts: Mapping[str, FloatArray],
 ) -> tuple[dict[str, FloatArray], dict[int, FloatArray]]:
     """Cameras, and the double board of each shot, in the world; from camera to camera."""
-    cameras: dict[str, FloatArray] = {}
     bodies: dict[int, FloatArray] = {}
     fixed: dict[str, list[FloatArray]] = {}
     for shot in seen:
@@ -160,7 +161,7 @@ def _chained(
                 fixed.setdefault(view.camera, []).append(
                     world_from_board[view.board] @ inverse(pose)
                 )
-    cameras.update({name: _most_central(poses) for name, poses in fixed.items()})
+    cameras = {name: _most_central(poses) for name, poses in fixed.items()}
     while True:
         reached: dict[str, list[FloatArray]] = {}
         for number, shot in enumerate(seen):
@@ -213,29 +214,29 @@ def _bundle(
     names, (poses, bodies) = sorted(cameras), placed
     order = sorted(parts)
     body_index = {number: 1 + i for i, number in enumerate(sorted(bodies))}
-    views: list[BoardView] = []
-    rows: list[tuple[int, int, int, int]] = []
-    for number, shot in enumerate(seen):
-        for view, _ in shot:
-            body = 0 if view.board in world_from_board else body_index[number]
-            rows.append(
-                (names.index(view.camera), body, order.index(view.board), len(view.corners))
-            )
-            views.append(view)
-    counts = [row[3] for row in rows]
-    index = [np.repeat([row[k] for row in rows], counts).astype(np.int64) for k in range(3)]
-    total = int(sum(counts))
+    views = [view for shot in seen for view, _ in shot]
+    rows = [
+        (
+            names.index(view.camera),
+            0 if view.board in world_from_board else body_index[number],
+            order.index(view.board),
+        )
+        for number, shot in enumerate(seen)
+        for view, _ in shot
+    ]
+    counts = [len(view.corners) for view in views]
+    camera, body, part = np.repeat(np.array(rows).reshape(-1, 3), counts, axis=0).astype(np.int64).T
     points = ChainPoints(
-        index[0],
-        index[1],
-        index[2],
+        camera,
+        body,
+        part,
         np.concatenate([boards[view.board].points for view in views]),
         np.concatenate([view.corners for view in views]),
-        np.tile(settings.corner_sigma_px**2 * np.eye(2), (total, 1, 1)),
+        np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
     free_part = np.zeros(len(order), dtype=np.bool_)
     priors: tuple[PosePrior, ...] = ()
-    if double is not None and _used(double.second, views):
+    if double is not None and any(view.board == double.second for view in views):
         free = double.offset is None or bool(np.any(double.covariance))
         free_part[order.index(double.second)] = free
         if free and double.offset is not None:
@@ -257,7 +258,3 @@ def _bundle(
         priors,
     )
     return bundle, tuple(views)
-
-
-def _used(board: str, views: Iterable[BoardView]) -> bool:
-    return any(view.board == board for view in views)

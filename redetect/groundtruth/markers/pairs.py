@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
@@ -21,15 +21,13 @@ from redetect.groundtruth.trajectories.transforms import (
     log_se3,
     mean_pose,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.landmarks import squared_mahalanobis
 
 # Squared normalised distance (6 dof) above which an estimate does not agree.
 _AGREES = 30.0
 _HYPOTHESES = 60
 # Estimates are linearised: no distance counts as better known than this.
-_FLOOR_M, _FLOOR_RAD = 0.002, 0.005
+_FLOOR = np.diag(np.square([0.002] * 3 + [0.005] * 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +47,9 @@ class PairConsensus:
     a_from_b: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
-    agrees: NDArray[np.bool_]  # (T,): which of them agree with it
+    agrees: BoolArray  # (T,): which of them agree with it
     # (T,): whether that is the combination of solutions that fit the image best
-    first: NDArray[np.bool_]
+    first: BoolArray
 
     @property
     def support(self) -> int:
@@ -94,7 +92,7 @@ def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairCo
         agreeing = best[distance < _AGREES]
         if not len(agreeing):  # not even the hypothesis: its own covariance is the floor's
             agreeing = np.array([chosen])
-        new, covariance, _ = mean_pose(poses[agreeing], covariances[agreeing] + _floor())
+        new, covariance, _ = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
         moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
         consensus = new
         if moved < 1e-10:
@@ -157,10 +155,6 @@ def _stacked(times: Sequence[MarkerPose]) -> tuple[FloatArray, FloatArray, Float
     )
 
 
-def _floor() -> FloatArray:
-    return np.diag(np.square([_FLOOR_M] * 3 + [_FLOOR_RAD] * 3))
-
-
 def _distances(
     consensus: FloatArray,
     covariance: FloatArray,
@@ -170,8 +164,7 @@ def _distances(
 ) -> FloatArray:
     """Squared normalised distances of all estimates, and what they cost in the image."""
     apart = log_se3(inverse(consensus) @ poses)
-    weighted = np.linalg.solve(covariances + covariance + _floor(), apart[..., None])[..., 0]
-    return np.asarray(np.sum(apart * weighted, axis=1) + costs)
+    return squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
 
 
 def _least(distance: FloatArray, owner: IntArray, times: int) -> tuple[FloatArray, IntArray]:

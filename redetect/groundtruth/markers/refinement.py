@@ -13,31 +13,30 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.chain import (
+from redetect.groundtruth.markers.adjustment import (
+    UNDETERMINED,
     ChainPoints,
+    inverted_information,
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.least_squares import Linearised, inverted_information, minimised
 from redetect.groundtruth.markers.settings import Loss
 from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
-
+from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
 _ROWS = 8
-_SMALLEST_STEP = 1e-10
+# Steps (m, rad) that are as good as none, and the share of the cost that rounding may hide.
+_SMALLEST_STEP, _COST_TOLERANCE, _MOST_STEPS = 1e-10, 1e-15, 200
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,29 +53,30 @@ class PoseProblem:
     view: IntArray
     floor: Floor | None = None
 
-    def __post_init__(self) -> None:
-        expected = np.repeat(np.arange(self.views), 4)
-        if not np.array_equal(self.view, expected) or len(self.view) != len(self.seen):
-            raise ValueError("views of a pose problem: expected four corners each, in order")
-
     @property
     def views(self) -> int:
         """V, the number of markers in images."""
         return int(self.view.max()) + 1 if len(self.view) else 0
 
+    def pixels(self, world_from_robot: FloatArray) -> FloatArray:
+        """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
+        return project_chain(
+            self.cameras,
+            self.world_from_camera,
+            world_from_robot[None],
+            self.robot_from_marker,
+            self.seen,
+        )
+
+    def extent_px(self, view: int) -> float:
+        """Width and height of a marker in an image, together."""
+        return float(np.ptp(self.seen.pixels[self.view == view], axis=0).sum())
+
     def only(self, views: BoolArray) -> PoseProblem:
         """The problem with only those of the V views."""
         chosen = views[self.view]
-        return PoseProblem(
-            self.cameras,
-            self.world_from_camera,
-            self.robot_from_marker,
-            self.camera_covariance,
-            self.marker_covariance,
-            self.seen.only(chosen),
-            (np.cumsum(views) - 1)[self.view[chosen]],
-            self.floor,
-        )
+        view = (np.cumsum(views) - 1)[self.view[chosen]]
+        return replace(self, seen=self.seen.only(chosen), view=view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,38 +129,67 @@ def refine_pose(
     if _corners(problem, start) is None:
         raise GeometryError("the start has a corner behind its camera or outside its lens")
 
-    def linearise(pose: FloatArray) -> Linearised[FloatArray]:
-        here = _corners(problem, pose)
-        assert here is not None
-        # Weights stay those of this step: a cost that also changes them is no measure.
-        covariance = _covariance(problem, here, _view_weights(problem, here, loss, loss_scale))
-        stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
-        products = stacked.T @ np.linalg.solve(covariance, stacked)
-        if problem.floor is not None:
-            missing, by_pose = floor_residuals(pose, problem.floor)
-            of_floor = np.concatenate([missing[:, None], -by_pose], axis=1)
-            products += of_floor.T @ of_floor
-        normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
-        return Linearised(
-            0.5 * float(products[0, 0]),
-            products[1:, 0],
-            normal,
-            lambda ahead: 0.5 * _cost(problem, ahead, covariance),
-        )
-
-    pose = minimised(start, linearise, lambda pose, step: pose @ exp_se3(step), _SMALLEST_STEP)
+    pose, damping = start, _DAMPING
+    now = _linearised(problem, pose, loss, loss_scale)
+    for _ in range(_MOST_STEPS):
+        added = damping * np.diagonal(now.normal)
+        try:
+            step = -np.linalg.solve(now.normal + np.diag(added), now.gradient)
+        except np.linalg.LinAlgError:
+            raise GeometryError(UNDETERMINED) from None
+        ahead = pose @ exp_se3(step)
+        cost = _cost(problem, ahead, now.covariance)
+        gain = float(step @ (added * step - now.gradient))
+        settled = np.abs(step).max() < _SMALLEST_STEP or gain <= _COST_TOLERANCE * now.cost
+        # Near the minimum rounding decides which cost is less; such steps are right all the same.
+        if cost <= now.cost * (1.0 + _COST_TOLERANCE) + 1e-20:
+            pose = ahead
+            if settled:
+                break
+            damping = max(0.1 * damping, _LEAST_DAMPING)
+            now = _linearised(problem, pose, loss, loss_scale)
+        elif settled or damping > _MOST_DAMPING:
+            break
+        else:
+            damping *= 10.0
     here = _corners(problem, pose)
     assert here is not None
     squares = np.sum(here.residuals.reshape(-1, 2) ** 2, axis=1)
     count = np.bincount(problem.view, minlength=problem.views)
     return RefinedPose(
         pose,
-        inverted_information(linearise(pose).normal),
+        inverted_information(_linearised(problem, pose, loss, loss_scale).normal),
         _cost(problem, pose, _covariance(problem, here, np.ones(problem.views))),
         len(here.residuals) + (0 if problem.floor is None else 3) - 6,
         _view_errors(problem, here),
         np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
     )
+
+
+class _Linearised(NamedTuple):
+    """The squares of a problem about a pose."""
+
+    cost: float
+    gradient: FloatArray  # (6,): J'r
+    normal: FloatArray  # (6, 6): J'J
+    # Weights stay those of this step: a cost that also changes them is no measure.
+    covariance: FloatArray
+
+
+def _linearised(
+    problem: PoseProblem, pose: FloatArray, loss: Loss, loss_scale: float
+) -> _Linearised:
+    here = _corners(problem, pose)
+    assert here is not None
+    covariance = _covariance(problem, here, _view_weights(problem, here, loss, loss_scale))
+    stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
+    products = stacked.T @ np.linalg.solve(covariance, stacked)
+    if problem.floor is not None:
+        missing, by_pose = floor_residuals(pose, problem.floor)
+        of_floor = np.concatenate([missing[:, None], -by_pose], axis=1)
+        products += of_floor.T @ of_floor
+    normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
+    return _Linearised(float(products[0, 0]), products[1:, 0], normal, covariance)
 
 
 def predicted_errors(
@@ -224,24 +253,17 @@ def _covariance(problem: PoseProblem, here: _Corners, weights: FloatArray) -> Fl
 
 def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> float:
     """Squared Mahalanobis length of all residuals; infinite where a corner cannot be seen."""
-    pixels = project_chain(
-        problem.cameras,
-        problem.world_from_camera,
-        pose[None],
-        problem.robot_from_marker,
-        problem.seen,
-    )
-    residuals = (problem.seen.pixels - pixels).ravel()
+    residuals = (problem.seen.pixels - problem.pixels(pose)).ravel()
     if not np.all(np.isfinite(residuals)):
         return np.inf
-    cost = float(residuals @ np.linalg.solve(covariance, residuals))
+    cost = float(squared_mahalanobis(residuals, covariance))
     if problem.floor is not None:
         cost += float(np.sum(floor_residuals(pose, problem.floor)[0] ** 2))
     return cost
 
 
 def _normalised_rms(residuals: FloatArray, covariance: FloatArray) -> float:
-    return float(np.sqrt(residuals @ np.linalg.solve(covariance, residuals) / len(residuals)))
+    return float(np.sqrt(squared_mahalanobis(residuals, covariance) / len(residuals)))
 
 
 def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
@@ -249,8 +271,7 @@ def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
     views = np.arange(problem.views)
     own = covariance.reshape(len(views), _ROWS, len(views), _ROWS)[views, :, views, :]
     residuals = here.residuals.reshape(-1, _ROWS)
-    weighted = np.linalg.solve(own, residuals[..., None])[..., 0]
-    return np.asarray(np.sqrt(np.sum(residuals * weighted, axis=1) / _ROWS))
+    return np.asarray(np.sqrt(squared_mahalanobis(residuals, own) / _ROWS))
 
 
 def _view_weights(

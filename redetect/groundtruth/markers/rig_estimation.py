@@ -11,13 +11,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import AdjustedBundle, Bundle, PosePrior, adjust_bundle
+from redetect.groundtruth.markers.adjustment import (
+    AdjustedBundle,
+    Bundle,
+    PosePrior,
+    adjust_bundle,
+    project_chain,
+)
 from redetect.groundtruth.markers.calibration import Rig
-from redetect.groundtruth.markers.chain import project_chain
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -26,15 +31,12 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
     spanning_tree,
 )
-from redetect.groundtruth.markers.pnp import view_poses
+from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
 from redetect.groundtruth.markers.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
-
-FloatArray = NDArray[np.float64]
-
 
 # Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
 _WRONG_PX = 20.0
@@ -91,13 +93,9 @@ def estimate_rig(
     candidates = _bare_rig(dictionary, ids, widths_m)
     seen = [rig_views(group, candidates) for group in groups]
     solved = [
-        [
-            (view, _solutions(view, candidates, cameras, world_from_camera, settings))
-            for view in views
-        ]
-        if len({view.rig_index for view in views}) > 1
-        else []
+        [(v, _solutions(v, candidates, cameras, world_from_camera, settings)) for v in views]
         for views in seen
+        if len({view.rig_index for view in views}) > 1
     ]
     pairs = _consensus_of_pairs(solved)
     support = {pair: c.support for pair, c in pairs.items() if c.support >= settings.least_support}
@@ -113,9 +111,7 @@ def estimate_rig(
     renumbered = {old: new for new, old in enumerate(kept)}
     tree = tuple(renumbered[parents[i]] for i in kept)
     pairs = {
-        (renumbered[a], renumbered[b]): PairConsensus(
-            (renumbered[a], renumbered[b]), c.a_from_b, c.covariance, c.estimates, c.agrees, c.first
-        )
+        (renumbered[a], renumbered[b]): replace(c, pair=(renumbered[a], renumbered[b]))
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
@@ -127,15 +123,9 @@ def estimate_rig(
     )
     if camera_covariance is not None and np.any(camera_covariance):
         bundle = _with_free_cameras(bundle, camera_covariance)
-    try:
-        adjusted = adjust_bundle(
-            bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
-        )
-    except GeometryError as error:
-        raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
-    covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
+    adjusted, rig = _adjusted(bundle, rig, settings)
     return RigEstimate(
-        Rig(dictionary, kept_ids, rig.widths_m, adjusted.bundle.body_from_part, covariance),
+        rig,
         ids[root],
         pairs,
         tree,
@@ -144,6 +134,19 @@ def estimate_rig(
         times,
         left_out,
     )
+
+
+def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[AdjustedBundle, Rig]:
+    """The bundle at its minimum, and the rig that it makes."""
+    try:
+        adjusted = adjust_bundle(
+            bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
+        )
+    except GeometryError as error:
+        raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
+    covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
+    poses = adjusted.bundle.body_from_part
+    return adjusted, replace(rig, robot_from_marker=poses, covariance=covariance)
 
 
 def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, float]) -> Rig:
@@ -208,9 +211,8 @@ def _root(
     ids: tuple[int, ...], support: Mapping[tuple[int, int], int], reference: int | None
 ) -> int:
     total = np.zeros(len(ids), dtype=np.int64)
-    for (a, b), count in support.items():
-        total[a] += count
-        total[b] += count
+    for pair, count in support.items():
+        total[list(pair)] += count
     if reference is None:
         return int(np.argmax(total))
     if reference not in ids or not total[ids.index(reference)]:
@@ -253,7 +255,7 @@ def _bundle(
     poses: list[FloatArray] = []
     for group in solved:
         own = [
-            (View(view.frame, view.marker, renumbered[view.rig_index]), solutions)
+            (replace(view, rig_index=renumbered[view.rig_index]), solutions)
             for view, solutions in group
             if view.rig_index in renumbered and solutions is not None
         ]
@@ -266,14 +268,6 @@ def _bundle(
         bodies += [len(poses)] * len(own)
         poses.append(pose)
     points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
-    seen = type(points)(
-        points.camera,
-        np.repeat(bodies, 4).astype(np.int64),
-        points.part,
-        points.points,
-        points.pixels,
-        points.covariances,
-    )
     free_part = np.ones(len(rig.ids), dtype=np.bool_)
     free_part[root] = False
     bundle = Bundle(
@@ -284,7 +278,7 @@ def _bundle(
         np.zeros(len(cameras), dtype=np.bool_),
         np.ones(len(poses), dtype=np.bool_),
         free_part,
-        seen,
+        replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
         np.repeat(np.arange(len(views)), 4),
     )
     return bundle, tuple(views), len(poses)
@@ -436,15 +430,5 @@ def _readjusted(
         free_part=np.ones(len(bundle.free_part), dtype=np.bool_),
         priors=(*(p for p in bundle.priors if p.kind == "camera"), *priors),
     )
-    try:
-        adjusted = adjust_bundle(
-            moved, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
-        )
-    except GeometryError as error:
-        raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
-    rig = replace(
-        estimate.rig,
-        robot_from_marker=adjusted.bundle.body_from_part,
-        covariance=adjusted.part_covariance * max(1.0, adjusted.reduced_cost),
-    )
+    adjusted, rig = _adjusted(moved, estimate.rig, settings)
     return replace(estimate, rig=rig, adjusted=adjusted)

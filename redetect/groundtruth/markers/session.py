@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers.adjustment import ChainPoints
 from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
-from redetect.groundtruth.markers.chain import ChainPoints
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import read_times
@@ -65,29 +65,21 @@ def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Pa
     return list(paths), network_path if network_path is not None else beside
 
 
-def read_marker_frames(
-    run: Path, camera: int, *, detected: Path | None = None, timed: bool = True
-) -> list[MarkerFrame]:
+def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
     """The markers found in a run's images, in the file's order, and the images' times.
 
-    The run folder has ``detected.markers`` (or `detected`) and ``<name>.times``. Frames are
-    numbered instead if they need not be `timed`.
+    The run folder has ``detected.markers`` and ``<name>.times``. Frames are numbered instead if
+    they need not be `timed`.
     """
-    path = detected if detected is not None else run / DETECTED_NAME
-    times: dict[str, float] = {}
     times_path = run / f"{run.resolve().name}.times"
-    if timed:
-        times = _times_by_name(times_path)
+    times = _times_by_name(times_path) if timed else {}
     frames = []
-    for number, frame in enumerate(read_frames(path)):
+    for number, frame in enumerate(read_frames(run / DETECTED_NAME)):
         name = _image_name(frame.step.prefix)
         if timed and name not in times:
             raise GroundTruthError(f"{times_path}: no time of image {frame.step.prefix}")
-        frames.append(
-            MarkerFrame(
-                camera, frame.step.prefix, times[name] if timed else float(number), frame.markers
-            )
-        )
+        time_s = times[name] if timed else float(number)
+        frames.append(MarkerFrame(camera, frame.step.prefix, time_s, frame.markers))
     return frames
 
 
@@ -100,13 +92,9 @@ def group_by_time(
     """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
-        last = groups[-1] if groups else None
-        if (
-            last is not None
-            and frame.time_s - last[0].time_s <= tolerance_s
-            and all(frame.camera != other.camera for other in last)
-        ):
-            last.append(frame)
+        near = bool(groups) and frame.time_s - groups[-1][0].time_s <= tolerance_s
+        if near and all(frame.camera != other.camera for other in groups[-1]):
+            groups[-1].append(frame)
         else:
             groups.append([frame])
     return [tuple(group) for group in groups]
@@ -154,13 +142,8 @@ def pose_problem(
     views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
 ) -> PoseProblem:
     """The problem of the robot's pose at one time."""
-    floor = None
-    if settings.floor:
-        floor = Floor(
-            settings.floor_z_m,
-            settings.floor_sigma_z_m,
-            float(np.radians(settings.floor_sigma_tilt_deg)),
-        )
+    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
+    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
     return PoseProblem(
         network.cameras,
         network.world_from_camera,

@@ -16,13 +16,7 @@ _ODDS = Bounds("more than 1", 1.0, above=True, below=True)
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Settings of the poses.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is not finite or not positive.
-    """
+    """Settings of the poses."""
 
     solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
     loss: Loss = "huber"  # How markers that fit badly are weighted in the least squares.
@@ -55,13 +49,7 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class RigSettings:
-    """Settings of the rig's estimation.
-
-    Raises
-    ------
-    GroundTruthError
-        If a number is not finite or too small.
-    """
+    """Settings of the rig's estimation."""
 
     # A marker belongs to the rig only if this many times, or images, show it with another and agree
     least_support: Annotated[int, whole(1)] = 3

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.calibration import Network, Rig
 from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
@@ -23,21 +23,11 @@ from redetect.groundtruth.markers.session import (
 from redetect.groundtruth.markers.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
+from redetect.landmarks import squared_mahalanobis
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
 
-STATUSES: tuple[Status, ...] = (
-    "clear",
-    "resolved",
-    "unresolved",
-    "rejected",
-    "failed",
-    "unseen",
-)
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,9 +146,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     estimate, choice = tracked.estimate, tracked.choice
     chosen = None
     if estimate is not None:
-        chosen = estimate.candidates[
-            choice.candidate if choice is not None and choice.candidate is not None else 0
-        ]
+        chosen = estimate.candidates[(choice.candidate or 0) if choice is not None else 0]
         entry["ambiguous"] = estimate.ambiguous
         entry["contradiction"] = estimate.contradiction
         if choice is not None and estimate.ambiguous:
@@ -166,11 +154,8 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
         entry["candidates"] = [
             {
                 "x_y_theta": [
-                    round(float(v), 6)
-                    for v in (
-                        *candidate.world_from_robot[:2, 3],
-                        heading(candidate.world_from_robot),
-                    )
+                    *(round(float(v), 6) for v in candidate.world_from_robot[:2, 3]),
+                    round(float(heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
                 "rms_px": round(candidate.refined.rms_px, 4),
@@ -184,14 +169,12 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
         {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
     ]
     if chosen is not None:
-        used = np.flatnonzero(chosen.views)
+        figures = iter(zip(chosen.refined.view_errors, chosen.refined.view_rms_px))
         for marker, is_used in zip(entry["markers"], chosen.views):
             marker["used"] = bool(is_used)
-        for position, index in enumerate(used):
-            entry["markers"][index]["error"] = round(float(chosen.refined.view_errors[position]), 3)
-            entry["markers"][index]["rms_px"] = round(
-                float(chosen.refined.view_rms_px[position]), 4
-            )
+            if is_used:
+                error, rms = next(figures)
+                marker["error"], marker["rms_px"] = round(float(error), 3), round(float(rms), 4)
     return entry
 
 
@@ -224,15 +207,7 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
         reason = f"{kind}, decided by the neighbours"
     elif choice.status == "unresolved":
         reason = f"{kind}, not decided by the neighbours"
-    return TrackedTime(
-        tracked.time_s,
-        tracked.images,
-        tracked.views,
-        choice.status,
-        estimate,
-        choice,
-        reason,
-    )
+    return replace(tracked, status=choice.status, choice=choice, reason=reason)
 
 
 # In units of negative log-likelihood: leaving a frame out is cheaper than two jumps round it, and a
@@ -322,27 +297,20 @@ def _step_costs(
     settings: PoseSettings,
 ) -> list[FloatArray]:
     """For each frame i, the costs (K_i, K_j) of moving to the candidates of frame i + distance."""
-    first: list[int] = []
-    second: list[int] = []
-    seconds: list[float] = []
-    shapes: list[tuple[int, int]] = []
     sizes = [len(estimate.candidates) for estimate in estimates]
-    start = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    for i in range(len(estimates) - distance):
-        j = i + distance
-        shapes.append((sizes[i], sizes[j]))
-        for a in range(sizes[i]):
-            for b in range(sizes[j]):
-                first.append(int(start[i]) + a)
-                second.append(int(start[j]) + b)
-                seconds.append(times_s[j] - times_s[i])
-    if not first:
+    shapes = list(zip(sizes[:-distance], sizes[distance:]))
+    if not shapes:
         return []
+    start = np.concatenate([[0], np.cumsum(sizes)])[:-1]
+    # Every candidate of one frame with every one of the other.
+    grids = [np.indices(shape).reshape(2, -1) for shape in shapes]
+    first = np.concatenate([start[i] + grid[0] for i, grid in enumerate(grids)])
+    second = np.concatenate([start[i + distance] + grid[1] for i, grid in enumerate(grids)])
+    apart = np.subtract(times_s[distance:], times_s[:-distance])
+    seconds = np.repeat(apart, [grid.shape[1] for grid in grids])
     poses = np.stack([c.world_from_robot for e in estimates for c in e.candidates])
     covariances = np.stack([c.covariance for e in estimates for c in e.candidates])
-    costs = _motion_costs(
-        poses, covariances, np.array(first), np.array(second), np.array(seconds), settings
-    )
+    costs = _motion_costs(poses, covariances, first, second, seconds, settings)
     split = np.cumsum([a * b for a, b in shapes])[:-1]
     return [part.reshape(shape) for part, shape in zip(np.split(costs, split), shapes)]
 
@@ -374,5 +342,4 @@ def _motion_costs(
     turn = np.radians(settings.turn_deg_s) * seconds
     for axis, sigma in enumerate((reach, reach, heave, wobble, wobble, turn)):
         spread[:, axis, axis] += np.square(sigma)
-    weighted = np.linalg.solve(spread, moved[..., None])[..., 0]
-    return np.asarray(np.minimum(0.5 * np.sum(moved * weighted, axis=1), _JUMP_COST))
+    return np.asarray(np.minimum(0.5 * squared_mahalanobis(moved, spread), _JUMP_COST))

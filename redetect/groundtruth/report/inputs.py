@@ -11,17 +11,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, read_clock
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_json_value
+from redetect.groundtruth.files import read_json
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.trajectories.matching import align_poses, matched_streams
-from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    matched_streams,
+    moved_poses,
+    planar_alignment,
+    read_planar_poses,
+)
 from redetect.storage.bounded import read_bounded
 
-FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Streams in the order of the page, with what they are called there.
@@ -92,7 +96,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         session / "fused.json",
         session / "validation" / "validation.json",
     ):
-        document = _read(inputs, path, _document, quiet=path.name == "clock.json")
+        document = _read(inputs, path, read_json, quiet=path.name == "clock.json")
         if document is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
@@ -138,13 +142,6 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
         inputs.missing.append("building.csv or building.dxf")
         return None
     return _read(inputs, path, read_building)
-
-
-def _document(path: Path) -> dict[str, Any]:
-    content = read_json_value(path)
-    if not isinstance(content, dict):
-        raise GroundTruthError(f"{path}: expected an object")
-    return content
 
 
 def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
@@ -223,7 +220,7 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
         part = in_visits(odometry, [visit])
         try:
             mine, theirs, _ = matched_streams(part, inputs.truth)
-            parts.append(align_poses(mine, theirs))
+            parts.append(moved_poses(mine, planar_alignment(mine, theirs)))
         except GroundTruthError:
             continue  # a visit without odometry, or without truth
     if not parts:

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.report.figures import (
+from redetect.groundtruth.files import is_number
+from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
+from redetect.groundtruth.report.pictures import (
     Series,
     Track,
     ellipse_figure,
     map_figure,
     series_figure,
 )
-from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
-from redetect.groundtruth.trajectories.matching import matched_streams, pose_differences
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses
 from redetect.groundtruth.validation.validate import PUBLISHED
 from redetect.reporting.page import Part, Section, image_part, page_of
@@ -62,11 +62,7 @@ def table(
 
 
 def _state(inputs: Inputs) -> list[Part]:
-    rows = []
-    for name, label in STREAMS.items():
-        poses = inputs.streams.get(name)
-        if poses is not None:
-            rows.append((label, *_extent(poses)))
+    rows = [(STREAMS[name], *_extent(poses)) for name, poses in inputs.streams.items()]
     if inputs.truth is not None:
         rows.append(("truth", *_extent(inputs.truth)))
     content: list[Part] = []
@@ -137,12 +133,9 @@ def _errors(inputs: Inputs) -> list[Part]:
             continue
         rows.append((label, *_score_words(score_poses(mine, theirs))))
         error = pose_differences(mine.poses, theirs.poses)
-        colour, dashes = _LOOKS[name]
-        far = 1e3 * np.hypot(error[:, 0], error[:, 1])
-        bent = np.degrees(np.abs(error[:, 2]))
-        short = STREAMS.get(name, name)
-        place.append(Series(short, colour, dashes, mine.times_s, far))
-        turn.append(Series(short, colour, dashes, mine.times_s, bent))
+        look = (STREAMS.get(name, name), *_LOOKS[name], mine.times_s)
+        place.append(Series(*look, 1e3 * np.hypot(error[:, 0], error[:, 1])))
+        turn.append(Series(*look, np.degrees(np.abs(error[:, 2]))))
     fused = inputs.streams.get("fused")
     if place and fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
         try:
@@ -189,7 +182,7 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
 def _is_outside(figures: dict[str, Any]) -> bool:
     """Whether the normalised error is outside its band."""
     values = [figures.get(name) for name in ("nees_low", "nees", "nees_high")]
-    numbers = [float(value) for value in values if isinstance(value, int | float)]
+    numbers = [float(value) for value in values if is_number(value)]
     return len(numbers) == 3 and not numbers[0] <= numbers[1] <= numbers[2]
 
 
@@ -249,21 +242,20 @@ def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
         words = "No clock.json: all times are taken to be of one clock."
         return [Part("note", words)]
-    rows = []
-    for s in inputs.clock.segments[:_MOST_ROWS]:
-        rows.append(
-            (
-                f"{s.from_s:.2f}",
-                f"{s.to_s:.2f}",
-                f"{1e3 * s.offset_s:+.2f}",
-                _number(s.sigma_offset_s, 1e3),
-                f"{1e6 * (s.rate - 1.0):+.1f}",
-                _number(s.sigma_rate, 1e6, 1),
-                f"{math.degrees(s.angle_rad):+.3f}",
-                f"{math.degrees(s.turned_rad):.0f}",
-                s.status,
-            )
+    rows = [
+        (
+            f"{s.from_s:.2f}",
+            f"{s.to_s:.2f}",
+            f"{1e3 * s.offset_s:+.2f}",
+            _number(s.sigma_offset_s, 1e3),
+            f"{1e6 * (s.rate - 1.0):+.1f}",
+            _number(s.sigma_rate, 1e6, 1),
+            f"{math.degrees(s.angle_rad):+.3f}",
+            f"{math.degrees(s.turned_rad):.0f}",
+            s.status,
         )
+        for s in inputs.clock.segments[:_MOST_ROWS]
+    ]
     head = (
         "from / s", "to / s", "offset / ms", "sigma", "drift / ppm", "sigma", "angle / deg",
         "turned / deg", "status",
@@ -368,11 +360,8 @@ def _value(value: Any) -> str:
 
 
 def _float(value: Any) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if good else 0.0
+    return float(value) if is_number(value) else 0.0
 
 
 def _number(value: Any, factor: float, decimals: int = 2) -> str:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return "-"
-    return f"{factor * value:.{decimals}f}"
+    return f"{factor * value:.{decimals}f}" if is_number(value) else "-"

@@ -1,7 +1,8 @@
-"""Files of poses and times: RAWSEEDS' comma-separated streams, TUM trajectories, ``.times``.
+"""Poses over time: their files, poses at other times, and paths moved rigidly onto others.
 
-A RAWSEEDS stream has a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth
-the 3x3 covariance of (x, y, theta) row by row. It has no comments and no header.
+Files are RAWSEEDS' comma-separated streams, TUM trajectories and ``.times``. A RAWSEEDS stream has
+a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth the 3x3 covariance of
+(x, y, theta) row by row. It has no comments and no header.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import read_text
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
+from redetect.landmarks import wrap_angle
+from redetect.plane import fitted, rotation
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
 RAWSEEDS_ROUNDING = 5e-7
@@ -93,22 +95,6 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     return poses if np.all(last) else poses.only(last)
 
 
-def is_positive_definite(covariances: FloatArray, rounding: float = 0.0) -> NDArray[np.bool_]:
-    """Which of (..., d, d) covariances can be inverted in earnest.
-
-    `covariances` (..., d, d). `rounding`: by how much each entry may be off; an eigenvalue must be
-    larger than that.
-    """
-    symmetric = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
-    scale = np.sqrt(np.clip(np.diagonal(symmetric, axis1=-2, axis2=-1), 0.0, None))
-    positive = np.all(scale > 0.0, axis=-1)
-    safe = np.where(positive[..., None], scale, 1.0)
-    correlation = symmetric / safe[..., :, None] / safe[..., None, :]
-    smallest = np.linalg.eigvalsh(correlation)[..., 0]
-    absolute = np.linalg.eigvalsh(symmetric)[..., 0]
-    return np.asarray(positive & (smallest > 1e-9) & (absolute > rounding))
-
-
 def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
@@ -163,15 +149,11 @@ def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> st
 
 
 def write_planar_poses(
-    path: str | os.PathLike[str],
-    poses: PlanarPoses,
-    *,
-    covariance_decimals: int = 12,
-    overwrite: bool = False,
+    path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
 ) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
     with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_planar_poses(poses, covariance_decimals).encode())
+        stream.write(format_planar_poses(poses).encode())
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
@@ -259,3 +241,98 @@ def _numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[
             raise StreamError(path, line, f"{excerpt(word)}: expected a finite number")
         numbers.append(value)
     return numbers
+
+
+def interpolate_poses(
+    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float = np.inf
+) -> tuple[PlanarPoses, BoolArray]:
+    """Poses at other times, linearly between neighbours, headings the short way round.
+
+    Times (N,) ascend. Between neighbours farther apart than the largest gap there is no pose, but
+    at their own times. Returns the poses at those times that have one, covariances interpolated
+    like them, and which times those are (N,).
+    """
+    if len(poses) == 0:
+        raise GroundTruthError("no poses to interpolate between")
+    after = np.clip(np.searchsorted(poses.times_s, times_s, side="left"), 0, len(poses) - 1)
+    before = np.where(poses.times_s[after] == times_s, after, np.maximum(after - 1, 0))
+    inside = (times_s >= poses.times_s[0]) & (times_s <= poses.times_s[-1])
+    gap = poses.times_s[after] - poses.times_s[before]
+    known = inside & (gap <= largest_gap_s)
+    before, after, gap = before[known], after[known], gap[known]
+    part = np.where(gap > 0.0, (times_s[known] - poses.times_s[before]) / np.where(gap, gap, 1), 0)
+    change = poses.poses[after] - poses.poses[before]
+    change[:, 2] = wrap_angle(change[:, 2])
+    between = poses.poses[before] + part[:, None] * change
+    covariances = None
+    if poses.covariances is not None:
+        a, b = poses.covariances[before], poses.covariances[after]
+        covariances = a + part[:, None, None] * (b - a)
+    return PlanarPoses(times_s[known], between, covariances), known
+
+
+def matched_streams(
+    poses: PlanarPoses,
+    truth: PlanarPoses,
+    *,
+    largest_gap_s: float = 0.5,
+    interpolate: str = "truth",
+) -> tuple[PlanarPoses, PlanarPoses, int]:
+    """Both streams at common times, and how many times had to be left out.
+
+    Parameters
+    ----------
+    largest_gap_s : float
+        Nothing is interpolated across longer gaps.
+    interpolate : str
+        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
+
+    Raises
+    ------
+    GroundTruthError
+        If no pose has a truth at its time.
+    """
+    if len(poses) == 0 or len(truth) == 0:
+        raise GroundTruthError(
+            f"{len(poses)} poses and {len(truth)} of the truth: expected at least one of each"
+        )
+    still, moving = (poses, truth) if interpolate == "truth" else (truth, poses)
+    at_times, known = interpolate_poses(moving, still.times_s, largest_gap_s)
+    kept = still.only(known)
+    mine, theirs = (kept, at_times) if interpolate == "truth" else (at_times, kept)
+    if len(mine) == 0:
+        raise GroundTruthError(
+            f"no pose has the truth beside it: poses from {poses.times_s[0]:.3f} to "
+            f"{poses.times_s[-1]:.3f} s, truth from {truth.times_s[0]:.3f} to "
+            f"{truth.times_s[-1]:.3f} s, gaps of at most {largest_gap_s:g} s interpolated"
+        )
+    return mine, theirs, int((~known).sum())
+
+
+def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
+    """(3,) rigid motion x, y (m), theta (rad) that takes poses' positions onto the truth's best.
+
+    Both have the same times. Least squares in the plane (Horn 1987), without scale, cannot mirror,
+    as alignments in space can.
+    """
+    if len(poses) < 2:
+        raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")
+    return fitted(poses.poses[:, :2], truth.poses[:, :2])
+
+
+def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
+    """Poses, and their covariances, after a rigid motion (x, y, theta) of the world."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(motion[2])
+    moved = poses.poses @ turn.T + motion
+    covariances = None
+    if poses.covariances is not None:
+        covariances = turn @ poses.covariances @ turn.T
+    return PlanarPoses(poses.times_s, moved, covariances)
+
+
+def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
+    """(N, 3) poses minus the truth's, headings the short way round."""
+    difference = poses - truth
+    difference[:, 2] = wrap_angle(difference[:, 2])
+    return difference

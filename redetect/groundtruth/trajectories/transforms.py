@@ -14,12 +14,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-FloatArray = NDArray[np.float64]
-
+from redetect.array_types import FloatArray
 
 #: Below this angle (rad) closed forms lose more digits than their series.
 _SMALL_ANGLE_RAD = 1e-2

@@ -13,18 +13,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import IcpResult, IcpSettings, icp_to_segments
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import apply
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply
 
-FloatArray = NDArray[np.float64]
 ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
 
 # Beams with fewer readings than this share near their median, as at edges, give no point.

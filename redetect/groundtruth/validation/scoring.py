@@ -6,23 +6,20 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.matching import (
-    interpolate_poses,
-    pose_differences,
-    squared_lengths,
-)
-from redetect.groundtruth.trajectories.plane import between
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
-    is_positive_definite,
+    interpolate_poses,
+    pose_differences,
     read_rows_of_numbers,
 )
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
+from redetect.plane import between
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+#: Covariances that files round to six decimals are singular below this.
+LEAST_CORRELATION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -59,16 +56,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         With the same times. If the truth has covariances, they count in the normalised error.
     unmatched : int
         Handed through.
-
-    Raises
-    ------
-    GroundTruthError
-        If there is no pose, or the numbers differ.
     """
-    if len(poses) == 0 or len(poses) != len(truth):
-        raise GroundTruthError(
-            f"{len(poses)} poses and {len(truth)} of the truth: expected as many, and at least one"
-        )
     error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
     normalised, count = float("nan"), 0
@@ -76,20 +64,20 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         covariances = poses.covariances
         if truth.covariances is not None:
             covariances = covariances + truth.covariances
-        usable = is_positive_definite(covariances)
+        usable = is_positive_definite(covariances, LEAST_CORRELATION)
         count = int(usable.sum())
         if count:
-            squared = squared_lengths(error[usable], covariances[usable])
+            squared = squared_mahalanobis(error[usable], covariances[usable])
             normalised = float(np.mean(squared) / 3.0)
     return PoseScore(
         len(poses),
         unmatched,
         float(distance.mean()),
-        _sigma(distance),
+        sigma_of(distance),
         float(np.sqrt(np.mean(distance**2))),
         float(distance.max()),
         float(error[:, 2].mean()),
-        _sigma(error[:, 2]),
+        sigma_of(error[:, 2]),
         float(np.abs(error[:, 2]).max()),
         float(np.abs(error[:, 2]).mean()),
         float(np.median(distance)),
@@ -98,11 +86,9 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
     )
 
 
-def _sigma(values: FloatArray) -> float:
+def sigma_of(values: FloatArray) -> float:
+    """Standard deviation with N - 1; 0 of a single value."""
     return float(values.std(ddof=1)) if len(values) > 1 else 0.0
-
-
-_COLUMNS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +134,7 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
     StreamError
         If the file cannot be read or a row is malformed; the message names file and line.
     """
-    table = read_rows_of_numbers(path, _COLUMNS, "t_i, t_j, x, y, z, roll, pitch, yaw")
+    table = read_rows_of_numbers(path, 8, "t_i, t_j, x, y, z, roll, pitch, yaw")
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 
 
@@ -192,10 +178,8 @@ def score_steps(
     Raises
     ------
     GroundTruthError
-        If the numbers of poses differ or no step remains.
+        If no step remains.
     """
-    if len(poses) != len(truth):
-        raise GroundTruthError(f"{len(poses)} poses and {len(truth)} of the truth: expected equal")
     if step < 1:
         raise GroundTruthError(f"step is {step}: expected 1 or more")
     known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
@@ -213,7 +197,7 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
         len(error),
         unmatched,
         float(length.mean()),
-        float(length.std(ddof=1)) if len(length) > 1 else 0.0,
+        sigma_of(length),
         float(np.median(length)),
         float(np.sqrt(np.mean(length**2))),
         float(length.max()),

@@ -8,19 +8,19 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.trajectories.matching import pose_differences, squared_lengths
-from redetect.groundtruth.trajectories.streams import PlanarPoses, is_positive_definite
+from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
-
-FloatArray = NDArray[np.float64]
+from redetect.groundtruth.validation.scoring import LEAST_CORRELATION, sigma_of
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 _BAND = 0.95
+_FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def stream_of(references: Sequence[ReferencePose]) -> PlanarPoses:
 
 
 def pose_errors(
-    references: Sequence[ReferencePose], poses: PlanarPoses, farthest_s: float = 0.5
+    references: Sequence[ReferencePose], poses: PlanarPoses
 ) -> tuple[list[PoseError], list[Refused]]:
     """Errors of a ground truth at reference poses.
 
@@ -202,9 +202,8 @@ def pose_errors(
         In order of time.
     poses : PlanarPoses
         The ground truth. The pose nearest in time is used, as the robot is at rest: the covariance
-        of an interpolated pose would depend on the unknown correlation of their errors.
-    farthest_s : float
-        But not one farther away in time (s).
+        of an interpolated pose would depend on the unknown correlation of their errors; but not
+        one more than half a second away.
 
     Returns
     -------
@@ -212,7 +211,7 @@ def pose_errors(
         References at whose time there is no ground truth.
     """
     stream = stream_of(references)
-    at_times, known = _nearest(poses, stream.times_s, farthest_s)
+    at_times, known = _nearest(poses, stream.times_s)
     without = [
         Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")
         for r, there in zip(references, known)
@@ -224,8 +223,9 @@ def pose_errors(
     sigma = np.full((len(error), 2), np.nan)
     if at_times.covariances is not None and len(error):
         both = at_times.covariances + stream.covariances[known]
-        usable = is_positive_definite(at_times.covariances) & is_positive_definite(both)
-        nees[usable] = squared_lengths(error[usable], both[usable])
+        usable = is_positive_definite(at_times.covariances, LEAST_CORRELATION)
+        usable &= is_positive_definite(both, LEAST_CORRELATION)
+        nees[usable] = squared_mahalanobis(error[usable], both[usable])
         sigma[usable, 0] = np.sqrt(both[usable, 0, 0] + both[usable, 1, 1])
         sigma[usable, 1] = np.sqrt(both[usable, 2, 2])
     there = [r for r, found in zip(references, known) if found]
@@ -239,15 +239,13 @@ def pose_errors(
     return errors, without
 
 
-def _nearest(
-    poses: PlanarPoses, times_s: FloatArray, farthest_s: float
-) -> tuple[PlanarPoses, NDArray[np.bool_]]:
+def _nearest(poses: PlanarPoses, times_s: FloatArray) -> tuple[PlanarPoses, BoolArray]:
     """The poses nearest to times, and which times have one."""
     after = np.clip(np.searchsorted(poses.times_s, times_s), 0, len(poses) - 1)
     before = np.maximum(after - 1, 0)
     earlier = np.abs(times_s - poses.times_s[before]) <= np.abs(poses.times_s[after] - times_s)
     index = np.where(earlier, before, after)
-    known = np.abs(poses.times_s[index] - times_s) <= farthest_s
+    known = np.abs(poses.times_s[index] - times_s) <= _FARTHEST_S
     return poses.only(index[known]), known
 
 
@@ -265,16 +263,13 @@ def figures_of(errors: Sequence[PoseError]) -> Figures:
         tails = [0.5 * (1.0 + _BAND), 0.5 * (1.0 - _BAND)]
         low, high = (float(v) / freedom for v in chdtri(freedom, tails))
 
-    def sigma(values: FloatArray) -> float:
-        return float(values.std(ddof=1)) if len(values) > 1 else 0.0
-
     return Figures(
         len(errors),
         float(linear.mean()),
-        sigma(linear),
+        sigma_of(linear),
         float(linear.max()),
         float(angular.mean()),
-        sigma(angular),
+        sigma_of(angular),
         float(np.abs(angular).max()),
         len(nees),
         float(nees.mean() / 3.0) if len(nees) else math.nan,
@@ -292,6 +287,7 @@ def table_rows(
     for r in references:
         error = by_index.get(r.index)
         sigma = np.sqrt(np.diagonal(r.covariance))
+        good = r.distances.residuals_m[r.distances.used]
         rows.append(
             {
                 "pose": r.index,
@@ -304,15 +300,13 @@ def table_rows(
                 "sigma_theta_rad": float(sigma[2]),
                 "distances": int(r.distances.used.sum()),
                 "gross": int((~r.distances.used).sum()),
-                "distance_rms_m": float(
-                    np.sqrt(np.mean(r.distances.residuals_m[r.distances.used] ** 2))
-                ),
+                "distance_rms_m": float(np.sqrt(np.mean(good**2))),
                 "scans": r.scans,
                 "error_x_m": None if error is None else error.x_m,
                 "error_y_m": None if error is None else error.y_m,
                 "linear_m": None if error is None else error.linear_m,
                 "angular_deg": None if error is None else math.degrees(error.angular_rad),
-                "nees": None if error is None else _finite(error.nees),
+                "nees": None if error is None else finite_or_none(error.nees),
             }
         )
     return rows
@@ -321,11 +315,12 @@ def table_rows(
 def document(figures: Figures, refused: Sequence[Refused]) -> dict[str, Any]:
     """Figures and refused poses as written to a JSON file: null for missing values."""
     return {
-        "figures": {k: _finite(v) for k, v in asdict(figures).items()},
+        "figures": {k: finite_or_none(v) for k, v in asdict(figures).items()},
         "published": [asdict(published) for published in PUBLISHED],
         "refused": [asdict(r) for r in refused],
     }
 
 
-def _finite(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
+    """A number as JSON has it."""
     return value if math.isfinite(value) else None

@@ -17,13 +17,11 @@ from functools import cache
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DEFAULT_GATE_PROBABILITY = 0.999
 MOST_NODES = 20_000
@@ -52,7 +50,7 @@ def nearest_compatible(
 
     Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
-    innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
+    innovation, predicted, measured = map(_contiguous, (innovations, predicted_covariance, noise))
     width = innovation.shape[2]
     squared = individual_distances(innovation, predicted, measured)
     landmark = pair_nearest_first(squared, chi_squared_gates(gate_probability, width, 1)[1])
@@ -76,7 +74,7 @@ def joint_compatible(
 
     Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
     """
-    innovation, predicted, measured = _checked(innovations, predicted_covariance, noise)
+    innovation, predicted, measured = map(_contiguous, (innovations, predicted_covariance, noise))
     n, _, width = innovation.shape
     squared = individual_distances(innovation, predicted, measured)
     gates = chi_squared_gates(gate_probability, width, n)
@@ -96,28 +94,15 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
     return _gates(float(probability), int(width), max(int(most_pairs), 1)).copy()
 
 
+def _contiguous(values: ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
 @cache
 def _gates(probability: float, width: int, most_pairs: int) -> FloatArray:
     gates = np.zeros(most_pairs + 1)
     gates[1:] = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
     return gates
-
-
-def _checked(
-    innovations: ArrayLike, predicted_covariance: ArrayLike, noise: ArrayLike
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    innovation = np.ascontiguousarray(innovations, dtype=np.float64)
-    predicted = np.ascontiguousarray(predicted_covariance, dtype=np.float64)
-    measured = np.ascontiguousarray(noise, dtype=np.float64)
-    if innovation.ndim != 3:
-        raise SlamError(f"innovations {innovation.shape}: expected (rows, landmarks, numbers)")
-    n, m, width = innovation.shape
-    if predicted.shape != (m * width, m * width) or measured.shape != (n, width, width):
-        raise SlamError(
-            f"predicted covariance {predicted.shape}, noise {measured.shape}: expected "
-            f"{(m * width, m * width)} and {(n, width, width)} with innovations {innovation.shape}"
-        )
-    return innovation, predicted, measured
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

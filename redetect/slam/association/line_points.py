@@ -17,21 +17,224 @@ those verticals in the problem, and the search is repeated with narrower gates.
 
 from __future__ import annotations
 
+import heapq
+import math
 from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
-from redetect.slam.association.line_points_kernels import Rays, Search, crossings, take_points
-from redetect.slam.association.loop_path import intersect_bearings, solve_path
+from redetect.plane import apply
+from redetect.slam.association.loop_closing import intersect_bearings, solve_path
 from redetect.slam.errors import SlamError
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map
+from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import Recording
-from redetect.storage.bounds import ABOVE_0, PROBABILITY, demand, whole
+from redetect.storage.bounds import ABOVE_0, PROBABILITY, Positive, demand_fields, whole
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+
+class Rays(NamedTuple):
+    """Rows of verticals in the map, by frame and bearing."""
+
+    row: IntArray  # (n,): which row of the run each ray is
+    centre: FloatArray  # (n, 2): the camera's place (m)
+    # (n,): its direction in the map, and in the robot frame (rad).
+    angle: FloatArray
+    bearing: FloatArray
+    sigma: FloatArray  # (n,): of it (rad)
+    frame: IntArray  # (n,): ascending from 0
+    start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f
+    heading: FloatArray  # (F, 2): cosine and sine of the robot's
+    widest_rad: float  # half the field of view, below a right angle
+
+
+class Search(NamedTuple):
+    """How points are searched."""
+
+    detected: float  # probability that a vertical in view gives a row
+    gate: float  # standard deviations within which a ray may be that row
+    window: int  # frames before and after a crossing that are considered
+    least_score: float  # of a point
+    widest_sigma: float  # of all rays (rad)
+
+
+_NEAREST_M = 0.3
+_FEWEST_ROWS = 3
+_ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _wrapped(angle: float) -> float:
+    return float((angle + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[float, float]:
+    """How far from their origins two rays cross; negative behind."""
+    ux, uy = math.sin(angle[i]), -math.cos(angle[i])
+    vx, vy = math.sin(angle[j]), -math.cos(angle[j])
+    determinant = vx * uy - ux * vy
+    if abs(determinant) < 1e-9:
+        return -1.0, -1.0
+    x, y = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
+    return (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def crossings(
+    rays: Rays,
+    gaps: IntArray,
+    least_parallax: float,
+    farthest_m: float,
+) -> tuple[FloatArray, IntArray]:
+    """Where rays of frames that are some steps apart cross, ahead of both.
+
+    Takes `gaps` (g,); returns `points` (k, 2), `frames` (k,).
+    """
+    centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
+    points = []
+    frames = []
+    for i in range(len(angle)):
+        for gap in gaps:
+            other = frame[i] + gap
+            if other >= len(start) - 1:
+                continue
+            for j in range(start[other], start[other + 1]):
+                parallax = abs(_wrapped(angle[j] - angle[i]))
+                if parallax < least_parallax * math.hypot(sigma[i], sigma[j]):
+                    continue
+                near, far = _crossing(centre, angle, i, j)
+                if min(near, far) < _NEAREST_M or max(near, far) > farthest_m:
+                    continue
+                points.append(centre[i, 0] + near * math.sin(angle[i]))
+                points.append(centre[i, 1] - near * math.cos(angle[i]))
+                frames.append(frame[i])
+    return np.array(points, dtype=np.float64).reshape(-1, 2), np.array(frames, dtype=np.int64)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _best_run(
+    point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, search: Search
+) -> tuple[float, IntArray]:
+    """The unbroken stretch of frames with the most evidence for a vertical at a point.
+
+    A frame in which a ray passes within the gate adds the logarithm of how much likelier the ray is
+    from there than from anywhere (its `worth`, at the best); one without such a ray, though the
+    point is in the field of view, adds that of the probability to miss a vertical. Returns the sum
+    over the stretch, and its rays.
+    """
+    reach = search.gate * search.widest_sigma
+    start, bearing, sigma = rays.start, rays.bearing, rays.sigma
+    first, last = max(0, frame - search.window), min(len(start) - 1, frame + search.window)
+    rows = np.full(last - first, -1, dtype=np.int64)
+    widest = math.tan(rays.widest_rad)
+    missed = math.log(1.0 - search.detected)
+    best, total = 0.0, 0.0
+    best_first, best_last, began = first, first, first
+    for f in range(first, last):
+        if start[f] == start[f + 1]:
+            continue
+        x, y = point[0] - rays.centre[start[f], 0], point[1] - rays.centre[start[f], 1]
+        if x * x + y * y < _NEAREST_M**2:
+            continue
+        cos, sin = rays.heading[f, 0], rays.heading[f, 1]
+        left, ahead = cos * x + sin * y, sin * x - cos * y
+        if abs(left) > widest * ahead:
+            continue
+        seen = math.atan2(left, ahead)
+        gained = missed
+        i, end = start[f], start[f + 1]
+        while i < end:  # the first ray that is near enough
+            middle = (i + end) // 2
+            if bearing[middle] < seen - reach:
+                i = middle + 1
+            else:
+                end = middle
+        while i < start[f + 1] and bearing[i] <= seen + reach:
+            off = (seen - bearing[i]) / sigma[i]
+            if free[i] and abs(off) < search.gate and worth[i] - 0.5 * off * off > gained:
+                gained, rows[f - first] = worth[i] - 0.5 * off * off, i
+            i += 1
+        if total <= 0.0:
+            total, began = 0.0, f
+        total += gained
+        if total > best:
+            best, best_first, best_last = total, began, f + 1
+    used = rows[best_first - first : best_last - first]
+    return best, used[used >= 0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
+    """The point that some rays pass closest to: robust least squares, from a point near it."""
+    for _ in range(4):
+        a, b, c, d, e = 1e-6, 0.0, 1e-6, 0.0, 0.0
+        for i in used:
+            x, y = point[0] - rays.centre[i, 0], point[1] - rays.centre[i, 1]
+            off = _wrapped(math.atan2(x, -y) - rays.angle[i])
+            squared = x * x + y * y
+            by_x, by_y = -y / squared, x / squared
+            variance = rays.sigma[i] ** 2
+            weight = 1.0 / (variance + 0.25 * off * off)
+            a += weight * by_x * by_x
+            b += weight * by_x * by_y
+            c += weight * by_y * by_y
+            d += weight * by_x * off
+            e += weight * by_y * off
+        determinant = a * c - b * b
+        change = np.array([(c * d - b * e) / determinant, (a * e - b * d) / determinant])
+        if not math.hypot(change[0], change[1]) <= 1.0:  # rays nearly parallel
+            break
+        point = point - change
+    return point
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def take_points(
+    points: FloatArray, frames: IntArray, rays: Rays, search: Search
+) -> tuple[IntArray, FloatArray]:
+    """The best of all points with the rays that it takes, then the best by the other rays, ...
+
+    Takes `points` (k, 2), `frames` (k,); returns `labels` (n,), `found` (m, 2).
+    """
+    # How much likelier a ray is from a vertical than from anywhere, as a logarithm.
+    clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)
+    worth = np.log(search.detected / (rays.sigma * _ROOT_TWO_PI * clutter))
+    free = np.ones(len(rays.angle), dtype=np.bool_)
+    labels = np.full(len(free), -1, dtype=np.int64)
+    found = np.empty((len(free), 2))
+    count = 0
+    # Scores only fall as rows are assigned: a point still first when rescored is the best.
+    waiting = [(0.0, 0) for _ in range(0)]
+    for k in range(len(points)):
+        score, _ = _best_run(points[k], frames[k], rays, free, worth, search)
+        if score >= search.least_score:
+            waiting.append((-score, k))
+    heapq.heapify(waiting)
+    while len(waiting) > 0:
+        k = heapq.heappop(waiting)[1]
+        point = points[k]
+        score, used = _best_run(point, frames[k], rays, free, worth, search)
+        if score < search.least_score:
+            continue
+        if len(waiting) > 0 and score < -waiting[0][0]:
+            heapq.heappush(waiting, (-score, k))
+            continue
+        for _ in range(3):
+            better = _meeting_point(rays, used, point)
+            improved, others = _best_run(better, frames[k], rays, free, worth, search)
+            if improved <= score:
+                break
+            point, score, used = better, improved, others
+        if len(used) >= _FEWEST_ROWS:
+            labels[used] = count
+            free[used] = False
+            found[count] = point
+            count += 1
+    return labels, found[:count].copy()
+
 
 # How far beyond the field of view a bearing may be.
 _WIDER_RAD = 0.005
@@ -44,37 +247,25 @@ class PointSettings:
     """Settings of the search for points."""
 
     # Standard deviation of the path's heading in a single frame, for each round (degrees).
-    heading_sigma_deg: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    heading_sigma_deg: Annotated[tuple[float, ...], ABOVE_0] = (0.2, 0.15, 0.1, 0.1)
     # Factor on the rows' standard deviations, which do not include the detector's errors at edges
     # that are close together.
-    sigma_scale: float = 1.5
-    path_sigma_scale: float = 2.0  # the same factor for rows that correct the path
-    detected: float = 0.7  # probability that a vertical in view gives a row
-    gate_sigmas: float = 3.0  # a ray that passes farther from a point does not support it
-    least_score: float = 4.0  # least log likelihood ratio of the rows with a point to those without
+    sigma_scale: Positive = 1.5
+    path_sigma_scale: Positive = 2.0  # the same factor for rows that correct the path
+    detected: Annotated[float, PROBABILITY] = 0.7  # probability that a vertical in view gives a row
+    gate_sigmas: Positive = 3.0  # a ray that passes farther from a point does not support it
+    # Least log likelihood ratio of the rows with a point to those without
+    least_score: Positive = 4.0
     # Numbers of steps between frames whose rays are intersected.
-    gaps: tuple[int, ...] = (2, 4, 7, 11)
-    least_parallax_sigmas: float = 4.0  # least angle between two rays that are intersected
-    farthest_m: float = 14.0  # intersections farther away are ignored
-    window_frames: int = 40  # number of frames before and after an intersection that are scored
-    path_rows: int = 6  # points of fewer rows do not correct the path
+    gaps: Annotated[tuple[int, ...], whole(1)] = (2, 4, 7, 11)
+    least_parallax_sigmas: Positive = 4.0  # least angle between two rays that are intersected
+    farthest_m: Positive = 14.0  # intersections farther away are ignored
+    # Number of frames before and after an intersection that are scored
+    window_frames: Annotated[int, whole(1)] = 40
+    path_rows: Annotated[int, whole(1)] = 6  # points of fewer rows do not correct the path
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            heading_sigma_deg=ABOVE_0,
-            sigma_scale=ABOVE_0,
-            path_sigma_scale=ABOVE_0,
-            detected=PROBABILITY,
-            gate_sigmas=ABOVE_0,
-            least_score=ABOVE_0,
-            gaps=whole(1),
-            least_parallax_sigmas=ABOVE_0,
-            farthest_m=ABOVE_0,
-            window_frames=whole(1),
-            path_rows=whole(1),
-        )
+        demand_fields(self, SlamError)
 
 
 def lines_by_points(
@@ -93,31 +284,46 @@ def lines_by_points(
     `labels` (m,), `path` (N + 1, 3).
     """
     setting = settings or PointSettings()
+    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
+    scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
+
+    def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
+        """Least squares over poses, discs and points, again without the rows that are far off."""
+        count = len(points)
+        used = (labels >= 0) & (
+            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
+        )
+        for _ in range(3):
+            solution = solve_path(
+                scaled,
+                circle_labels,
+                np.where(used, labels, count),
+                path,
+                np.concatenate([points, [[np.nan, np.nan]]]),
+                camera_xy=camera_xy,
+                sigma_scale=disc_sigma_scale,
+            )
+            path = solution.path
+            places = solution.line_xy[np.where(used, labels, 0)]
+            bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
+            off = wrap_angle(bearing - recording.lines.bearing_rad)
+            used &= np.abs(off) < 4.0 * sigma
+        return path
+
     for _ in range(_FIRST_ROUNDS):
         places = intersect_bearings(recording, path, line_labels, camera_xy=camera_xy)
         known = np.isfinite(places[:, 0])
         if not np.any(known):
             break
         label_of = np.where(known, np.cumsum(known) - 1, -1)
-        path = _path_with_points(
-            recording,
-            path,
-            circle_labels,
-            label_of[line_labels],
-            places[known],
-            setting,
-            camera_xy,
-            disc_sigma_scale,
-        )
+        path = corrected(path, label_of[line_labels], places[known])
     labels = np.full(len(line_labels), -1, dtype=np.int64)
     last = len(setting.heading_sigma_deg) - 1
     for number, sigma_deg in enumerate(setting.heading_sigma_deg):
         rays = rays_of(recording, path, camera_xy, setting.sigma_scale, np.radians(sigma_deg))
         labels, points = find_points(rays, setting)
         if number < last and len(points):
-            path = _path_with_points(
-                recording, path, circle_labels, labels, points, setting, camera_xy, disc_sigma_scale
-            )
+            path = corrected(path, labels, points)
     rest = labels < 0
     _, own = np.unique(line_labels[rest], return_inverse=True)
     labels[rest] = labels.max(initial=-1) + 1 + own
@@ -141,7 +347,7 @@ def rays_of(
     poses = path[frame + 1]
     return Rays(
         row=row,
-        centre=disc_in_map(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
+        centre=apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2))),
         angle=bearing + poses[:, 2],
         bearing=bearing,
         sigma=np.hypot(sigma_scale * lines.sigma_rad[row], heading_sigma_rad),
@@ -174,38 +380,3 @@ def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArra
     labels = np.empty(len(taken), dtype=np.int64)
     labels[rays.row] = taken
     return labels, found
-
-
-def _path_with_points(
-    recording: Recording,
-    path: FloatArray,
-    circle_labels: IntArray,
-    labels: IntArray,
-    points: FloatArray,
-    setting: PointSettings,
-    camera_xy: tuple[float, float],
-    disc_sigma_scale: float,
-) -> FloatArray:
-    """Least squares over poses, discs and points, done again without the rows that are far off."""
-    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
-    scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
-    count = len(points)
-    used = (labels >= 0) & (
-        np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
-    )
-    for _ in range(3):
-        solution = solve_path(
-            scaled,
-            circle_labels,
-            np.where(used, labels, count),
-            path,
-            np.concatenate([points, [[np.nan, np.nan]]]),
-            camera_xy=camera_xy,
-            sigma_scale=disc_sigma_scale,
-        )
-        path = solution.path
-        places = solution.line_xy[np.where(used, labels, 0)]
-        bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
-        off = wrap_angle(bearing - recording.lines.bearing_rad)
-        used &= np.abs(off) < 4.0 * sigma
-    return path

@@ -10,25 +10,135 @@ J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 4
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 from scipy.sparse import csr_array
 from scipy.stats import binom
 
-from redetect.slam.association.loops_kernels import best_motion
+from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.plane import apply, fitted, rotation
 from redetect.slam.errors import SlamError
-from redetect.storage.bounds import ABOVE_0, LIMIT, NOT_NEGATIVE, demand, whole
+from redetect.storage.bounds import Limit, NotNegative, Positive, demand_fields, whole
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+# Width of the cells in which the nearest landmark is looked up.
+_CELL_M = 0.05
+# Landmarks are in order of first sight, so neighbours in this order are near each other.
+_NEIGHBOURS = 5
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _nearest_by_cell(fixed: FloatArray, reach_m: float) -> tuple[float, float, IntArray]:
+    """Low corner, and for every cell the landmark next to its centre, -1 with none in reach."""
+    margin = reach_m + _CELL_M
+    low_x, low_y = fixed[:, 0].min() - margin, fixed[:, 1].min() - margin
+    columns = int((fixed[:, 0].max() + margin - low_x) / _CELL_M) + 1
+    rows = int((fixed[:, 1].max() + margin - low_y) / _CELL_M) + 1
+    nearest = np.full((columns, rows), -1, dtype=np.int64)
+    distance = np.full((columns, rows), margin * margin)
+    span = int(margin / _CELL_M) + 1
+    for j in range(len(fixed)):
+        column = int((fixed[j, 0] - low_x) / _CELL_M)
+        row = int((fixed[j, 1] - low_y) / _CELL_M)
+        for a in range(max(column - span, 0), min(column + span + 1, columns)):
+            for b in range(max(row - span, 0), min(row + span + 1, rows)):
+                off_x = low_x + (a + 0.5) * _CELL_M - fixed[j, 0]
+                off_y = low_y + (b + 0.5) * _CELL_M - fixed[j, 1]
+                squared = off_x * off_x + off_y * off_y
+                if squared < distance[a, b]:
+                    distance[a, b] = squared
+                    nearest[a, b] = j
+    return low_x, low_y, nearest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def best_motion(
+    moved: FloatArray,
+    fixed: FloatArray,
+    length_tolerance_m: float,
+    least_length_m: float,
+    reach_m: float,
+    most_turn_rad: float,
+    most_shift_m: float,
+    least_agreeing: int,
+) -> tuple[float, float, float, int, float, int]:
+    """The motion under which most landmarks of one constellation fall on those of another.
+
+    Every pair of landmarks of the first with every pair of the second of the same length says what
+    the motion would be; it is counted how many landmarks agree.
+
+    Takes `moved` (n, 2), `fixed` (m, 2); returns `turn_rad`, `shift_x, shift_y`, `agreeing`,
+    `squared`, `tried`.
+    """
+    n, m = len(moved), len(fixed)
+    centre_x, centre_y = 0.0, 0.0
+    for i in range(n):
+        centre_x += moved[i, 0] / n
+        centre_y += moved[i, 1] / n
+    best_turn, best_x, best_y = 0.0, 0.0, 0.0
+    best_count, best_squared, tried = least_agreeing - 1, 0.0, 0
+    low_x, low_y, nearest = _nearest_by_cell(fixed, reach_m)
+    columns, rows = nearest.shape
+    squared_length = np.empty((m, m))
+    for c in range(m):
+        for d in range(m):
+            squared_length[c, d] = (fixed[d, 0] - fixed[c, 0]) ** 2 + (
+                fixed[d, 1] - fixed[c, 1]
+            ) ** 2
+    for a in range(n):
+        for b in range(a + 1, min(a + 1 + _NEIGHBOURS, n)):
+            ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]
+            length = math.hypot(ab_x, ab_y)
+            if length < least_length_m:
+                continue
+            shortest = (length - length_tolerance_m) ** 2
+            longest = (length + length_tolerance_m) ** 2
+            for c in range(m):
+                for d in range(m):
+                    if not shortest <= squared_length[c, d] <= longest:
+                        continue
+                    cd_x, cd_y = fixed[d, 0] - fixed[c, 0], fixed[d, 1] - fixed[c, 1]
+                    turn = math.atan2(ab_x * cd_y - ab_y * cd_x, ab_x * cd_x + ab_y * cd_y)
+                    if abs(turn) > most_turn_rad:
+                        continue
+                    cos, sin = math.cos(turn), math.sin(turn)
+                    # The middle of one pair goes to the middle of the other.
+                    x = 0.5 * (moved[a, 0] + moved[b, 0]) - centre_x
+                    y = 0.5 * (moved[a, 1] + moved[b, 1]) - centre_y
+                    new_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
+                    new_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
+                    shift_x, shift_y = new_x - centre_x, new_y - centre_y
+                    if math.hypot(shift_x, shift_y) > most_shift_m:
+                        continue
+                    tried += 1
+                    count, squared = 0, 0.0
+                    for i in range(n):
+                        if count + n - i < best_count:
+                            break
+                        x, y = moved[i, 0] - centre_x, moved[i, 1] - centre_y
+                        at_x, at_y = new_x + cos * x - sin * y, new_y + sin * x + cos * y
+                        column = int((at_x - low_x) / _CELL_M)
+                        row = int((at_y - low_y) / _CELL_M)
+                        if at_x < low_x or at_y < low_y or column >= columns or row >= rows:
+                            continue
+                        j = nearest[column, row]
+                        if j >= 0:
+                            off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
+                            distance = off_x * off_x + off_y * off_y
+                            if distance <= reach_m * reach_m:
+                                count += 1
+                                squared += distance
+                    if count > best_count or (count == best_count and squared < best_squared):
+                        best_turn, best_x, best_y = turn, shift_x, shift_y
+                        best_count, best_squared = count, squared
+    if best_count < least_agreeing:
+        best_count = 0
+    return best_turn, best_x, best_y, best_count, best_squared, tried
+
 
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
@@ -41,44 +151,29 @@ SHARED_BY_ONE_PLACE = 3
 class LoopSettings:
     """Settings of the search for loops."""
 
-    stretch_frames: int = 50  # frames whose landmarks form a constellation
-    stride_frames: int = 10  # frames from one constellation to the next
+    stretch_frames: Annotated[int, whole(1)] = 50  # frames whose landmarks form a constellation
+    stride_frames: Annotated[int, whole(1)] = 10  # frames from one constellation to the next
     # By how much the lengths of two pairs of landmarks may differ to vote.
-    length_tolerance_m: float = 0.08
-    least_length_m: float = 0.8  # pairs shorter than this do not vote
-    reach_m: float = 0.12  # largest distance of landmarks that agree
+    length_tolerance_m: Positive = 0.08
+    least_length_m: NotNegative = 0.8  # pairs shorter than this do not vote
+    reach_m: Positive = 0.12  # largest distance of landmarks that agree
     # Largest motion that brings one constellation onto the other.
-    most_turn_rad: float = 0.8
-    most_shift_m: float = 8.0
+    most_turn_rad: Limit = 0.8
+    most_shift_m: Limit = 8.0
     # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: int = 7
+    least_agreeing: Annotated[int, whole(2)] = 7
     # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: float = 1e-3
+    false_alarms: Positive = 1e-3
     # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
     # `earlier_step`-th of these.
-    later_step: int = 1
-    earlier_step: int = 2
+    later_step: Annotated[int, whole(1)] = 1
+    earlier_step: Annotated[int, whole(1)] = 2
     # A stretch that shares landmarks with one at least this many frames earlier is part of the map
     # already and not matched again; 0 to match all.
-    attached_frames: int = 0
+    attached_frames: Annotated[int, whole(0)] = 0
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            stretch_frames=whole(1),
-            stride_frames=whole(1),
-            length_tolerance_m=ABOVE_0,
-            least_length_m=NOT_NEGATIVE,
-            reach_m=ABOVE_0,
-            most_turn_rad=LIMIT,
-            most_shift_m=LIMIT,
-            least_agreeing=whole(2),
-            false_alarms=ABOVE_0,
-            later_step=whole(1),
-            earlier_step=whole(1),
-            attached_frames=whole(0),
-        )
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,17 +296,6 @@ def find_matches(
     return [matches[n] for n in order]
 
 
-def fit_motion(moved: FloatArray, fixed: FloatArray) -> tuple[float, FloatArray]:
-    """The rigid motion of least squares between paired points of the plane.
-
-    Takes `moved, fixed` (n, 2); returns `turn_rad`, `shift` (2,).
-    """
-    first, second = moved.mean(axis=0), fixed.mean(axis=0)
-    a, b = moved - first, fixed - second
-    turn = float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
-    return turn, second - _turned(first, turn)
-
-
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
     """Points of two sets that are each other's nearest, and near.
 
@@ -249,13 +333,13 @@ def _refined(
     """Match by least squares over all landmarks that agree; None if too few agree then."""
     place, target = later.xy[moved], earlier.xy[fixed]
     centre = place.mean(axis=0)
-    shift = centre + offset - _turned(centre, turn)
+    pose = np.array([*(centre + offset - rotation(turn) @ centre), turn])
     for _ in range(5):
-        pairs = mutual_pairs(target, _turned(place, turn) + shift, settings.reach_m)
+        pairs = mutual_pairs(target, apply(pose, place), settings.reach_m)
         if len(pairs) < settings.least_agreeing:
             return None
-        turn, shift = fit_motion(place[pairs[:, 1]], target[pairs[:, 0]])
-    after = _turned(place, turn) + shift
+        pose = fitted(place[pairs[:, 1]], target[pairs[:, 0]])
+    after = apply(pose, place)
     nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
     chance = len(target) * np.pi * settings.reach_m**2 / _covered_area(target)
@@ -263,8 +347,8 @@ def _refined(
         earlier.middle_frame,
         later.middle_frame,
         np.stack([earlier.labels[fixed][pairs[:, 0]], later.labels[moved][pairs[:, 1]]], axis=1),
-        turn,
-        shift,
+        float(pose[2]),
+        pose[:2],
         log10_false_alarms(len(pairs), present, chance, tried),
     )
 
@@ -277,8 +361,3 @@ def _covered_area(xy: FloatArray) -> float:
         ys[None, None, :] - xy[:, 1, None, None]
     ) ** 2
     return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
-
-
-def _turned(xy: FloatArray, turn: float) -> FloatArray:
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.stack([cos * xy[..., 0] - sin * xy[..., 1], sin * xy[..., 0] + cos * xy[..., 1]], -1)

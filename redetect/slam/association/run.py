@@ -3,7 +3,7 @@
 First, every row is associated with recently seen landmarks
 (`redetect.slam.association.frame_to_frame`). The result is nearly always right, but a landmark that
 is seen again later has several labels. Then loops are detected (`redetect.slam.association.loops`)
-and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_path`) in
+and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_closing`) in
 rounds. The first round searches within the possible drift of the odometry, later rounds everywhere,
 since each closed loop reduces the map's distortion. Verticals, which the local association often
 confuses, are then associated again along the path that the discs give
@@ -14,32 +14,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.landmarks import wrap_angle
-from redetect.slam.association.frame_to_frame import LocalSettings, associate_locally
+from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.plane import rotation
+from redetect.slam.association.frame_to_frame import (
+    LocalAssociation,
+    LocalSettings,
+    associate_locally,
+    tilt_jacobian,
+)
 from redetect.slam.association.line_points import PointSettings, lines_by_points
-from redetect.slam.association.local_map import tilt_jacobian
 from redetect.slam.association.loop_closing import (
     closed_path,
     in_order,
+    intersect_bearings,
     merge_labels,
     pairs_by_votes,
     pairs_in_place,
+    solve_path,
 )
-from redetect.slam.association.loop_path import LabelledMap, intersect_bearings, solve_path
 from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
 from redetect.slam.errors import SlamError
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-from redetect.slam.models.motion import chain_steps, rotation
-from redetect.slam.recording import Recording
-from redetect.storage.bounds import PROBABILITY, demand, whole
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.slam.recording import LineRows, Recording
+from redetect.storage.bounds import PROBABILITY, demand_fields, whole
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
 # Share of the labels of one landmark that are compatible by position.
@@ -77,18 +82,12 @@ class AssociateSettings:
     map_level: bool = True
     loops: LoopSettings = field(default_factory=LoopSettings)
     points: PointSettings = field(default_factory=PointSettings)
-    most_rounds: int = 6
-    kept_probability: float = 0.99
-    fewest_rows: int = 3
+    most_rounds: Annotated[int, whole(1)] = 6
+    kept_probability: Annotated[float, PROBABILITY] = 0.99
+    fewest_rows: Annotated[int, whole(1)] = 3
 
     def __post_init__(self) -> None:
-        demand(
-            self,
-            SlamError,
-            most_rounds=whole(1),
-            kept_probability=PROBABILITY,
-            fewest_rows=whole(1),
-        )
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,64 +130,13 @@ def associate_run(
     """
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)
-    both = len(recording.circles) > 0 and len(recording.lines) > 0
-    local = associate_locally(
-        recording,
-        # Bearings say more of a frame's heading than discs, whose sway would only blur it.
-        replace(setting.local, tilt_sigma_rad=0.0) if both else setting.local,
-        camera_xy=camera_xy,
-        progress=lambda done: report(f"frame {done} of {len(recording)}"),
-    )
-    incomplete = local.incomplete
-    if both:
-        # Discs help to associate lines; lines are often confused and would only harm the discs.
-        discs_alone = associate_locally(_without_lines(recording), setting.local)
-        local = replace(local, circle_labels=discs_alone.circle_labels)
+    local = _associated_locally(recording, setting.local, camera_xy, report)
     circle_labels, line_labels = local.circle_labels, local.line_labels
-    matches: list[Match] = []
+    matches: tuple[Match, ...] = ()
     path = None
     if setting.map_level:
-        # The map is built from discs if there are any: their rows give positions.
-        by_discs = len(recording.circles) > 0
-        rows = recording.circles if by_discs else recording.lines
-        labels = circle_labels if by_discs else line_labels
-        solution = _solved(recording, by_discs, labels, None, setting, camera_xy)
-        loops = setting.loops
-        swayed = _swayed(recording, setting.local)
-        for number in range(setting.most_rounds):
-            xy = solution.circle_xy if by_discs else solution.line_xy
-            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
-            found = find_matches(
-                stretches,
-                loops,
-                lambda text, n=number: report(f"round {n + 1}: {text}"),  # type: ignore[misc]
-            )
-            labels, matched = merge_labels(rows.frame, labels, pairs_by_votes(found))
-            path = closed_path(solution.path, found) if found else solution.path
-            solution = _solved(recording, by_discs, labels, path, setting, camera_xy)
-            xy = solution.circle_xy if by_discs else solution.line_xy
-            stretches = stretches_of(rows.frame, labels, xy, len(recording), loops)
-            spread = _isotropic(len(xy), loops.reach_m)
-            if by_discs:
-                spread = _spread(swayed, solution.path, labels, setting.local.sigma_scale)
-            pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
-            labels, in_place = merge_labels(rows.frame, labels, pairs)
-            if in_place:
-                solution = _solved(recording, by_discs, labels, solution.path, setting, camera_xy)
-            matches += found
-            everywhere = replace(
-                loops,
-                most_turn_rad=np.pi,
-                most_shift_m=np.inf,
-                later_step=2,
-                earlier_step=3,
-                attached_frames=_ATTACHED_FRAMES,
-            )
-            if matched + in_place == 0 and loops == everywhere:
-                break
-            loops = everywhere
-        path = solution.path
-        if by_discs:
+        if len(recording.circles):
+            labels, path, matches = _closed(recording, circle_labels, setting, camera_xy, report)
             circle_labels = _without_clutter(recording, labels, path, setting)
             if len(line_labels):
                 report("verticals on the path of the discs")
@@ -205,49 +153,107 @@ def associate_run(
                     recording, path_of_both, line_labels, setting, camera_xy
                 )
         else:
-            line_labels = labels
+            line_labels, path, matches = _closed(recording, line_labels, setting, camera_xy, report)
     return RunAssociation(
         in_order(circle_labels),
         in_order(line_labels),
         in_order(local.circle_labels),
         in_order(local.line_labels),
-        tuple(matches),
+        matches,
         path,
-        incomplete,
+        local.incomplete,
     )
 
 
-def _solved(
+def _associated_locally(
+    recording: Recording, setting: LocalSettings, camera_xy: tuple[float, float], report: Progress
+) -> LocalAssociation:
+    """Labels from frame to frame; of a run with discs and lines, discs are associated alone."""
+    both = len(recording.circles) > 0 and len(recording.lines) > 0
+    local = associate_locally(
+        recording,
+        # Bearings say more of a frame's heading than discs, whose sway would only blur it.
+        replace(setting, tilt_sigma_rad=0.0) if both else setting,
+        camera_xy=camera_xy,
+        progress=lambda done: report(f"frame {done} of {len(recording)}"),
+    )
+    if not both:
+        return local
+    # Discs help to associate lines; lines are often confused and would only harm the discs.
+    discs_alone = associate_locally(_without_lines(recording), setting)
+    return replace(local, circle_labels=discs_alone.circle_labels)
+
+
+def _closed(
     recording: Recording,
-    by_discs: bool,
     labels: IntArray,
-    path: FloatArray | None,
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
-) -> LabelledMap:
-    """Path and map by discs, or by lines where there are no discs."""
-    line_xy = None
-    if not by_discs:
-        start = chain_steps(recording.steps) if path is None else path
-        line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+    report: Progress,
+) -> tuple[IntArray, FloatArray, tuple[Match, ...]]:
+    """Labels after all loops are closed, the path that they say, and the loops.
+
+    Labels are those of discs if there are any, whose rows give positions, else those of lines.
+    """
+    by_discs = len(recording.circles) > 0
+    frames = recording.circles.frame if by_discs else recording.lines.frame
+    swayed, loops = _swayed(recording, setting.local), setting.loops
     none = np.zeros(len(recording.lines), dtype=np.int64)
-    return solve_path(
-        _swayed(recording, setting.local),
-        labels if by_discs else none[:0],
-        none if by_discs else labels,
-        path,
-        line_xy,
-        camera_xy=camera_xy,
-        sigma_scale=setting.local.sigma_scale,
+    everywhere = replace(
+        loops,
+        most_turn_rad=np.pi,
+        most_shift_m=np.inf,
+        later_step=2,
+        earlier_step=3,
+        attached_frames=_ATTACHED_FRAMES,
     )
+
+    def solved(path: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Path and places of the landmarks by the labels."""
+        line_xy = None
+        if not by_discs:
+            start = chain_steps(recording.steps) if path is None else path
+            line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+        found = solve_path(
+            swayed,
+            labels if by_discs else none[:0],
+            none if by_discs else labels,
+            path,
+            line_xy,
+            camera_xy=camera_xy,
+            sigma_scale=setting.local.sigma_scale,
+        )
+        return found.path, found.circle_xy if by_discs else found.line_xy
+
+    path, xy = solved(None)
+    matches: list[Match] = []
+    for number in range(1, setting.most_rounds + 1):
+        stretches = stretches_of(frames, labels, xy, len(recording), loops)
+        found = find_matches(stretches, loops, partial(_of_round, report, number))
+        labels, matched = merge_labels(frames, labels, pairs_by_votes(found))
+        path, xy = solved(closed_path(path, found) if found else path)
+        stretches = stretches_of(frames, labels, xy, len(recording), loops)
+        spread = _isotropic(len(xy), loops.reach_m)
+        if by_discs:
+            spread = _spread(swayed, path, labels, setting.local.sigma_scale)
+        pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
+        labels, in_place = merge_labels(frames, labels, pairs)
+        if in_place:
+            path, xy = solved(path)
+        matches += found
+        if matched + in_place == 0 and loops == everywhere:
+            break
+        loops = everywhere
+    return labels, path, tuple(matches)
+
+
+def _of_round(report: Progress, number: int, text: str) -> None:
+    report(f"round {number}: {text}")
 
 
 def _without_lines(recording: Recording) -> Recording:
-    none = recording.lines
-    empty = replace(
-        none, frame=none.frame[:0], bearing_rad=none.bearing_rad[:0], sigma_rad=none.sigma_rad[:0]
-    )
-    return replace(recording, lines=replace(empty, ids=()))
+    none = np.zeros(0)
+    return replace(recording, lines=LineRows(none.astype(np.int64), none, none, ()))
 
 
 def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
@@ -270,21 +276,13 @@ def _without_clutter(
     # The second time without the rows that the first one found.
     for _ in range(2):
         known, numbers = np.unique(labels[kept], return_inverse=True)
-        fitting = replace(
-            circles,
-            frame=circles.frame[kept],
-            xy=circles.xy[kept],
-            covariance=circles.covariance[kept],
-        )
-        solution = solve_path(
-            _without_lines(replace(recording, circles=fitting)), numbers, none, path
-        )
+        fitting = _without_lines(replace(recording, circles=circles.only(kept)))
+        solution = solve_path(fitting, numbers, none, path)
         path = solution.path
         places = np.full((int(labels.max(initial=-1)) + 1, 2), np.nan)
         places[known] = solution.circle_xy
         off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
-        whitened = np.linalg.solve(circles.covariance, off[..., None])[..., 0]
-        kept = np.sum(off * whitened, axis=1) <= gate
+        kept = squared_mahalanobis(off, circles.covariance) <= gate
         kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= setting.fewest_rows
     return np.where(kept, labels, -1)
 

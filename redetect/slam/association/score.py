@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 
-IntArray = NDArray[np.int64]
+from redetect.array_types import IntArray
 
 
 @dataclass(frozen=True)
@@ -104,14 +103,7 @@ def _pairs(
     )
     rows = np.bincount(kind, minlength=len(kinds))
     of_label = np.bincount(label, minlength=found)
-    totals = (
-        int(rows @ (alike @ rows)),
-        int(of_label @ of_label),
-        int((alike @ cells).multiply(cells).sum()),
-    )
+    totals = rows @ (alike @ rows), of_label @ of_label, (alike @ cells).multiply(cells).sum()
     # Each pair was counted twice, and each row with itself.
-    return (
-        (totals[0] - len(known)) // 2,
-        (totals[1] - len(known)) // 2,
-        (totals[2] - len(known)) // 2,
-    )
+    of_landmark, of_one_label, of_both = ((int(total) - len(known)) // 2 for total in totals)
+    return of_landmark, of_one_label, of_both

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -18,13 +17,12 @@ from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, wri
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
-from redetect.slam.commands.inputs import read_run_of
+from redetect.slam.commands.files import demand_free, landmark_files, read_run_of, write_json
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
-from redetect.storage import OutputExistsError, write_whole
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, PROBABILITY, demand, from_to, whole
+from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.storage.bounds import NOT_NEGATIVE, demand, from_to, whole
 
 #: Of each kind's rows those before and those after the map level.
 Scores = dict[str, dict[str, AssociationScore]]
@@ -35,15 +33,10 @@ def perform(options: Associate) -> int:
     demand(
         options,
         SlamError,
-        gate_probability=PROBABILITY,
-        kept_probability=PROBABILITY,
-        fewest_rows=whole(1),
-        sigma_scale=ABOVE_0,
         tilt_sigma_deg=from_to(0.0, 45.0),
         noise=NOT_NEGATIVE,
         seed=whole(0),
     )
-    circles = options.circles or not options.lines
     settings = AssociateSettings(
         local=LocalSettings(
             method=options.method,
@@ -55,12 +48,10 @@ def perform(options: Associate) -> int:
         kept_probability=options.kept_probability,
         fewest_rows=options.fewest_rows,
     )
-    sources = _sources(options, circles)
+    sources = landmark_files(options)
     targets = [_target(options.output, source, len(sources) > 1) for source in sources]
     report = targets[0].with_suffix(".json")
-    for path in (*targets, report):
-        if path.exists() and not options.force:
-            raise OutputExistsError(path)
+    demand_free([*targets, report], overwrite=options.force)
     recording, centre = read_run_of(options)
     camera_xy = (float(centre[0]), float(centre[1]))
 
@@ -100,8 +91,7 @@ def perform(options: Associate) -> int:
         "seed": options.seed,
         "runs": runs,
     }
-    with write_whole(report, overwrite=options.force) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    write_json(report, content, overwrite=options.force)
     return 0
 
 
@@ -150,23 +140,18 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
 
 def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
     """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was."""
-    counts = {
-        kind: sum(isinstance(row.record, kind) for row in rows)
-        for kind in (CircleLandmark, LineLandmark)
-    }
-    expected = (len(found.circle_labels), len(found.line_labels))
-    for count, size in zip(counts.values(), expected):
-        if count not in (0, size):
-            raise SlamError(f"{source}: {count} rows of a kind: expected the {size} associated")
-    circle, line = (
-        iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
-        for labels in (found.circle_labels, found.line_labels)
-    )
+    numbers: dict[type, Iterator[int]] = {}
+    for kind, labels in ((CircleLandmark, found.circle_labels), (LineLandmark, found.line_labels)):
+        count = sum(isinstance(row.record, kind) for row in rows)
+        if count not in (0, len(labels)):
+            raise SlamError(
+                f"{source}: {count} rows of a kind: expected the {len(labels)} associated"
+            )
+        numbers[kind] = iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
     for row in rows:
-        if isinstance(row.record, CircleLandmark):
-            yield row.with_record(replace(row.record, ids=(next(circle),)))
-        elif isinstance(row.record, LineLandmark):
-            yield row.with_record(replace(row.record, ids=(next(line),)))
+        if isinstance(row.record, CircleLandmark | LineLandmark):
+            number = next(numbers[type(row.record)])
+            yield row.with_record(replace(row.record, ids=(number,)))
         else:
             yield row
 
@@ -183,13 +168,6 @@ def _counted(rows: Sequence[Row], found: RunAssociation) -> str:
             if np.any(labels < 0):
                 parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that show none of them"
     return ", ".join(parts) or "no landmarks"
-
-
-def _sources(options: Associate, circles: bool) -> list[Path]:
-    if not options.run.is_dir():
-        return [options.run]
-    wanted = [*([".circles"] if circles else []), *([".lines"] if options.lines else [])]
-    return [landmark_file(options.run, suffix, options.stem) for suffix in wanted]
 
 
 def _target(output: Path | None, source: Path, several: bool) -> Path:

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from redetect import slam
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
-from redetect.slam.commands.inputs import camera_of_run, recording_of
+from redetect.slam.commands.files import camera_of_run, demand_free, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import write_whole
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
@@ -40,9 +40,7 @@ def perform(options: Options) -> int:
     if source.is_dir():
         source = landmark_file(source, ".circles", options.stem)
     target = options.output or source.with_name("audited.circles")
-    for path in (target, target.with_suffix(".csv")):
-        if path.exists() and not options.force:
-            raise OutputExistsError(path)
+    demand_free((target, target.with_suffix(".csv")), overwrite=options.force)
     recording = recording_of(options)
     camera = None
     if options.calibrate or options.pictures:
@@ -133,11 +131,8 @@ def _report(recording: Recording, audit: Audit) -> list[str]:
             f"{f'{x:.2f}, {y:.2f}':<18}{group.own_m:>6.2f} m{group.chi_squared:>13,.1f}  {shows}"
         )
     lines.append(f"{'':<12}{'rows':>8}{'discs':>8}{'chi-squared':>14}{'expected':>10}{'factor':>8}")
-    for name, table in (
-        ("as written", audit.before),
-        ("dropped", audit.dropped),
-        ("mended", audit.mended),
-    ):
+    tables = {"as written": audit.before, "dropped": audit.dropped, "mended": audit.mended}
+    for name, table in tables.items():
         lines.append(
             f"{name:<12}{table.measurements:>8,}{table.landmarks:>8,}{table.chi_squared:>14,.2f}"
             f"{table.expected:>10,}{table.factor:>8.2f}"

@@ -5,22 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 
 from redetect import slam
-from redetect.landmarks.map_file import read_map, write_map, write_path
-from redetect.slam.commands.inputs import default_output, read_reference, read_run_of
-from redetect.slam.commands.outputs import (
+from redetect.landmarks.map_file import (
+    covariance_file,
+    read_map,
+    write_joint_covariance,
+    write_map,
+    write_path,
+)
+from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,
+    default_output,
     demand_free,
     draw_results,
+    flags_of,
+    read_reference,
+    read_run_of,
     timed,
     write_json,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.frames import Associator
 from redetect.slam.filters.report import map_distance, path_distance, summary, table
-from redetect.slam.mapping.covariance_file import covariance_file, write_joint_covariance
 from redetect.slam.options import Ekf
 from redetect.storage.bounds import FINITE, demand
 
@@ -37,7 +45,7 @@ def perform(command: Ekf) -> int:
     demand(command, SlamError, start=FINITE)
     associator = Associator(command.association, command.gate_probability)
     recording, camera_xy = read_run_of(command)
-    demand_free(output, names, overwrite=command.force)
+    demand_free([output / name for name in names], overwrite=command.force)
     ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
     run, time_line = timed(lambda: run_ekf(recording, ekf, associator))
     landmark_map = ekf.landmark_map()
@@ -54,10 +62,11 @@ def perform(command: Ekf) -> int:
         else None
     )
     comments = [f"slam ekf {slam.__version__}: {command.run}"]
+    output.mkdir(parents=True, exist_ok=True)
     write_path(output / PATH_NAME, run.path, comments, overwrite=command.force)
     write_map(output / MAP_NAME, landmark_map, comments, overwrite=command.force)
     write_joint_covariance(output / MAP_NAME, ekf.map_covariance(), overwrite=command.force)
-    content = summary(run, command, distance)
+    content = summary(run, flags_of(command), distance)
     content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
     if from_map is not None:
         content["distance_from_reference_map"] = from_map

@@ -16,31 +16,30 @@ from redetect.landmarks.map_file import (
     read_path,
     write_map,
     write_path,
+    write_table,
 )
-from redetect.slam.commands.inputs import camera_of_run, print_assumed, recording_of
+from redetect.slam.commands.files import demand_free, print_assumed, read_run_of, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import data_sets
-from redetect.slam.formats.axes import MEANING, Axes, covariance_from_dataset, from_dataset
-from redetect.slam.formats.g2o import write_g2o
-from redetect.slam.formats.g2o_frames import (
+from redetect.slam.formats.g2o import (
     demand_readable,
     frames_of_graph,
     graph_of_frames,
     poses_of_run,
+    write_g2o,
 )
 from redetect.slam.formats.g2o_reading import read_g2o
-from redetect.slam.formats.tables import (
-    identified_discs,
-    identified_lines,
-    write_bearings,
-    write_discs,
-    write_odometry,
+from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
+from redetect.slam.formats.text import (
+    MEANING,
+    Axes,
+    covariance_from_dataset,
+    from_dataset,
+    text_rows,
 )
-from redetect.slam.formats.text import text_rows
 from redetect.slam.formats.tum import read_times, read_tum, write_tum
 from redetect.slam.options import Export, Import
 from redetect.slam.recording import demand_landmarks, landmark_file
-from redetect.storage import OutputExistsError
 from redetect.storage.bounds import ABOVE_0, demand
 
 _LANDMARKS = (".circles", ".lines", ".markers")
@@ -122,38 +121,29 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
 
 
 def _export_tables(command: Export) -> int:
-    recording = recording_of(command)
-    bearings = len(recording.lines) > 0
-    camera_xy = np.zeros(2)
-    if bearings:
-        camera = camera_of_run(command.run, command.camera)
-        camera_xy = np.array(camera.robot_from_camera)[:2, 3]
-    folder = command.output
-    names = ["odometry.csv", "discs.csv"]
-    names += ["bearings.csv"] if bearings else []
-    names += ["path.csv", "map.csv"] if command.solution is not None else []
-    if not command.force:  # before the first is written: all or none
-        for name in names:
-            if (folder / name).exists():
-                raise OutputExistsError(folder / name)
+    recording, camera_xy = read_run_of(command)
+    axes, folder, force = command.axes, command.output, command.force
+    tables = {
+        "odometry.csv": odometry_table(recording, axes),
+        "discs.csv": disc_table(recording, axes),
+    }
+    if len(recording.lines):
+        tables["bearings.csv"] = bearing_table(recording, camera_xy, axes)
+    solution = ("path.csv", "map.csv") if command.solution is not None else ()
+    demand_free([folder / name for name in (*tables, *solution)], overwrite=force)
     folder.mkdir(parents=True, exist_ok=True)
-
-    axes = command.axes
     head = [_made_by(command.run), f"AXES {axes} ({MEANING[axes]})"]
-    force = command.force
-    write_odometry(folder / "odometry.csv", recording, axes, head, overwrite=force)
-    write_discs(folder / "discs.csv", recording, axes, head, overwrite=force)
-    if bearings:
-        write_bearings(folder / "bearings.csv", recording, camera_xy, axes, head, overwrite=force)
+    for name, table in tables.items():
+        write_table(folder / name, table.columns, table.rows, head, overwrite=force)
     if command.solution is not None:
         path = poses_of_run(recording, command.solution)
         landmark_map = read_map(command.solution / "map.csv")
         write_path(folder / "path.csv", _turned_path(path, axes), head, overwrite=force)
         write_map(folder / "map.csv", _turned_map(landmark_map, axes), head, overwrite=force)
-    discs, lines = identified_discs(recording.circles), identified_lines(recording.lines)
+    discs, lines = recording.circles.identified, recording.lines.identified
     parts = [f"{len(recording)} steps"]
     parts.append(f"{discs.sum()} measurements of discs{_left_out(int(np.sum(~discs)))}")
-    if bearings:
+    if len(lines):
         parts.append(f"{lines.sum()} bearings{_left_out(int(np.sum(~lines)))}")
     print(f"{folder}: {', '.join(parts)}")
     return 0
@@ -170,16 +160,10 @@ def _import(command: Import) -> int:
     if command.file.suffix == ".tum" or (
         command.file.suffix != ".g2o" and _first_word(command.file) not in _G2O_WORDS
     ):
-        path = read_tum(command.file, axes=command.axes)
-        write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, read_tum(command.file, axes=command.axes))
     graph = read_g2o(command.file, axes=command.axes)
     if command.output.suffix == ".csv":
-        path = Path2D(graph.prefixes, graph.poses)
-        write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, Path2D(graph.prefixes, graph.poses))
     frames = frames_of_graph(graph)
     demand_readable(frames, str(command.file))
     unknown = int(np.sum(~np.isfinite(graph.quality)))
@@ -202,10 +186,7 @@ def _import_data_set(command: Import) -> int:
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
         return 0
     if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
-        path = data_sets.read_truth(file)
-        write_path(command.output, path, head, overwrite=command.force)
-        print(f"{command.output}: {len(path.poses)} poses")
-        return 0
+        return _write_path(command, data_sets.read_truth(file))
     if file.name.endswith(data_sets.ODOMETRY):
         run = data_sets.read_robot(file)
     elif file.name == data_sets.DRIVE:
@@ -218,6 +199,12 @@ def _import_data_set(command: Import) -> int:
     frames = data_sets.frames_of(run, command.range_sigma, command.bearing_sigma)
     write_frames(command.output, frames, head=head[0], overwrite=command.force)
     print(f"{command.output}: {len(frames)} steps, {len(run.frame)} measurements")
+    return 0
+
+
+def _write_path(command: Import, path: Path2D) -> int:
+    write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
+    print(f"{command.output}: {len(path.poses)} poses")
     return 0
 
 

@@ -3,36 +3,37 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from redetect import slam
-from redetect.landmarks.map_file import LandmarkMap, read_map, write_path
-from redetect.slam.commands.inputs import (
-    camera_xy_of,
-    default_output,
-    read_reference,
-    read_run_of,
+from redetect.array_types import FloatArray
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    covariance_file,
+    read_joint_covariance,
+    read_map,
+    write_path,
 )
-from redetect.slam.commands.outputs import (
+from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
     PATH_NAME,
+    camera_xy_of,
+    default_output,
     demand_free,
     draw_results,
+    flags_of,
+    read_reference,
+    read_run_of,
     timed,
     write_json,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator
-from redetect.slam.filters.frames import FilterRun
-from redetect.slam.filters.localizer import Localizer, MapErrors, run_localizer
+from redetect.slam.filters.frames import Associator, FilterRun, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
 from redetect.slam.filters.report import path_distance, summary, table
-from redetect.slam.mapping.covariance_file import covariance_file, read_joint_covariance
 from redetect.slam.options import Localize
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
-
-FloatArray = NDArray[np.float64]
 
 JSON_NAME = "localize.json"
 
@@ -46,17 +47,18 @@ def perform(command: Localize) -> int:
     considered = map_errors == "considered"
     joint = read_joint_covariance(command.map, landmark_map) if considered else None
     recording, _ = read_run_of(command)
-    demand_free(output, names, overwrite=command.force)
+    demand_free([output / name for name in names], overwrite=command.force)
     run, time_line = timed(lambda: localized_run_of(command, recording, landmark_map, joint))
     reference = read_reference(command.reference, run.path) if command.reference else None
     distance = path_distance(run.path, reference.poses) if reference else None
+    output.mkdir(parents=True, exist_ok=True)
     write_path(
         output / PATH_NAME,
         run.path,
         [f"slam localize {slam.__version__}: {command.run} in {command.map}"],
         overwrite=command.force,
     )
-    content = summary(run, command, distance)
+    content = summary(run, flags_of(command), distance)
     content["map_errors"] = map_errors if joint is None else f"{map_errors}, jointly"
     write_json(output / JSON_NAME, content, overwrite=command.force)
     print("\n".join(table(run, distance)))
@@ -89,7 +91,7 @@ def localized_run_of(
         joint_covariance=joint,
     )
     associator = Associator(command.association, command.gate_probability)
-    run = run_localizer(recording, localizer, associator)
+    run = run_filter(recording, localizer, associator)
     if not run.count.discs and not run.count.lines:
         raise SlamError(
             f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "

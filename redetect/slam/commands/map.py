@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import asdict
@@ -12,28 +11,38 @@ from typing import Any
 import numpy as np
 
 from redetect import slam
-from redetect.landmarks.map_file import LandmarkMap, Path2D, no_landmarks, write_map, write_path
-from redetect.slam.commands.inputs import camera_of_run, recording_of
-from redetect.slam.errors import SlamError
-from redetect.slam.mapping.chi_squared import as_json, table_lines
-from redetect.slam.mapping.covariance_file import (
+from redetect.landmarks.map_file import (
+    LandmarkMap,
     covariance_file,
-    joint_covariance,
+    no_landmarks,
     write_joint_covariance,
+    write_map,
+    write_path,
 )
+from redetect.slam.commands.files import (
+    camera_of_run,
+    default_output,
+    demand_free,
+    flags_of,
+    recording_of,
+    write_json,
+)
+from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import (
     LeftOut,
     MappedRun,
     Mounting,
+    as_json,
     landmark_map,
     map_run,
     path_of,
+    table_lines,
 )
+from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording
-from redetect.storage import OutputExistsError, write_whole
 from redetect.storage.bounds import FINITE, demand
 
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
@@ -45,13 +54,10 @@ MOST_LANDMARKS_TOGETHER = 5000
 
 def perform(command: Map) -> int:
     """Carry the command out; 0 if all went well."""
-    output = (
-        command.output or (command.run if command.run.is_dir() else command.run.parent) / "slam"
-    )
+    output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
-    for name in (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME):
-        if (output / name).exists() and not command.force:
-            raise OutputExistsError(output / name)
+    names = (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME)
+    demand_free([output / name for name in names], overwrite=command.force)
     recording = recording_of(command)
     begin = time.perf_counter()
     mapped = mapped_run_of(command, recording)
@@ -70,8 +76,7 @@ def perform(command: Map) -> int:
         # One of another map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     write_path(output / PATH_NAME, path, head, overwrite=command.force)
-    with write_whole(output / TABLE_NAME, overwrite=command.force) as stream:
-        stream.write((json.dumps(_results(mapped, command), indent=1) + "\n").encode())
+    write_json(output / TABLE_NAME, _results(mapped, command), overwrite=command.force)
     for line in _report(mapped, seconds):
         print(line)
     if not few:
@@ -79,7 +84,17 @@ def perform(command: Map) -> int:
             f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
             "localize` takes their errors to be independent"
         )
-    _draw(mapped, final, path, recording, output, command)
+    first = landmark_map(mapped.graph, mapped.start, None)
+    start = LandmarkMap(discs=first.discs, lines=no_landmarks())
+    draw_map(
+        output / PICTURE_NAME,
+        final,
+        path,
+        before=(start, path_of(recording, mapped.start, None)),
+        title=command.run.resolve().name,
+        overwrite=command.force,
+        interactive=command.interactive,
+    )
     print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
     return 0
 
@@ -154,14 +169,9 @@ def _left_out_lines(left_out: LeftOut) -> list[str]:
 
 
 def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:
-    configuration = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in asdict(command).items()
-        if name not in ("output", "force", "interactive")
-    }
     results: dict[str, Any] = {
         "version": slam.__version__,
-        "configuration": configuration,
+        "configuration": flags_of(command, ("output", "force", "interactive")),
         "table": as_json(mapped.table),
         "minimised": mapped.cost,
         "steps": mapped.steps,
@@ -176,27 +186,3 @@ def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:
             "chi_squared_gained": mapped.mounting.gain,
         }
     return results
-
-
-def _draw(
-    mapped: MappedRun,
-    final: LandmarkMap,
-    path: Path2D,
-    recording: Recording,
-    output: Path,
-    command: Map,
-) -> None:
-
-    first = landmark_map(mapped.graph, mapped.start, None)
-    draw_map(
-        output / PICTURE_NAME,
-        final,
-        path,
-        before=(
-            LandmarkMap(discs=first.discs, lines=no_landmarks()),
-            path_of(recording, mapped.start, None),
-        ),
-        title=command.run.resolve().name,
-        overwrite=command.force,
-        interactive=command.interactive,
-    )

@@ -17,12 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-from redetect.slam.models.measurement import bearing_of_vertical, disc_in_map, disc_in_robot
-
-FloatArray = NDArray[np.float64]
+from redetect.plane import apply
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical
 
 _MOST_ITERATIONS = 10
 _CONVERGED_M = 1e-6
@@ -149,7 +148,7 @@ def triangulate(
     Takes `poses` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,), `pose_covariance` (3 k, 3
     k); returns (2,).
     """
-    origin = disc_in_map(poses, camera_xy)
+    origin = apply(poses, camera_xy)
     angle = poses[:, 2] + bearing_rad
     # A ray looks along (sin, -cos) of its angle; this is across it.
     across = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -199,13 +198,7 @@ def bearing_rows(
     Takes `poses, line_xy` (k, 3), (2,), `poses_at, line_at` (k, 3), (2,), `camera_xy` (2,); returns
     `by_pose` (k, 3), `by_line` (k, 2).
     """
-    seen = disc_in_robot(poses, line_xy) - camera_xy
-    by_seen = np.stack([-seen[:, 1], seen[:, 0]], axis=-1) / np.sum(seen**2, axis=1)[:, None]
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    by_line = np.stack(
-        [by_seen[:, 0] * cos - by_seen[:, 1] * sin, by_seen[:, 0] * sin + by_seen[:, 1] * cos],
-        axis=-1,
-    )
+    _, by_line = bearing_jacobians(poses, line_xy, camera_xy)
     offset = line_at - poses_at[:, :2]
     by_heading = by_line[:, 0] * offset[:, 1] - by_line[:, 1] * offset[:, 0]
     return np.column_stack([-by_line, by_heading]), by_line

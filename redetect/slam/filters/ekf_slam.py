@@ -18,23 +18,22 @@ from itertools import count
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator, run_filter
 from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
+    Associator,
     FilterRun,
     FrameRows,
     RowCount,
+    run_filter,
 )
 from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
 from redetect.slam.recording import UNKNOWN_ID, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 JacobiansAt = Literal["first", "latest"]
 

@@ -1,21 +1,125 @@
-"""A recording frame by frame, as input of filters, and the result of a filter."""
+"""A recording frame by frame, as input of the filters: innovations, pairing, the way through a run.
+
+Rows without identifiers are paired with landmarks of the filter's state, discs and lines apart from
+each other, each frame for itself, by `redetect.slam.association.compatibility`.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
+from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import Path2D
-from redetect.slam.filters.innovation_kernels import MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.recording import Recording
+from redetect.slam.association.compatibility import (
+    DEFAULT_GATE_PROBABILITY,
+    Pairing,
+    chi_squared_gates,
+    joint_compatible,
+    nearest_compatible,
+)
+from redetect.slam.errors import SlamError
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+
+class MeasuredDiscs(NamedTuple):
+    """Rows of d discs.
+
+    Attributes
+    ----------
+    slot : (d,) int64
+        Where in the state the disc of each row begins.
+    xy, covariance : (d, 2), (d, 2, 2) float64
+        Measured, in the robot frame (m).
+    """
+
+    slot: IntArray
+    xy: FloatArray
+    covariance: FloatArray
+
+
+class MeasuredLines(NamedTuple):
+    """Rows of l lines, each of which may be that of several of e lines of the state."""
+
+    slot: IntArray  # (e,): where in the state the lines of the rows begin
+    # (l + 1,): row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
+    start: IntArray
+    # (l,): measured.
+    bearing_rad: FloatArray
+    sigma_rad: FloatArray
+
+
+@njit(cache=True, error_model="numpy")
+def frame_innovation(
+    state: FloatArray,
+    linearised_at: FloatArray,
+    discs: MeasuredDiscs,
+    lines: MeasuredLines,
+    camera_xy: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Measured minus predicted, its Jacobian and its noise, for all rows of a frame.
+
+    Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
+    `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
+    """
+    disc_count, line_count = len(discs.slot), len(lines.bearing_rad)
+    rows = 2 * disc_count + line_count
+    numbers = 3 + 2 * disc_count + 2 * len(lines.slot)
+    innovation = np.zeros(rows)
+    jacobian = np.zeros((rows, numbers))
+    noise = np.zeros((rows, rows))
+    index = np.empty(numbers, dtype=np.int64)
+    index[0], index[1], index[2] = 0, 1, 2
+    cos, sin = math.cos(state[2]), math.sin(state[2])
+    for k in range(disc_count):
+        slot, row, column = discs.slot[k], 2 * k, 3 + 2 * k
+        index[column], index[column + 1] = slot, slot + 1
+        dx, dy = state[slot] - state[0], state[slot + 1] - state[1]
+        innovation[row] = discs.xy[k, 0] - (cos * dx + sin * dy)
+        innovation[row + 1] = discs.xy[k, 1] - (-sin * dx + cos * dy)
+        dx = linearised_at[slot] - linearised_at[0]
+        dy = linearised_at[slot + 1] - linearised_at[1]
+        jacobian[row, 0], jacobian[row, 1] = -cos, -sin
+        jacobian[row + 1, 0], jacobian[row + 1, 1] = sin, -cos
+        jacobian[row, 2] = -sin * dx + cos * dy
+        jacobian[row + 1, 2] = -cos * dx - sin * dy
+        jacobian[row, column], jacobian[row, column + 1] = cos, sin
+        jacobian[row + 1, column], jacobian[row + 1, column + 1] = -sin, cos
+        for i in range(2):
+            for j in range(2):
+                noise[row + i, row + j] = discs.covariance[k, i, j]
+    for k in range(line_count):
+        row = 2 * disc_count + k
+        share = 1.0 / (lines.start[k + 1] - lines.start[k])
+        difference = 0.0
+        for entry in range(lines.start[k], lines.start[k + 1]):
+            slot, column = lines.slot[entry], 3 + 2 * disc_count + 2 * entry
+            index[column], index[column + 1] = slot, slot + 1
+            dx, dy = state[slot] - state[0], state[slot + 1] - state[1]
+            seen_x = cos * dx + sin * dy - camera_xy[0]
+            seen_y = -sin * dx + cos * dy - camera_xy[1]
+            angle = lines.bearing_rad[k] - math.atan2(seen_x, -seen_y)
+            difference += share * ((angle + math.pi) % (2.0 * math.pi) - math.pi)
+            weight = share / (seen_x**2 + seen_y**2)
+            by_x = (-seen_y * cos - seen_x * sin) * weight
+            by_y = (-seen_y * sin + seen_x * cos) * weight
+            jacobian[row, column], jacobian[row, column + 1] = by_x, by_y
+            jacobian[row, 0] -= by_x
+            jacobian[row, 1] -= by_y
+            dx = linearised_at[slot] - linearised_at[0]
+            dy = linearised_at[slot + 1] - linearised_at[1]
+            jacobian[row, 2] += by_x * dy - by_y * dx
+        innovation[row] = difference
+        noise[row, row] = lines.sigma_rad[k] ** 2
+    return innovation, jacobian, noise, index
+
 
 NO_CAMERA = np.zeros(2)
 
@@ -35,9 +139,7 @@ class FrameRows:
         self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
     ) -> FrameRows:
         """The same rows under other identifiers."""
-        return FrameRows(
-            disc_ids, self.disc_xy, self.disc_covariance, line_ids, self.bearing_rad, self.sigma_rad
-        )
+        return replace(self, disc_ids=disc_ids, line_ids=line_ids)
 
     def innovation(
         self,
@@ -153,3 +255,172 @@ class Filter(Protocol):
 
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame."""
+
+
+Association = Literal["known", "nearest", "joint"]
+
+#: A row shows a new disc if its distance from all known discs is this many times the gate.
+NEW_DISC_GATES = 4.0
+#: Lines farther than this from the camera are not taken to be in view (m): walls hide them.
+FARTHEST_LINE_M = 15.0
+
+# Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
+_NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
+
+_NONE = np.zeros(0, dtype=np.int64)
+_NO_DISCS = MeasuredDiscs(_NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+_NO_LINES = MeasuredLines(_NONE, np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Associator:
+    """How rows are paired with landmarks."""
+
+    method: Association = "known"  # `known`, `nearest` or `joint`
+    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of right rows that pass
+
+    def __post_init__(self) -> None:
+        chi_squared_gates(self.gate_probability, 1, 1)
+
+    def identified(
+        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None = None
+    ) -> FrameRows:
+        """Rows with the identifiers of the landmarks they are found to show."""
+        if self.method == "known":
+            return rows
+        discs = self._discs(rows, estimate, new_id) if rows.disc_ids else ()
+        lines = self._lines(rows, estimate) if rows.line_ids else ()
+        return rows.identified(discs, lines)
+
+    def _discs(
+        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None
+    ) -> tuple[int, ...]:
+        names, slots = _near_discs(rows.disc_xy, estimate)
+        found = np.full(len(rows.disc_xy), UNKNOWN_ID, dtype=np.int64)
+        closest = np.full(len(found), np.inf)
+        if len(slots):
+            prediction, jacobian, _, index = frame_innovation(
+                estimate.state,
+                estimate.state,
+                MeasuredDiscs(slots, np.zeros((len(slots), 2)), np.zeros((len(slots), 2, 2))),
+                _NO_LINES,
+                estimate.camera_xy,
+            )
+            predicted = jacobian @ estimate.block(index) @ jacobian.T
+            innovation = rows.disc_xy[:, None] + prediction.reshape(-1, 2)
+            pairing = self._paired(innovation, predicted, rows.disc_covariance)
+            paired = pairing.landmark >= 0
+            found[paired] = names[pairing.landmark[paired]]
+            closest = _closest(innovation, predicted, rows.disc_covariance)
+        if new_id is not None:
+            far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
+            for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
+                found[k] = new_id()
+        return tuple(int(number) for number in found)
+
+    def _lines(self, rows: FrameRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
+        slots = np.array(list(estimate.line_slots.values()), dtype=np.int64)
+        names = np.array(list(estimate.line_slots), dtype=np.int64)
+        state = estimate.state
+        away = np.hypot(state[slots] - state[0], state[slots + 1] - state[1])
+        slots, names = slots[away < FARTHEST_LINE_M], names[away < FARTHEST_LINE_M]
+        if not len(slots):
+            return ((),) * len(rows.line_ids)
+        zeros = np.zeros(len(slots))
+        prediction, jacobian, _, index = frame_innovation(
+            state,
+            state,
+            _NO_DISCS,
+            MeasuredLines(slots, np.arange(len(slots) + 1), zeros, zeros),
+            estimate.camera_xy,
+        )
+        innovation = wrap_angle(rows.bearing_rad[:, None] + prediction)
+        predicted = jacobian @ estimate.block(index) @ jacobian.T
+        noise = rows.sigma_rad[:, None, None] ** 2
+        landmark = self._paired(innovation[:, :, None], predicted, noise).landmark
+        return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
+
+    def _paired(self, innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -> Pairing:
+        pair = joint_compatible if self.method == "joint" else nearest_compatible
+        return pair(innovation, predicted, noise, gate_probability=self.gate_probability)
+
+
+def run_filter(
+    recording: Recording,
+    estimate: Filter,
+    associator: Associator | None = None,
+    new_id: Callable[[], int] | None = None,
+) -> FilterRun:
+    """Take a filter through a run.
+
+    Parameters
+    ----------
+    recording : Recording
+    estimate : Filter
+        At the start; changed.
+    associator : Associator, optional
+        How rows are paired with landmarks; by default by their identifiers.
+    new_id : callable, optional
+        Gives the next identifier for a row that is found to show a new disc.
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible; the message names the step.
+    """
+    pairing = associator or Associator()
+    disc_ids: list[int] = []
+    line_ids: list[tuple[int, ...]] = []
+    poses = np.empty((len(recording) + 1, 3))
+    covariance = np.empty((len(recording) + 1, 3, 3))
+    poses[0], covariance[0] = estimate.state[:3], estimate.pose_covariance
+    for k, rows in enumerate(frames_of(recording)):
+        try:
+            estimate.predict(recording.steps[k], recording.step_covariance[k])
+            identified = pairing.identified(rows, estimate, new_id)
+            estimate.measure(identified)
+        except SlamError as error:
+            raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
+        disc_ids.extend(identified.disc_ids)
+        line_ids.extend(identified.line_ids)
+        poses[k + 1], covariance[k + 1] = estimate.state[:3], estimate.pose_covariance
+    return FilterRun(
+        path=Path2D(("start", *recording.prefixes), poses, covariance),
+        count=estimate.count,
+        disc_ids=np.array(disc_ids, dtype=np.int64),
+        line_ids=tuple(line_ids),
+    )
+
+
+def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArray]:
+    """Names and slots of the discs that any of the rows may show."""
+    slots = np.array(list(estimate.disc_slots.values()), dtype=np.int64)
+    names = np.array(list(estimate.disc_slots), dtype=np.int64)
+    if not len(slots):
+        return names, slots
+    state = estimate.state
+    cos, sin = np.cos(state[2]), np.sin(state[2])
+    rotated = seen_xy @ np.array([[cos, sin], [-sin, cos]])
+    offset = np.stack([state[slots], state[slots + 1]], axis=-1)[:, None] - state[:2] - rotated
+    pose = estimate.block(np.arange(3))
+    reach = np.sqrt(pose[0, 0] + pose[1, 1]) + np.sqrt(pose[2, 2]) * np.hypot(*seen_xy.T)
+    near = np.any(np.hypot(*offset.transpose(2, 0, 1)) < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
+    return names[near], slots[near]
+
+
+def _closest(innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
+    """Squared Mahalanobis distance of each row of a disc from the landmark closest to it: (n,)."""
+    pairs = np.arange(innovation.shape[1])
+    own = predicted.reshape(len(pairs), 2, len(pairs), 2)[pairs, :, pairs, :]
+    return np.asarray(np.min(squared_mahalanobis(innovation, own + noise[:, None]), axis=1))
+
+
+def innovation_root(covariance: FloatArray) -> FloatArray:
+    """Cholesky factor of an innovation's covariance; `SlamError` where there is none."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        raise SlamError(
+            "the covariance of the innovation is not positive definite: rows or steps with "
+            "covariances that contradict each other"
+        ) from None

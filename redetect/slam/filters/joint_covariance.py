@@ -15,17 +15,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dtrtrs
 
-from redetect.slam.errors import SlamError
+from redetect.array_types import FloatArray, IntArray
+from redetect.slam.filters.frames import innovation_root
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 POSE_SIZE = 3
 
@@ -107,13 +105,7 @@ class JointCovariance:
         Takes `projected` (size, m), `innovation_covariance` (m, m), `innovation` (m,); returns
         `change`, `squared`.
         """
-        try:
-            root = np.linalg.cholesky(innovation_covariance)
-        except np.linalg.LinAlgError:
-            raise SlamError(
-                "the covariance of the innovation is not positive definite: rows or steps with "
-                "covariances that contradict each other"
-            ) from None
+        root = innovation_root(innovation_covariance)
         rows = len(innovation)
         if self._pending + rows > self._factor.shape[1]:
             self._settle()

@@ -6,7 +6,7 @@ the filter *considers* them: it carries the correlation of the pose with each la
 without estimating the landmarks anew (Schmidt-Kalman filter).
 
 Landmarks of a map made by driving share most of their error with their neighbours. The joint
-covariance describes this (`redetect.slam.mapping.covariance_file`); without it landmarks are
+covariance describes this (`redetect.landmarks.map_file`); without it landmarks are
 assumed to be independent of each other.
 """
 
@@ -15,22 +15,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
-from redetect.slam.errors import SlamError
-from redetect.slam.filters.association import Associator, run_filter
-from redetect.slam.filters.frames import (
-    NO_CAMERA,
-    FilterRun,
-    FrameRows,
-    RowCount,
-)
-from redetect.slam.models.motion import move, move_jacobians
-from redetect.slam.recording import UNKNOWN_ID, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.slam.filters.frames import NO_CAMERA, FrameRows, RowCount, innovation_root
+from redetect.slam.models import move, move_jacobians
+from redetect.slam.recording import UNKNOWN_ID
 
 MapErrors = Literal["considered", "white", "ignored"]
 
@@ -152,13 +143,7 @@ class Localizer:
         )
         block = self.block(index)
         covariance = jacobian @ block @ jacobian.T + noise
-        try:
-            root = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            raise SlamError(
-                "the covariance of the innovation is not positive definite: rows or steps with "
-                "covariances that contradict each other"
-            ) from None
+        root = innovation_root(covariance)
         whitened = np.linalg.solve(root, innovation)
         # The pose's part of P H^T, over the root of S.
         factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
@@ -186,30 +171,3 @@ class Localizer:
                 self.count.left_out[reason] += 1
         self.count.discs += len(discs)
         self.count.lines += len(lines)
-
-
-def run_localizer(
-    recording: Recording, localizer: Localizer, associator: Associator | None = None
-) -> FilterRun:
-    """Take a localizer through a run.
-
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    localizer : Localizer
-        A filter at the start; changed.
-    associator : Associator, optional
-        How rows are paired with the map; by default by their identifiers.
-
-    Returns
-    -------
-    FilterRun
-        With the landmarks that each row was taken to show.
-
-    Raises
-    ------
-    SlamError
-        If an update is not possible; the message names the step.
-    """
-    return run_filter(recording, localizer, associator or Associator())

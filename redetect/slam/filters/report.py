@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from redetect import slam
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Path2D
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import FilterRun
-
-FloatArray = NDArray[np.float64]
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
@@ -73,7 +69,9 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
     }
 
 
-def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) -> dict[str, object]:
+def summary(
+    run: FilterRun, settings: dict[str, Any], distance: dict[str, float] | None
+) -> dict[str, Any]:
     """Content of the command's .json file."""
     count = run.count
     figures: dict[str, object] = {
@@ -86,11 +84,7 @@ def summary(run: FilterRun, settings: Any, distance: dict[str, float] | None) ->
     }
     if distance is not None:
         figures["distance_from_reference"] = distance
-    flags = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in dataclasses.asdict(settings).items()
-    }
-    return {"version": slam.__version__, "settings": flags, "figures": figures}
+    return {"version": slam.__version__, "settings": settings, "figures": figures}
 
 
 def table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:

@@ -19,19 +19,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Step
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.plane import between
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import to_dataset
-from redetect.slam.formats.text import finite, text_rows
-from redetect.slam.models.motion import chain_steps, relative_pose
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.slam.formats.text import finite, text_rows, to_dataset
+from redetect.slam.models import chain_steps
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -116,7 +114,7 @@ def _steps_between(
     knots = knots[knots >= ends[0]]
     held = np.clip(np.searchsorted(logged, knots[:-1], side="right") - 1, 0, None)
     poses = chain_steps(along(held, np.diff(knots)))[np.searchsorted(knots, times)]
-    return relative_pose(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+    return between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
 
 
 def read_robot(odometry: Path) -> RangeBearing:
@@ -225,9 +223,8 @@ def trees_of(scan: FloatArray) -> FloatArray:
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
-    before = np.concatenate(
-        [[0.0], scan[starts[1:] - 1]]
-    )  # what the scan's border hides is unknown
+    # What the scan's border hides is unknown.
+    before = np.concatenate([[0.0], scan[starts[1:] - 1]])
     after = np.concatenate([scan[ends[:-1]], [0.0]])
     found = []
     for first, last, right, left in zip(starts, ends, before, after):

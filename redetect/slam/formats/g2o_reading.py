@@ -8,21 +8,18 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes, to_dataset
 from redetect.slam.formats.g2o import (
     FRAME_COMMENT,
     RunGraph,
     covariances_of_graph,
     first_disc_vertex,
 )
-from redetect.slam.formats.text import demand_axes, finite, text_rows, whole
+from redetect.slam.formats.text import Axes, demand_axes, finite, text_rows, to_dataset, whole
 from redetect.slam.recording import CircleRows
-
-FloatArray = NDArray[np.float64]
 
 _TRIANGLE_3 = ("I11", "I12", "I13", "I22", "I23", "I33")
 # Of each kind of row: how many vertices it names, and its numbers.
@@ -180,18 +177,15 @@ def _demand_vertices(path: str | os.PathLike[str], rows: _Rows) -> None:
         for vertex in row.vertices:
             if vertex not in rows.poses and vertex not in rows.discs:
                 raise SlamError(f"{path}:{row.line}: no vertex {vertex}")
-    for row in (*rows.steps.values(), *rows.sights):
-        if row.vertices[0] not in rows.poses:
-            raise SlamError(f"{path}:{row.line}: no VERTEX_SE2 {row.vertices[0]}")
-    for row in rows.steps.values():
-        if row.vertices[1] not in rows.poses:
-            raise SlamError(f"{path}:{row.line}: no VERTEX_SE2 {row.vertices[1]}")
+    named = [(row.line, vertex) for row in rows.steps.values() for vertex in row.vertices]
+    named += [(row.line, row.vertices[0]) for row in rows.sights]
+    named += [(line, vertex) for vertex, (line, _, _) in rows.frames.items()]
+    for line, vertex in named:
+        if vertex not in rows.poses:
+            raise SlamError(f"{path}:{line}: no VERTEX_SE2 {vertex}")
     for row in rows.sights:
         if row.vertices[1] not in rows.discs:
             raise SlamError(f"{path}:{row.line}: no VERTEX_XY {row.vertices[1]}")
-    for vertex, (line, _, _) in rows.frames.items():
-        if vertex not in rows.poses:
-            raise SlamError(f"{path}:{line}: no VERTEX_SE2 {vertex}")
 
 
 def _chain(path: str | os.PathLike[str], rows: _Rows) -> list[int]:

@@ -1,4 +1,15 @@
-"""Common parts of other tools' text formats: rows, numbers and axes."""
+"""Common parts of other tools' text formats: axes, rows and numbers.
+
+The data set's robot has X left and Y backward; other tools expect X forward and Y left. One
+rotation about Z by a quarter turn, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, leads
+from the first to the second. It is applied to the robot's frame and to the map's alike: a pose or
+step T becomes Rz T Rz^-1, that is, its position is rotated and its angle stays. Covariances become
+Rz C Rz^T; rotating the means alone would leave ellipses across instead of along. Bearings count
+from forward, positive to the left, in both.
+
+All is done by exchanging numbers and signs: nothing is rounded, and there and back gives the same
+bits.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +18,70 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import Axes
 from redetect.storage import write_whole
+
+Axes = Literal["robotics", "dataset"]
+
+#: What each kind of axes means, for the heads of files.
+MEANING: dict[str, str] = {
+    "robotics": "X forward, Y left",
+    "dataset": "X left, Y backward",
+}
+
+# Which of the old coordinates becomes the new first, second, third, and with which sign; on the way
+# back it is the sign of the first two that differs.
+_ORDER = np.array([1, 0, 2])
+_SIGNS = np.array([-1.0, 1.0, 1.0])
+
+
+def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
+    """Vectors, poses or steps in the data set's axes, brought into others.
+
+    Parameters
+    ----------
+    values : (..., 2) or (..., 3) array_like
+        x, y and, of poses and steps, the angle.
+    axes : str
+        The axes to bring them into.
+    back : bool
+        From those axes into the data set's instead.
+
+    Returns
+    -------
+    float64 of the same shape
+    """
+    old = np.array(values, dtype=np.float64)
+    if axes == "dataset":
+        return old
+    order, sign = _turn(old.shape[-1], back)
+    return np.asarray(old[..., order] * sign)
+
+
+def to_dataset(values: ArrayLike, axes: Axes) -> FloatArray:
+    """Undo `from_dataset`."""
+    return from_dataset(values, axes, back=True)
+
+
+def covariance_from_dataset(covariance: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
+    """Covariances (or information matrices) (..., d, d) of what `from_dataset` turns, turned."""
+    old = np.array(covariance, dtype=np.float64)
+    if axes == "dataset":
+        return old
+    order, sign = _turn(old.shape[-1], back)
+    return np.asarray(old[..., order[:, None], order] * np.outer(sign, sign))
+
+
+def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
+    order = _ORDER[:size]
+    return order, (_SIGNS[order] if back else _SIGNS[:size])
+
 
 #: Begins the comment that says which axes a file is in.
 AXES_COMMENT = "# AXES"

@@ -10,15 +10,21 @@ import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.axes import MEANING, Axes, from_dataset, to_dataset
-from redetect.slam.formats.text import AXES_COMMENT, demand_axes, finite, text_rows, write_text
-
-FloatArray = NDArray[np.float64]
+from redetect.slam.formats.text import (
+    AXES_COMMENT,
+    MEANING,
+    Axes,
+    demand_axes,
+    finite,
+    from_dataset,
+    text_rows,
+    to_dataset,
+    write_text,
+)
 
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 # How far a pose may lie off the floor (m; quaternion) and still be a pose on it.

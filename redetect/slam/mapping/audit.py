@@ -14,23 +14,20 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU
 from scipy.stats import chi2
 
 from camera import Camera
-from redetect.least_squares.solver import factor
+from redetect.array_types import FloatArray, IntArray
+from redetect.least_squares.solver import factor, whitening
+from redetect.plane import apply
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.chi_squared import ChiSquared, chi_squared
-from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording, whitening
+from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
-from redetect.slam.mapping.run_map import map_run
+from redetect.slam.mapping.run_map import ChiSquared, chi_squared, map_run
 from redetect.slam.mapping.solve import equations_at, solve
-from redetect.slam.models.measurement import disc_in_map
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Kind = Literal["exchange", "split", "drop"]
 
 # Standard deviations from which on rows pull less.
@@ -138,7 +135,7 @@ def _fit(
     graph = graph_of_recording(
         replace(recording, circles=replace(recording.circles, ids=ids)), camera
     )
-    places = disc_in_map(start.poses[graph.disc_pose], graph.disc_xy)
+    places = apply(start.poses[graph.disc_pose], graph.disc_xy)
     order = np.argsort(graph.disc_index, kind="stable")
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
@@ -203,7 +200,7 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
     """What the rows of a group show."""
     circles, graph = recording.circles, fit.graph
     number = int(circles.ids[rows[0]])
-    xy = disc_in_map(fit.estimate.poses[circles.frame[rows] + 1], circles.xy[rows])
+    xy = apply(fit.estimate.poses[circles.frame[rows] + 1], circles.xy[rows])
     place = np.median(xy, axis=0)
     away = np.linalg.norm(fit.estimate.disc_xy - place, axis=1)
     # A landmark shows up once in a frame.

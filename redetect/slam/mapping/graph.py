@@ -1,19 +1,22 @@
-"""All measurements of a run as one least-squares problem, and a value for each of its unknowns."""
+"""All measurements of a run as one least-squares problem, and a value for each of its unknowns.
+
+One map can represent a run only if all its parts are connected, which is checked here, too.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera import Camera
-from redetect.slam.models.measurement import disc_in_map
-from redetect.slam.models.motion import chain_steps
+from redetect.array_types import FloatArray, IntArray
+from redetect.least_squares.solver import whitening
+from redetect.plane import apply
+from redetect.slam.errors import SlamError
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import LineRows, Recording
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,22 +108,6 @@ class Estimate:
     tilt: FloatArray | None = None
 
 
-def whitening(covariance: FloatArray) -> FloatArray:
-    """Inverse Cholesky roots of covariances.
-
-    Parameters
-    ----------
-    covariance : (..., d, d) float64
-        Positive definite.
-
-    Returns
-    -------
-    (..., d, d) float64
-        Lower triangular W with ``W C W^T = I``.
-    """
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-
-
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
     """The problem that a run's odometry and discs pose; lines come in by `with_lines`.
 
@@ -196,6 +183,62 @@ def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
     _, first = np.unique(graph.disc_index, return_index=True)
     return Estimate(
         poses=poses,
-        disc_xy=disc_in_map(poses[graph.disc_pose[first]], graph.disc_xy[first]),
+        disc_xy=apply(poses[graph.disc_pose[first]], graph.disc_xy[first]),
         line_xy=np.full((len(graph.line_ids), 2), np.nan),
+    )
+
+
+#: Beyond these standard deviations a step gives no information about the robot's motion.
+MOST_STEP_SIGMA_M = 100.0
+MOST_STEP_SIGMA_RAD = float(np.pi)
+#: Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
+FEWEST_SHARED = 2
+
+
+def lost_steps(step_covariance: FloatArray) -> IntArray:
+    """Steps whose odometry gives no information.
+
+    Takes `step_covariance` (N, 3, 3); returns (L,).
+    """
+    way = np.linalg.eigvalsh(step_covariance[:, :2, :2])[:, -1]
+    lost = (way > MOST_STEP_SIGMA_M**2) | (step_covariance[:, 2, 2] > MOST_STEP_SIGMA_RAD**2)
+    return np.flatnonzero(lost)
+
+
+def check_connected(recording: Recording, name: str) -> None:
+    """See that landmarks join the parts between which odometry is lost."""
+    lost = lost_steps(recording.step_covariance)
+    if len(lost) == 0:
+        return
+    seen: list[set[tuple[str, int]]] = [set() for _ in range(len(lost) + 1)]
+    circles, lines = recording.circles, recording.lines
+    for part, number in zip(np.searchsorted(lost, circles.frame, side="right"), circles.ids):
+        if number >= 0:
+            seen[part].add(("disc", int(number)))
+    for part, ids in zip(np.searchsorted(lost, lines.frame, side="right"), lines.ids):
+        seen[part].update(("line", i) for i in ids)
+    # Parts grow together as long as any two share enough.
+    joined = [({k}, landmarks) for k, landmarks in enumerate(seen)]
+    grown = True
+    while grown:
+        grown = False
+        for a in range(len(joined)):
+            for b in range(len(joined) - 1, a, -1):
+                if len(joined[a][1] & joined[b][1]) >= FEWEST_SHARED:
+                    parts, landmarks = joined.pop(b)
+                    joined[a] = (joined[a][0] | parts, joined[a][1] | landmarks)
+                    grown = True
+    if len(joined) == 1:
+        return
+    # Name the first step with parts on both sides that nothing joins.
+    group = {part: k for k, (parts, _) in enumerate(joined) for part in parts}
+    broken = next(k for k in range(len(lost)) if group[k] != group[k + 1])
+    step = int(lost[broken])
+    covariance = recording.step_covariance[step]
+    shared = len(joined[group[broken]][1] & joined[group[broken + 1]][1])
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    raise SlamError(
+        f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its odometry is "
+        f"lost (standard deviations {sigma:.3g} m, {np.sqrt(covariance[2, 2]):.3g} rad), and the "
+        f"parts before and after share {shared} landmarks: expected at least {FEWEST_SHARED}"
     )

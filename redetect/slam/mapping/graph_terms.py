@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
+from redetect.plane import between
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.models.measurement import (
+from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
+    between_jacobians,
     disc_in_robot,
     disc_jacobians,
 )
-from redetect.slam.models.motion import relative_pose, relative_pose_jacobians
-from redetect.slam.models.mounting import (
+from redetect.slam.mounting import (
     RecordedJacobians,
     directions_of_rows,
     nominal_mounting,
@@ -28,10 +29,8 @@ from redetect.slam.models.mounting import (
     rows_through_mounting,
     turn_to_the_left,
 )
-from redetect.storage.bounds import ABOVE_0, Bounds, demand
+from redetect.storage.bounds import Bounds, Positive, demand_fields
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 RowErrors = Literal["corrected", "recorded"]
 
 #: Rotation about robot x, y, z, and height.
@@ -66,13 +65,13 @@ class Weighting:
     """
 
     loss: LossKind = "none"
-    loss_scale: float = 3.0
+    loss_scale: Positive = 3.0
     calibrate: bool = False
     row_errors: RowErrors = "corrected"
-    tilt_sigma_rad: float = 0.0
+    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0
 
     def __post_init__(self) -> None:
-        demand(self, SlamError, loss_scale=ABOVE_0, tilt_sigma_rad=_SWAY_RAD)
+        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ class Errors:
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
     """Whitened errors at an estimate: predicted minus measured, in standard deviations."""
-    step = relative_pose(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
+    step = between(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
     step[:, 2] = wrap_angle(step[:, 2])
     tilt, near = np.zeros((0, 2)), graph.line_prior
     if estimate.tilt is not None and weighting.tilt_sigma_rad > 0.0:
@@ -172,7 +171,7 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     layout = layout_of(graph, weighting)
     error = errors(graph, estimate, weighting)
     loss = Loss(weighting.loss, weighting.loss_scale)
-    by_first, by_second = relative_pose_jacobians(estimate.poses[:-1], estimate.poses[1:])
+    by_first, by_second = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     step = 3 * np.arange(len(graph.steps), dtype=np.int64)
     by_pose, by_tilt, by_disc, by_mounting = _disc_derivatives(graph, estimate, weighting)
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.plane import apply
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.models.measurement import bearing_jacobians, disc_in_robot
+from redetect.slam.models import bearing_jacobians, disc_in_robot
 from redetect.slam.recording import LineRows
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Rays to a line have to cross under at least this angle somewhere.
 LEAST_PARALLAX_RAD = float(np.radians(5.0))
@@ -80,7 +78,7 @@ def place_lines(
     )
 
 
-def well_placed(graph: Graph, estimate: Estimate) -> NDArray[np.bool_]:
+def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
     """Which lines of an estimate the bearings of its poses place.
 
     Returns (K,).
@@ -110,13 +108,9 @@ def triangulate(
 
     Takes `poses` (n, 3), `bearing_rad, sigma_rad` (n,), `camera_xy` (2,); returns (2,).
     """
-    theta = poses[:, 2]
-    cos, sin = np.cos(theta), np.sin(theta)
-    start = poses[:, :2] + np.stack(
-        [cos * camera_xy[0] - sin * camera_xy[1], sin * camera_xy[0] + cos * camera_xy[1]], axis=1
-    )
+    start = apply(poses, camera_xy)
     # Bearing b in the robot frame is the direction (sin b, -cos b).
-    course = theta + bearing_rad
+    course = poses[:, 2] + bearing_rad
     ray = np.stack([np.sin(course), -np.cos(course)], axis=1)
     normal = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
     if _widest_crossing(course) < least_parallax_rad:

@@ -8,13 +8,15 @@ chain of thousands of poses creeps along a curved valley.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from redetect.least_squares.covariance import diagonal_blocks
+from redetect.array_types import FloatArray
+from redetect.least_squares.covariance import chosen_covariance, diagonal_blocks
 from redetect.least_squares.solver import (
     Linear,
     NormalEquations,
@@ -26,9 +28,7 @@ from redetect.least_squares.solver import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
-from redetect.slam.models.mounting import nominal_mounting
-
-FloatArray = NDArray[np.float64]
+from redetect.slam.mounting import nominal_mounting
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,20 +121,17 @@ def solve(
     estimate = _with_unknowns(graph, start, weighting)
     problem = _MapProblem(graph, weighting)
     try:
-        found = minimise(
-            problem,
-            estimate,
-            tolerance=tolerance,
-            most_steps=most_steps,
-            refined=problem.with_best_positions,
-        )
+        with _determined("least squares"):
+            found = minimise(
+                problem,
+                estimate,
+                tolerance=tolerance,
+                most_steps=most_steps,
+                refined=problem.with_best_positions,
+            )
     except StartError:
         raise SlamError(
             "least squares cannot begin: a disc lies where the camera as mounted cannot see it"
-        ) from None
-    except np.linalg.LinAlgError:
-        raise SlamError(
-            "least squares: the measurements do not determine all poses and landmarks"
         ) from None
     if not found.converged:
         raise SlamError(
@@ -142,6 +139,17 @@ def solve(
             f"{found.costs[-1]:.6g} and falling"
         )
     return Solution(found.at, found.costs[-1], found.costs)
+
+
+@contextmanager
+def _determined(what: str) -> Iterator[None]:
+    """Say where the measurements do not determine the unknowns."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise SlamError(
+            f"{what}: the measurements do not determine all poses and landmarks"
+        ) from None
 
 
 def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> NormalEquations:
@@ -161,14 +169,38 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
         (2, np.arange(layout.first_disc, layout.first_line, 2)),
         (2, np.arange(layout.first_line, layout.size, 2)),
     ]
-    try:
+    with _determined("covariances"):
         found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
-    except np.linalg.LinAlgError:
-        raise SlamError(
-            "covariances: the measurements do not determine all poses and landmarks"
-        ) from None
     poses = np.concatenate([np.zeros((1, 3, 3)), found[0]])
     return Marginals(poses, found[1], found[2], shared if weighting.calibrate else None)
+
+
+def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
+    """Joint covariance of all landmarks at a least-squares solution.
+
+    Parameters
+    ----------
+    graph : Graph
+        The measurements.
+    estimate : Estimate
+        Where their sum of squares is least.
+    weighting : Weighting
+        As it was minimised.
+
+    Returns
+    -------
+    (2 M, 2 M) float64
+        Discs, then lines (m^2).
+
+    Raises
+    ------
+    SlamError
+        If the measurements do not determine the unknowns.
+    """
+    layout = layout_of(graph, weighting)
+    landmarks = np.arange(layout.first_disc, layout.size)
+    with _determined("covariances"):
+        return chosen_covariance(equations_at(graph, estimate, weighting), landmarks)
 
 
 def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:

@@ -16,35 +16,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
+from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
 from redetect.slam.mapping.solve import Solution
-from redetect.slam.models.measurement import bearing_jacobians, bearing_of_vertical
-from redetect.slam.models.motion import rotation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical
 
 # Called with factor, values and, where derivatives are wanted, a list for them.
 ErrorFunction = Callable[[Any, Any, list[FloatArray] | None], FloatArray]
 
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
+_TOLERANCE, _MOST_STEPS = 1e-10, 200
 _MISSING = "--solver gtsam needs GTSAM, which is not installed: pip install 'redetect[slam]'"
 
 
-def solve_gtsam(
-    graph: Graph,
-    start: Estimate,
-    weighting: Weighting,
-    *,
-    tolerance: float = 1e-10,
-    most_steps: int = 200,
-) -> Solution:
+def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Solution:
     """Minimise the sum of `redetect.slam.mapping.solve.solve` by GTSAM's Levenberg-Marquardt."""
     gtsam = load_gtsam()
     if weighting.calibrate or weighting.tilt_sigma_rad > 0.0:
@@ -54,8 +45,8 @@ def solve_gtsam(
         )
     factors, values = gtsam_problem(graph, start, weighting)
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(most_steps)
-    parameters.setRelativeErrorTol(tolerance)
+    parameters.setMaxIterations(_MOST_STEPS)
+    parameters.setRelativeErrorTol(_TOLERANCE)
     parameters.setAbsoluteErrorTol(0.0)
     optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters)
     try:
@@ -63,8 +54,8 @@ def solve_gtsam(
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]
         raise SlamError(f"GTSAM: no least squares: {reason}") from None
-    if optimizer.iterations() >= most_steps:
-        raise SlamError(f"GTSAM: no minimum within {most_steps} steps")
+    if optimizer.iterations() >= _MOST_STEPS:
+        raise SlamError(f"GTSAM: no minimum within {_MOST_STEPS} steps")
     estimate = estimate_of_values(graph, found, start)
     lowest = cost(graph, estimate, weighting)
     begun = cost(graph, start, weighting)

@@ -17,7 +17,7 @@ from detect.runs.frame import level_run
 from detect.runs.plan import RunSummary
 from detect.seen import level_seen
 from detect.settings import CircleSettings
-from redetect.landmarks.reading import frames_of_rows, parse_rows
+from redetect.landmarks.files import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
 STEP = "STEP {} 0.0 0.0 0.0 1e-6 0.0 1e-6 0.0 0.0 1e-6\n"

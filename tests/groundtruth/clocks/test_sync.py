@@ -13,15 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.clocks.clock import ClockModel, ClockSegment, clock_document, read_clock
+from redetect.groundtruth.clocks.clock import (
+    ClockModel,
+    ClockSegment,
+    clock_document,
+    read_clock,
+    read_ptpd,
+)
 from redetect.groundtruth.clocks.headings import (
     HeadingIntegral,
+    Wandering,
+    estimate_wandering,
     heading_noise,
     segments_between_gaps,
 )
-from redetect.groundtruth.clocks.ptpd import read_ptpd
 from redetect.groundtruth.clocks.sync import SyncSettings, synchronise
-from redetect.groundtruth.clocks.wandering import Wandering, estimate_wandering
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -238,7 +244,7 @@ def test_clock_files_come_back(tmp_path: Path) -> None:
     [
         ("{", "is no JSON"),
         ("[" * 100000, "is no JSON"),
-        ("[]", "no list of segments"),
+        ("[]", "expected a JSON object"),
         ('{"segments": []}', "no list of segments"),
         ('{"segments": [3]}', "segment 1 is no object"),
         ('{"segments": [{"from_s": "a"}]}', "segment 1: from_s is not a number"),

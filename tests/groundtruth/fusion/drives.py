@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.fusion.fuse import FuseSettings
-from redetect.groundtruth.trajectories.matching import interpolate_poses
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]

@@ -12,18 +12,17 @@ from scipy.optimize import least_squares
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
-from redetect.groundtruth.fusion.learning import noise_of
+from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.trajectories.matching import interpolate_poses
-from redetect.groundtruth.trajectories.plane import log_motion
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
+    interpolate_poses,
     read_planar_poses,
     write_planar_poses,
 )
 from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle
+from redetect.plane import log_motion
 from tests.groundtruth.fusion.drives import (
     LASER_COVARIANCE,
     chain,

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
-from redetect.groundtruth.trajectories.matching import interpolate_poses
-from redetect.groundtruth.trajectories.plane import between
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import between
 from tests.groundtruth.fusion.drives import (
     LASER_COVARIANCE,
     chain,

@@ -13,8 +13,7 @@ from redetect.groundtruth.cli import main
 from redetect.groundtruth.clocks.sync import synchronise
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, leave_out
-from redetect.groundtruth.trajectories.matching import moved_poses
-from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, moved_poses, write_planar_poses
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.drives import drive, measure
 

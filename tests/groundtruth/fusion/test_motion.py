@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.kernels import STATE, arc_integrals, move
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.trajectories.plane import between, compose, log_motion
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle
+from redetect.plane import between, compose, log_motion
 
 FloatArray = NDArray[np.float64]
 

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
 from redetect.groundtruth.fusion.movement import movement_problem
-from redetect.groundtruth.trajectories.matching import interpolate_poses
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from tests.groundtruth.fusion.drives import LASER_COVARIANCE, drive, measure, normalised_error
 
 FloatArray = NDArray[np.float64]

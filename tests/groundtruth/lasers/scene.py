@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, write_scanners
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import apply
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
+from redetect.plane import apply
 from tools.simulator.laser.writers import write_robot, write_scans
 
 FloatArray = NDArray[np.float64]

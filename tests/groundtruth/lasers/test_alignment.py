@@ -19,10 +19,9 @@ from redetect.groundtruth.lasers.alignment import (
     align_scanners,
     still_scan,
 )
-from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import between
+from redetect.groundtruth.lasers.scanners import Scanner, Scans, read_scanners
 from redetect.landmarks import wrap_angle
+from redetect.plane import between
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     ROOM,
@@ -157,7 +156,7 @@ def test_a_still_scan_leaves_out_what_moves() -> None:
 
 
 def test_bad_input_is_said() -> None:
-    with pytest.raises(GroundTruthError, match="expected as many"):
+    with pytest.raises(GroundTruthError, match="no scanners"):
         align_scanners([], [], ROOM)
     with pytest.raises(GroundTruthError, match="gate_m"):
         AlignmentSettings(gate_m=-1.0)

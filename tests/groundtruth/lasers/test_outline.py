@@ -7,11 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.outline import outline_faces, outline_radius_m, outline_symmetries
-from tests.groundtruth.lasers.scene import (
-    FRONTED,
-    PLAIN,
+from redetect.groundtruth.lasers.acquisition import (
+    outline_faces,
+    outline_radius_m,
+    outline_symmetries,
 )
+from tests.groundtruth.lasers.scene import FRONTED, PLAIN
 
 FloatArray = NDArray[np.float64]
 
@@ -44,5 +45,3 @@ def test_outlines_that_are_none() -> None:
         outline_faces([[0, 0], [0, 0], [1, 1]])
     with pytest.raises(GroundTruthError, match="encloses"):
         outline_faces([[0, 0], [1, 0], [2, 0]])
-    with pytest.raises(GroundTruthError, match="3 or more"):
-        outline_faces([[0, 0], [1, 0]])

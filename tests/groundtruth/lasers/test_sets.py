@@ -7,18 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.sets import (
     ScannerTables,
     learn_background,
     scanner_tables,
     sets_of_scans,
 )
-from tests.groundtruth.lasers.scene import (
-    empty_scans,
-    four_scanners,
-)
+from tests.groundtruth.lasers.scene import empty_scans, four_scanners
 
 FloatArray = NDArray[np.float64]
 

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import AGREES_M, acquire, explain, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import (
+    AGREES_M,
+    LaserSettings,
+    acquire,
+    explain,
+    refine,
+    robot_body,
+)
 from redetect.groundtruth.lasers.icp import fit_outline
-from redetect.groundtruth.lasers.outline import LaserSettings
-from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.lasers.sets import (
     ScannerTables,
     ScanSets,
@@ -36,15 +41,10 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.lasers.tracking_kernels import (
-    Beams,
-    Seen,
-    explain_set,
-    new_points,
-)
-from redetect.groundtruth.trajectories.plane import compose, invert
+from redetect.groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, new_points
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose, invert
 from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,
@@ -441,6 +441,6 @@ def test_settings_are_checked() -> None:
         LaserSettings(kept=1.2)
     with pytest.raises(GroundTruthError, match="gate_m"):
         LaserSettings(gate_m=float("nan"))
-    with pytest.raises(GroundTruthError, match="expected as many"):
+    with pytest.raises(GroundTruthError, match="no scanners"):
         scanner_tables([], [])
     assert invert(np.zeros(3)) == pytest.approx(np.zeros(3))

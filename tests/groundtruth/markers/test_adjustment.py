@@ -12,12 +12,11 @@ from scipy.optimize import least_squares
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.adjustment import (
     Bundle,
+    ChainPoints,
     PosePrior,
     adjust_bundle,
-    whitened_jacobian,
-    whitened_residuals,
+    linearised,
 )
-from redetect.groundtruth.markers.chain import ChainPoints
 from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3
 from tests.groundtruth.markers.scene import (
     box_rig,
@@ -103,7 +102,7 @@ def dense_jacobian(bundle: Bundle) -> FloatArray:
     columns = []
     for k in range(bundle.unknowns):
         d = step * np.eye(bundle.unknowns)[k]
-        change = [whitened_residuals(bundle.moved(sign * d)) for sign in (1, -1)]
+        change = [linearised(bundle.moved(sign * d)).residual for sign in (1, -1)]
         columns.append((change[0] - change[1]) / (2.0 * step))
     return np.stack(columns, axis=1)
 
@@ -111,7 +110,7 @@ def dense_jacobian(bundle: Bundle) -> FloatArray:
 @pytest.mark.parametrize("fixed", ["nothing", "free_cameras", "free_bodies", "free_parts"])
 def test_the_jacobian_is_that_of_finite_differences(fixed: str) -> None:
     bundle = watched_robot(times=5, **({} if fixed == "nothing" else {fixed: False}))
-    expected, found = dense_jacobian(bundle), whitened_jacobian(bundle).toarray()
+    expected, found = dense_jacobian(bundle), linearised(bundle).jacobian.toarray()
     size = np.linalg.norm(expected, axis=0)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-7)
 
@@ -121,7 +120,7 @@ def test_the_minimum_and_the_covariances_are_scipys() -> None:
     adjusted = adjust_bundle(bundle)
     assert adjusted.used.all()
     solved = least_squares(
-        lambda x: whitened_residuals(bundle.moved(x)),
+        lambda x: linearised(bundle.moved(x)).residual,
         np.zeros(bundle.unknowns),
         x_scale="jac",
         xtol=1e-12,

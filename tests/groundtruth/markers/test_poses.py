@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.chain import ChainPoints
-from redetect.groundtruth.markers.pnp import SOLVERS
-from redetect.groundtruth.markers.poses import estimate_pose
+from redetect.groundtruth.markers.adjustment import ChainPoints
+from redetect.groundtruth.markers.poses import SOLVERS, estimate_pose
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
 from redetect.groundtruth.markers.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (

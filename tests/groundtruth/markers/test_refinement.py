@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.chain import (
+from redetect.groundtruth.markers.adjustment import (
     ChainPoints,
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.pnp import SOLVERS, solve_camera, solve_robot
+from redetect.groundtruth.markers.poses import SOLVERS, solve_camera, solve_robot
 from redetect.groundtruth.markers.refinement import (
     Floor,
     floor_residuals,

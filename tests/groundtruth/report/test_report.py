@@ -13,7 +13,9 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.report.figures import (
+from redetect.groundtruth.report.inputs import Interval, gather
+from redetect.groundtruth.report.page import report_page, table
+from redetect.groundtruth.report.pictures import (
     Series,
     Track,
     ellipse_figure,
@@ -22,8 +24,6 @@ from redetect.groundtruth.report.figures import (
     map_figure,
     series_figure,
 )
-from redetect.groundtruth.report.inputs import Interval, gather
-from redetect.groundtruth.report.page import report_page, table
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.reporting.page import Part, Section, page_of
 from tests.groundtruth.comparison import compare_streams
@@ -246,7 +246,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     page = Page(output.read_bytes())
     assert_harmless(page)
     warnings = capsys.readouterr().err
-    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected an",
+    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected a JSON",
                   "clock.json: no list", "laser.jsonl:2: expected", "building.csv:1:"):  # fmt: skip
         assert words in page.text
         assert words in warnings

@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.trajectories.streams import (
-    RAWSEEDS_ROUNDING,
     PlanarPoses,
     format_planar_poses,
     format_tum,
-    is_positive_definite,
     read_planar_poses,
     read_times,
     write_planar_poses,
@@ -136,17 +134,6 @@ def test_poses_that_cannot_be_are_refused() -> None:
         PlanarPoses(np.zeros(1), np.full((1, 3), np.nan))
     with pytest.raises(GroundTruthError, match="expected \\(2, 3, 3\\)"):
         PlanarPoses(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 3, 3)))
-
-
-def test_singular_covariances_are_told_from_good_ones() -> None:
-    good = np.diag([1e-8, 1e-6, 1e-5])
-    singular = np.array([[4e-6, 4e-6, 0], [4e-6, 4e-6, 0], [0, 0, 1e-5]])
-    assert is_positive_definite(np.stack([good, singular, np.zeros((3, 3))])).tolist() == [
-        True,
-        False,
-        False,
-    ]
-    assert not is_positive_definite(good, RAWSEEDS_ROUNDING)
 
 
 def test_tum_rows_are_the_pose(tmp_path: Path) -> None:

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.validation.fiducials import Distance, Survey, read_distances, read_survey
+from redetect.groundtruth.validation.reference_poses import (
+    Distance,
+    Survey,
+    read_distances,
+    read_survey,
+)
 from tools.simulator.laser.writers import write_distances, write_survey
 
 SURVEY = Survey(

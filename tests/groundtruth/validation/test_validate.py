@@ -13,15 +13,13 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from redetect.groundtruth.lasers.scans import Scans
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import Distance, Survey
-from redetect.groundtruth.validation.reference_poses import poses_from_distances
+from redetect.groundtruth.validation.reference_poses import Distance, Survey, poses_from_distances
 from redetect.groundtruth.validation.validate import figures_of, pose_errors, reference_poses
 from tools.simulator.laser.writers import (
     write_building,

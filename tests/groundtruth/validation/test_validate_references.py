@@ -12,19 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.validation.fiducials import Distance, Survey
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.validation.reference_poses import (
+    Distance,
     DistancePose,
+    Survey,
     distance_residuals,
     poses_from_distances,
 )
-from redetect.groundtruth.validation.reference_poses_scans import (
-    Onboard,
-    refine_pose,
-    still_points,
-)
+from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]

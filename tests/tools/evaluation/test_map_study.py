@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.slam.commands.inputs import camera_of_run
+from redetect.slam.commands.files import camera_of_run
 from redetect.slam.mapping.run_map import map_run
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.mounting import directions_of_rows, rotation_exp, rows_through_mounting
+from redetect.slam.models import disc_in_robot
+from redetect.slam.mounting import directions_of_rows, rotation_exp, rows_through_mounting
 from redetect.slam.recording import UNKNOWN_ID, read_recording
 from tools.evaluation.__main__ import main as evaluate
 from tools.evaluation.maps import (

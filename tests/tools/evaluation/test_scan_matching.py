@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.trajectories.plane import between, compose
 from redetect.landmarks import wrap_angle
+from redetect.plane import between, compose
 from tests.groundtruth.lasers.scene import ROOM, cast
 from tools.evaluation.scan_matching import match_scans
 

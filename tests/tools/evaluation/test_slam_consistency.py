@@ -32,8 +32,8 @@ def test_band_is_that_of_chi_squared() -> None:
 
 
 def test_rows_have_the_errors_that_they_state() -> None:
-    from redetect.slam.models.measurement import bearing_of_vertical, disc_in_robot
-    from redetect.slam.models.motion import relative_pose
+    from redetect.plane import between
+    from redetect.slam.models import bearing_of_vertical, disc_in_robot
 
     run = simulate(Scenario(steps=400, lines=20), 3)
     rows = run.recording.circles
@@ -41,7 +41,7 @@ def test_rows_have_the_errors_that_they_state() -> None:
     error = rows.xy - seen
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows.covariance), error)
     assert np.mean(squared) == pytest.approx(2.0, rel=4 / np.sqrt(len(squared)))
-    step_error = run.recording.steps - relative_pose(run.poses[:-1], run.poses[1:])
+    step_error = run.recording.steps - between(run.poses[:-1], run.poses[1:])
     weight = np.linalg.inv(run.recording.step_covariance)
     squared = np.einsum("ni,nij,nj->n", step_error, weight, step_error)
     assert np.mean(squared) == pytest.approx(3.0, rel=4 * np.sqrt(2 / 3 / len(squared)))

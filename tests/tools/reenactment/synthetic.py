@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from camera.uncertainty import with_pose
 from redetect.landmarks import Frame, Step, circle_landmarks
+from redetect.plane import between
 from redetect.slam.mapping.graph import Estimate, Graph, graph_of_recording
-from redetect.slam.models.motion import relative_pose
 from redetect.slam.recording import recording_of_frames
 
 FloatArray = NDArray[np.float64]
@@ -36,7 +36,7 @@ def make_run(camera: Camera, seed: int, *, tilt_deg: float = 0.0, noisy: bool = 
     rng = np.random.default_rng(seed)
     truth = _truth(camera, rng, tilt_deg)
     disc_ids = np.arange(len(truth.disc_xy), dtype=np.int64) * 3 + 5
-    steps = relative_pose(truth.poses[:-1], truth.poses[1:])
+    steps = between(truth.poses[:-1], truth.poses[1:])
     if noisy:
         steps = steps + rng.normal(size=steps.shape) * STEP_SIGMA
     frames = []

@@ -12,12 +12,17 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.lasers.building import read_building
-from redetect.groundtruth.lasers.scanners import Scanner, read_robot, read_scanners
-from redetect.groundtruth.lasers.scans import find_scans, read_scans
-from redetect.groundtruth.trajectories.plane import compose
+from redetect.groundtruth.lasers.scanners import (
+    Scanner,
+    find_scans,
+    read_robot,
+    read_scanners,
+    read_scans,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from redetect.groundtruth.validation.fiducials import read_distances, read_survey
+from redetect.groundtruth.validation.reference_poses import read_distances, read_survey
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose
 from tools.simulator.__main__ import main
 from tools.simulator.laser.session import EPOCH_S, SessionPlan, plan_session, sides_of
 from tools.simulator.laser.session_files import (

@@ -12,9 +12,9 @@ import pytest
 from scipy.stats import chi2
 
 from camera import parse_camera, read_camera
+from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
 from redetect.groundtruth.markers.boards import Checkerboard, find_checkerboard
 from redetect.groundtruth.markers.calibration import read_network, read_rig
-from redetect.groundtruth.markers.chain import ChainPoints, project_chain
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
 from redetect.groundtruth.trajectories.transforms import (
     apply,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.landmarks import Frame, Step, parse_record
-from redetect.slam.models.motion import relative_pose
+from redetect.plane import between
 from redetect.slam.recording import recording_of_frames
 from tools.simulator.driving import (
     DriveStyle,
@@ -70,7 +70,7 @@ def test_errors_match_their_covariance_over_a_long_drive() -> None:
     squared = []
     for seed in range(5):
         steps = measured_steps(poses, np.random.default_rng(seed))
-        error = steps - relative_pose(poses[:-1], poses[1:])
+        error = steps - between(poses[:-1], poses[1:])
         weighted = np.linalg.solve(step_covariance(steps), error[..., None])[..., 0]
         squared.append((error * weighted).sum(axis=1))
     total, count = float(np.sum(squared)), 3 * np.size(squared)
@@ -85,21 +85,21 @@ def test_wrong_odometry_is_far_beyond_its_covariance() -> None:
     steps = measured_steps(poses, np.random.default_rng(0), wrong)
     usual = measured_steps(poses, np.random.default_rng(0))
     np.testing.assert_array_equal(steps[~wrong], usual[~wrong])
-    total = (steps - relative_pose(poses[:-1], poses[1:]))[100:200].sum(axis=0)
+    total = (steps - between(poses[:-1], poses[1:]))[100:200].sum(axis=0)
     covariance = step_covariance(steps[100:200]).sum(axis=0)
     assert total @ np.linalg.solve(covariance, total) > chi2.ppf(1.0 - 1e-6, 3)
 
 
 def test_joined_steps_are_the_way_between_frames() -> None:
     poses = drive(ROUTE, 40, DriveStyle(), np.random.default_rng(2))
-    true = relative_pose(poses[:-1], poses[1:])
+    true = between(poses[:-1], poses[1:])
     rows = [step_record(f"s.{k}", step) for k, step in enumerate(true)]
     kept = [0, 7, 19, 39]
     joined = joined_steps(recording_of_frames([Frame(row) for row in rows], "s"), kept)
     assert [s.prefix for s in joined] == ["s.0", "s.7", "s.19", "s.39"]
     ends = poses[[0, *(k + 1 for k in kept)]]
     found = np.array([[s.dx, s.dy, s.dphi] for s in joined])
-    np.testing.assert_allclose(found, relative_pose(ends[:-1], ends[1:]), atol=1e-12)
+    np.testing.assert_allclose(found, between(ends[:-1], ends[1:]), atol=1e-12)
     # The covariance is that of many drives with errors.
     ways = []
     for seed in range(3000):
@@ -119,7 +119,7 @@ def test_joined_steps_are_the_way_between_frames() -> None:
 def test_drive_goes_where_the_route_goes() -> None:
     style = DriveStyle(weave_m=0.0)
     poses = drive(ROUTE, 1000, style, np.random.default_rng(1))
-    steps = relative_pose(poses[:-1], poses[1:])
+    steps = between(poses[:-1], poses[1:])
     assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.25
     assert np.abs(steps[:, 2]).max() < 0.35
     # Forward is -y of the robot frame.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.trajectories.transforms import planar_transform
-from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models import disc_in_robot
 from tools.simulator.driving import tilted_camera
 from tools.simulator.frame_kernels import camera_ray
 from tools.simulator.ray_kernels import nearest_quad, points_visible

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from camera import Camera, write_camera
 from camera.uncertainty import with_pose
 from redetect.landmarks import CircleLandmark, Frame, read_frames, write_frames
-from redetect.slam.models.measurement import disc_in_robot
-from redetect.slam.models.motion import relative_pose
+from redetect.plane import between
+from redetect.slam.models import disc_in_robot
 from tools.reenactment.world import World, write_world
 from tools.simulator.driving import step_record
 from tools.simulator.reenact import (
@@ -46,7 +46,7 @@ def recorded(
     world = World(np.array(PREFIXES), poses, tilt, ids, DISC_XY, mounting)
     before = np.vstack([[0.0, 0.1, 0.0], poses[:-1]])
     frames = []
-    for prefix, step, pose in zip(PREFIXES, relative_pose(before, poses), poses):
+    for prefix, step, pose in zip(PREFIXES, between(before, poses), poses):
         rows = tuple(
             CircleLandmark(float(x), float(y), 0.9, 0.002, 0.0, 0.003, (int(i),))
             for i, (x, y) in zip(ids[:3], disc_in_robot(pose, DISC_XY[:3]))
@@ -113,7 +113,7 @@ def test_run_folder_holds_the_recorded_rows(
     assert [f.step.prefix for f in frames] == PREFIXES[::2]
     steps = [f.step for f in read_frames(tmp_path / "again" / "again.txt")]
     assert steps == [f.step for f in frames]
-    move = relative_pose(run.world.poses[0], run.world.poses[2])
+    move = between(run.world.poses[0], run.world.poses[2])
     np.testing.assert_allclose([steps[1].dx, steps[1].dy, steps[1].dphi], move, atol=2e-5)
     assert "SIMULATED" in (tmp_path / "again" / "map.circles").read_text()[:300]
     assert SIMULATED.split("{")[0] in (tmp_path / "again" / "again.txt").read_text()

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from camera import Camera, read_camera
 from camera.uncertainty import exact
 from redetect.landmarks import read_frames
-from redetect.slam.models.measurement import disc_in_robot
+from redetect.slam.models import disc_in_robot
 from tools.simulator.__main__ import main
 from tools.simulator.driving import tilted_camera
 from tools.simulator.observation import published_covariance

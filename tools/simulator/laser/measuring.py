@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import compose
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.plane import compose
 from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.lasers.scanners import Scanner, write_scanners
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.trajectories.plane import apply
+from redetect.groundtruth.lasers.scanners import Scanner, Scans, write_scanners
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.fiducials import Distance, Survey
+from redetect.groundtruth.validation.reference_poses import Distance, Survey
 from redetect.landmarks import wrap_angle
+from redetect.plane import apply
 from tools.arrays import BoolArray, FloatArray
 from tools.simulator.files import write_bytes
 from tools.simulator.laser.measuring import Scene, measured, true_ranges

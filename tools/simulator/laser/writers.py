@@ -10,9 +10,8 @@ import numpy as np
 
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.building import HEAD
-from redetect.groundtruth.lasers.scanners import Robot, scanner_entry
-from redetect.groundtruth.lasers.scans import Scans
-from redetect.groundtruth.validation.fiducials import DISTANCES_HEAD, Distance, Survey
+from redetect.groundtruth.lasers.scanners import Robot, Scans, scanner_entry
+from redetect.groundtruth.validation.reference_poses import DISTANCES_HEAD, Distance, Survey
 from redetect.storage import write_whole
 from tools.arrays import FloatArray
 

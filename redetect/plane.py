@@ -1,4 +1,4 @@
-"""Rigid motions of the plane as (x, y, theta): composition, inverse, points, covariances.
+"""Rigid motions of the plane as (x, y, theta): composition, inverse, points, fits.
 
 A pose `a_from_b` takes points of frame b to frame a. Metres and radians; stacks of any leading
 shape. Covariances are those of (x, y, theta) themselves, as in the streams of poses.
@@ -7,11 +7,17 @@ shape. Covariances are those of (x, y, theta) themselves, as in the streams of p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 
-FloatArray = NDArray[np.float64]
+
+def rotation(theta_rad: ArrayLike) -> FloatArray:
+    """(..., 2, 2) rotations by (...) angles, counter-clockwise."""
+    angle = np.asarray(theta_rad, dtype=np.float64)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 
 
 def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
@@ -63,23 +69,17 @@ def log_motion(a_from_b: ArrayLike) -> FloatArray:
 
 
 def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
-    """(n, 2) points of frame b taken to frame a by one pose."""
+    """(..., 2) points of frame b taken to frame a by (..., 3) poses, broadcast."""
     a, p = np.asarray(a_from_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
-    c, s = np.cos(a[2]), np.sin(a[2])
-    return np.stack(
-        [a[0] + c * p[..., 0] - s * p[..., 1], a[1] + s * p[..., 0] + c * p[..., 1]], -1
-    )
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * p[..., 0] - s * p[..., 1]
+    y = a[..., 1] + s * p[..., 0] + c * p[..., 1]
+    return np.stack([x, y], axis=-1)
 
 
-def composed_covariance(
-    a_from_b: FloatArray,
-    covariance_a: FloatArray,
-    b_from_c: FloatArray,
-    covariance_b: FloatArray,
-) -> FloatArray:
-    """(3, 3) covariance of a_from_c = a_from_b composed with b_from_c, with independent errors."""
-    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
-    dx, dy = c * b_from_c[0] - s * b_from_c[1], s * b_from_c[0] + c * b_from_c[1]
-    first = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    second = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(first @ covariance_a @ first.T + second @ covariance_b @ second.T)
+def fitted(points: FloatArray, target: FloatArray) -> FloatArray:
+    """(3,) pose that takes (n, 2) points nearest to their targets: least squares (Horn 1987)."""
+    from_points, from_target = points - points.mean(axis=0), target - target.mean(axis=0)
+    across = from_points[:, 0] * from_target[:, 1] - from_points[:, 1] * from_target[:, 0]
+    turn = float(np.arctan2(np.sum(across), np.sum(from_points * from_target)))
+    return np.array([*(target.mean(axis=0) - rotation(turn) @ points.mean(axis=0)), turn])

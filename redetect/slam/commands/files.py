@@ -1,22 +1,27 @@
-"""Input of the commands: the run, its camera, a path to compare with."""
+"""Files of the commands: the run, its camera, a path to compare with; summaries and pictures."""
 
 from __future__ import annotations
 
+import json
 import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from redetect.landmarks.map_file import Path2D, read_path
+from redetect.array_types import FloatArray
+from redetect.landmarks.map_file import LandmarkMap, Path2D, read_path
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import NO_CAMERA
-from redetect.slam.models.odometry_noise import OdometryNoise
-from redetect.slam.options import RunFlags
-from redetect.slam.recording import Recording, read_recording
-
-FloatArray = NDArray[np.float64]
+from redetect.slam.filters.frames import NO_CAMERA, FilterRun
+from redetect.slam.models import OdometryNoise
+from redetect.slam.options import FilterFlags, RunFlags
+from redetect.slam.pictures import draw_errors, draw_map
+from redetect.slam.recording import Recording, demand_landmarks, landmark_file, read_recording
+from redetect.storage import OutputExistsError, write_whole
 
 
 def recording_of(flags: RunFlags) -> Recording:
@@ -108,6 +113,80 @@ def read_reference(path: Path, poses: Path2D) -> Path2D:
     return reference
 
 
-def default_output(run: Path, name: str) -> Path:
+def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
+
+
+def landmark_files(flags: RunFlags) -> list[Path]:
+    """The landmark files of the kinds that a command names."""
+    if not flags.run.is_dir():
+        return [demand_landmarks(flags.run)]
+    kinds = (".circles", flags.circles or not flags.lines), (".lines", flags.lines)
+    return [landmark_file(flags.run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
+
+
+PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
+
+
+def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
+    """Refuse before the work what could not be written after it."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise OutputExistsError(path)
+
+
+def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A command's flags as a JSON file has them."""
+    return {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in asdict(cast(Any, command)).items()
+        if name not in but
+    }
+
+
+def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
+    """Take a filter through a run; also returned is what to print of its time."""
+    began, began_working = time.perf_counter(), time.thread_time()
+    run = work()
+    seconds, working = time.perf_counter() - began, time.thread_time() - began_working
+    steps = len(run.path.poses) - 1
+    return run, (
+        f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s; of processor "
+        f"{working:.2f} s, {steps / working:.0f} steps/s"
+    )
+
+
+def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
+    """Write a summary."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def draw_results(
+    output: Path,
+    landmark_map: LandmarkMap,
+    path: Path2D,
+    reference: Path2D | None,
+    title: str,
+    flags: FilterFlags,
+) -> None:
+    """Draw the map with the path and, beside a reference, the distance from it."""
+    draw_map(
+        output / MAP_PICTURE,
+        landmark_map,
+        path,
+        reference=reference,
+        title=title,
+        overwrite=flags.force,
+        interactive=flags.interactive,
+    )
+    if reference is not None:
+        draw_errors(
+            output / ERROR_PICTURE,
+            path,
+            reference.poses,
+            title=title,
+            overwrite=flags.force,
+            interactive=flags.interactive,
+        )

@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.model import cross_matrices
+from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
-
-FloatArray = NDArray[np.float64]
 
 
 def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -85,13 +83,22 @@ def rows_through_mounting(
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
     ray = directions @ turn.T
+    slope, by_ray = _on_floor(ray, centre[2])
+    by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
+    return centre[:2] - centre[2] * slope, by_mounting
+
+
+def _on_floor(ray: FloatArray, height_m: float) -> tuple[FloatArray, FloatArray]:
+    """Slopes (n, 2) of rays (n, 3), NaN where one does not go down.
+
+    And the derivatives (n, 2, 3) of where they meet the floor, ``-height_m * slope``, by the rays.
+    """
     ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
     slope = ray[:, :2] / ray[:, 2:]
     by_ray = np.zeros((len(ray), 2, 3))
-    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -centre[2] / ray[:, 2]
-    by_ray[:, :, 2] = centre[2] * slope / ray[:, 2:]
-    by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
-    return centre[:2] - centre[2] * slope, by_mounting
+    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -height_m / ray[:, 2]
+    by_ray[:, :, 2] = height_m * slope / ray[:, 2:]
+    return slope, by_ray
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +128,8 @@ def rows_as_recorded(
     turn, left = rotation_exp(np.column_stack([tilt, np.zeros(len(tilt))]))
     level = np.swapaxes(turn, 1, 2)
     untilted = np.einsum("nij,nj->ni", level, from_centre)
-    ray = untilted @ unturn.T
-    ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
     height = float(camera.centre[2])
-    slope = ray[:, :2] / ray[:, 2:]
-    by_ray = np.zeros((len(ray), 2, 3))
-    by_ray[:, 0, 0] = by_ray[:, 1, 1] = -height / ray[:, 2]
-    by_ray[:, :, 2] = height * slope / ray[:, 2:]
+    slope, by_ray = _on_floor(untilted @ unturn.T, height)
     by_untilted = by_ray @ unturn
     by_robot = by_untilted @ level
     return camera.centre[:2] - height * slope, RecordedJacobians(

@@ -1,0 +1,210 @@
+"""Motion and measurement of a robot on the floor, with Jacobians, and the noise of its odometry.
+
+A pose is (x, y, theta): the robot's origin in the map (m), and the turn of its axes against the
+map's (rad, counter-clockwise). An odometry step (dx, dy, dphi) is the pose after a movement in the
+robot frame before it. Robot frame: X left, Y backward, so a bearing is atan2(x, -y): 0 forward,
+positive to the left. Everything is vectorised over leading axes. f and J1 to J6 are the report's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from redetect.array_types import FloatArray
+from redetect.plane import between, rotation
+from redetect.slam.errors import SlamError
+from redetect.storage.bounds import NotNegative, Positive, demand_fields
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """Standard deviations of the steps of odometry that state none."""
+
+    per_metre: NotNegative = 0.05  # of the way, as a share of it
+    per_radian: NotNegative = 0.05  # of the turn, as a share of it
+    turn_per_metre: NotNegative = 0.03  # of the turn by the way, radians per metre
+    least_m: Positive = 0.005  # of every step's way, metres
+    least_rad: Positive = 0.002  # of every step's turn, radians
+
+    def __post_init__(self) -> None:
+        demand_fields(self, SlamError)
+
+    def covariance(self, steps: FloatArray) -> FloatArray:
+        """(N, 3, 3) covariances of (N, 3) steps dx, dy (m), dphi (rad)."""
+        way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
+        of_way = (self.per_metre * way) ** 2 + self.least_m**2
+        of_turn = (self.per_radian * turn) ** 2 + (self.turn_per_metre * way) ** 2
+        diagonal = np.stack([of_way, of_way, of_turn + self.least_rad**2], axis=-1)
+        return np.asarray(diagonal[:, :, None] * np.eye(3))
+
+    def sentence(self) -> str:
+        """Description of the assumed noise."""
+        return (
+            f"{100.0 * self.per_metre:g} % of the way, {100.0 * self.per_radian:g} % of the turn "
+            f"and {self.turn_per_metre:g} rad per metre, at least {self.least_m:g} m and "
+            f"{self.least_rad:g} rad"
+        )
+
+
+def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
+    """Motion model f: the pose after an odometry step.
+
+    Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
+    """
+    before = np.asarray(pose, dtype=np.float64)
+    moved = np.asarray(step, dtype=np.float64)
+    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
+    return np.stack(
+        [
+            before[..., 0] + cos * moved[..., 0] - sin * moved[..., 1],
+            before[..., 1] + sin * moved[..., 0] + cos * moved[..., 1],
+            before[..., 2] + moved[..., 2],
+        ],
+        axis=-1,
+    )
+
+
+def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of `move` by the pose (J1) and by the step (J2).
+
+    Takes `pose, step` (..., 3); returns `by_pose, by_step` (..., 3, 3).
+    """
+    before = np.asarray(pose, dtype=np.float64)
+    moved = np.asarray(step, dtype=np.float64)
+    shape = np.broadcast_shapes(before.shape, moved.shape)[:-1]
+    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
+    by_pose = np.zeros((*shape, 3, 3))
+    by_pose[..., 0, 0] = by_pose[..., 1, 1] = by_pose[..., 2, 2] = 1.0
+    by_pose[..., 0, 2] = -sin * moved[..., 0] - cos * moved[..., 1]
+    by_pose[..., 1, 2] = cos * moved[..., 0] - sin * moved[..., 1]
+    by_step = np.zeros((*shape, 3, 3))
+    by_step[..., 0, 0] = by_step[..., 1, 1] = cos
+    by_step[..., 0, 1], by_step[..., 1, 0] = -sin, sin
+    by_step[..., 2, 2] = 1.0
+    return by_pose, by_step
+
+
+def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of `between` by the first (J3) and by the second pose (J4).
+
+    Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
+    """
+    before = np.asarray(first, dtype=np.float64)
+    step = between(first, second)
+    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
+    by_second = np.zeros((*step.shape, 3))
+    by_second[..., 0, 0] = by_second[..., 1, 1] = cos
+    by_second[..., 0, 1], by_second[..., 1, 0] = sin, -sin
+    by_second[..., 2, 2] = 1.0
+    by_first = -by_second
+    by_first[..., 0, 2], by_first[..., 1, 2] = step[..., 1], -step[..., 0]
+    return by_first, by_second
+
+
+def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Poses that odometry alone leads to.
+
+    Parameters
+    ----------
+    steps : (N, 3) array_like
+        Odometry steps.
+    start : (3,) array_like
+        Pose before the first.
+
+    Returns
+    -------
+    (N + 1, 3) float64
+        The start and the pose after each step; theta is not wrapped.
+    """
+    step = np.asarray(steps, dtype=np.float64).reshape(-1, 3)
+    first = np.asarray(start, dtype=np.float64)
+    theta = first[2] + np.concatenate([[0.0], np.cumsum(step[:, 2])])
+    offset = np.einsum("nij,nj->ni", rotation(theta[:-1]), step[:, :2])
+    xy = first[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(offset, axis=0)])
+    return np.concatenate([xy, theta[:, None]], axis=1)
+
+
+def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
+    """Measurement model of a disc: its centre in the robot frame.
+
+    Parameters
+    ----------
+    pose : (..., 3) array_like
+        x, y (m), theta (rad) of the robot in the map.
+    disc_xy : (..., 2) array_like
+        The disc's centre in the map (m).
+
+    Returns
+    -------
+    (..., 2) float64
+        The centre in the robot frame (m).
+    """
+    robot = np.asarray(pose, dtype=np.float64)
+    offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
+    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
+    return np.stack(
+        [
+            cos * offset[..., 0] + sin * offset[..., 1],
+            -sin * offset[..., 0] + cos * offset[..., 1],
+        ],
+        axis=-1,
+    )
+
+
+def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of `disc_in_robot` by the pose (J5) and by the disc's centre (J6).
+
+    Returns `by_pose` (..., 2, 3), `by_disc` (..., 2, 2).
+    """
+    robot = np.asarray(pose, dtype=np.float64)
+    seen = disc_in_robot(pose, disc_xy)
+    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
+    by_disc = np.zeros((*seen.shape, 2))
+    by_disc[..., 0, 0] = by_disc[..., 1, 1] = cos
+    by_disc[..., 0, 1], by_disc[..., 1, 0] = sin, -sin
+    by_pose = np.zeros((*seen.shape, 3))
+    by_pose[..., :2] = -by_disc
+    by_pose[..., 0, 2], by_pose[..., 1, 2] = seen[..., 1], -seen[..., 0]
+    return by_pose, by_disc
+
+
+def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
+    """Measurement model of a vertical line: the bearing under which the camera sees it.
+
+    Parameters
+    ----------
+    pose : (..., 3) array_like
+        The robot's pose in the map.
+    line_xy : (..., 2) array_like
+        Position of the line in the map (m).
+    camera_xy : (2,) array_like
+        (cx, cy): the camera's centre in the robot frame (m), from `sensor2World`.
+
+    Returns
+    -------
+    (...) float64
+        Bearing (rad) in [-pi, pi].
+    """
+    seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
+    return np.asarray(np.arctan2(seen[..., 0], -seen[..., 1]))
+
+
+def bearing_jacobians(
+    pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of `bearing_of_vertical` by the pose and by the line's place (chain rule).
+
+    Returns `by_pose` (..., 3), `by_line` (..., 2).
+    """
+    seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
+    squared = np.sum(seen**2, axis=-1)
+    # d atan2(x, -y) = (-y dx + x dy) / (x^2 + y^2)
+    by_seen = np.stack([-seen[..., 1], seen[..., 0]], axis=-1) / squared[..., None]
+    by_pose, by_line = disc_jacobians(pose, line_xy)
+    return (
+        np.asarray(np.einsum("...i,...ij->...j", by_seen, by_pose)),
+        np.asarray(np.einsum("...i,...ij->...j", by_seen, by_line)),
+    )
