@@ -165,6 +165,9 @@ class Localize(FilterFlags):
         Pose at the start in the map (m, m, rad).
     start_sigma : three floats
         Its standard deviations.
+    lost : bool
+        Nothing is known of the pose at the start: it is found by the discs of the first frames,
+        whatever their identifiers. Without these, with `--association joint`.
     output : Path
         Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run
         folder.
@@ -174,6 +177,7 @@ class Localize(FilterFlags):
     map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lost: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

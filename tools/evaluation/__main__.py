@@ -42,6 +42,7 @@ STUDIES = {
     "tilt-of-discs": "tilt_of_discs.TiltOfDiscs",
     "train-rim-network": "rim_network_training.TrainRimNetwork",
     "tutorial-photographs": "boards.TutorialPhotographs",
+    "waking-up": "association.WakingUp",
 }
 
 

@@ -1,16 +1,20 @@
-"""How well rows are associated, by method and by added noise."""
+"""How well rows are associated, by method and by added noise, and where a robot wakes up."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from tyro.conf import Positional
 
+from redetect.landmarks import wrap_angle
+from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, associate_run
+from redetect.slam.association.waking import wake_up
 from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
 from redetect.slam.noise import with_relative_noise
@@ -63,4 +67,46 @@ class Association:
                             s.right_rows, s.found_landmarks, s.true_landmarks, s.wrong_merges,
                             s.splits, seconds,
                         )  # fmt: skip
+        return 0
+
+
+@dataclass(frozen=True)
+class WakingUp:
+    """Let a robot wake up along a run, its identifiers unknown, and compare with a known path."""
+
+    run: Positional[Path]  # Run folder or `.circles` file.
+    map: Path  # `map.csv`.
+    path: Path  # `path.csv` of the same run in that map.
+    every: int = 50  # Frames from one waking to the next.
+
+    def __call__(self) -> int:
+        recording, discs = read_recording(self.run), read_map(self.map).discs.xy
+        poses = read_path(self.path).poses
+        rows, off, turned, taken, squared = recording.circles, [], [], [], []
+        starts = range(0, len(recording), self.every)
+        for start in starts:
+            later = rows.only(rows.frame >= start)
+            rest = replace(
+                recording,
+                prefixes=recording.prefixes[start:],
+                steps=recording.steps[start:],
+                step_covariance=recording.step_covariance[start:],
+                circles=replace(later, frame=later.frame - start),
+            )
+            woken = wake_up(rest, discs)
+            if woken is None:
+                continue
+            difference = woken.pose - poses[start]
+            difference[2] = wrap_angle(difference[2])
+            off.append(np.hypot(difference[0], difference[1]))
+            turned.append(abs(np.degrees(difference[2])))
+            taken.append(woken.frames)
+            squared.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
+        print(f"{len(off)} of {len(starts)} times it knew where it was")
+        if off:
+            print(
+                f"off by {np.median(off):.2f} m and {np.median(turned):.1f} deg (medians), at most "
+                f"{max(off):.2f} m and {max(turned):.1f} deg; after {np.median(taken):.0f} frames "
+                f"(median), at most {max(taken)}; error^2 / sigma^2 {np.mean(squared):.2f}"
+            )
         return 0

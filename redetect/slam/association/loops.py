@@ -342,7 +342,7 @@ def _refined(
     after = apply(pose, place)
     nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
-    chance = len(target) * np.pi * settings.reach_m**2 / _covered_area(target)
+    chance = len(target) * np.pi * settings.reach_m**2 / covered_area(target)
     return Match(
         earlier.middle_frame,
         later.middle_frame,
@@ -353,7 +353,7 @@ def _refined(
     )
 
 
-def _covered_area(xy: FloatArray) -> float:
+def covered_area(xy: FloatArray) -> float:
     """Area within the cover distance of any point (m^2), on a grid."""
     low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
     xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))

@@ -13,6 +13,7 @@ from redetect.landmarks.map_file import (
     read_map,
     write_path,
 )
+from redetect.slam.association.waking import wake_up
 from redetect.slam.commands.files import (
     ERROR_PICTURE,
     MAP_PICTURE,
@@ -82,10 +83,13 @@ def localized_run_of(
         If no row shows a landmark of the map, or a flag is out of its range.
     """
     demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
+    start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))
+    if command.lost:
+        start, covariance = _woken_up(command, recording, landmark_map)
     localizer = Localizer(
         landmark_map,
-        command.start,
-        np.diag(np.square(command.start_sigma)),
+        start,
+        covariance,
         camera_xy_of(recording, command.run, command.camera),
         map_errors=_map_errors(command),
         joint_covariance=joint,
@@ -98,6 +102,26 @@ def localized_run_of(
             "same run, or --association joint"
         )
     return run
+
+
+def _woken_up(
+    command: Localize, recording: Recording, landmark_map: LandmarkMap
+) -> tuple[FloatArray, FloatArray]:
+    """The pose at the start and its covariance, by the discs of the first frames."""
+    if any(command.start) or any(command.start_sigma):
+        raise SlamError("--lost and --start: expected one of them")
+    woken = wake_up(recording, landmark_map.discs.xy)
+    if woken is None:
+        raise SlamError(
+            f"{command.run}: no place in {command.map} is certain by the discs of the first frames:"
+            " expected five or more that no other place has as well; --start says where"
+        )
+    x, y, heading = woken.pose
+    print(
+        f"woke up at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {woken.agreeing} "
+        f"of {woken.discs} discs of the first {woken.frames} frames are in the map"
+    )
+    return woken.pose, woken.covariance
 
 
 def _map_errors(command: Localize) -> MapErrors:

@@ -1,0 +1,116 @@
+"""A robot that wakes up somewhere: where is found where it is certain, and nowhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from redetect.array_types import FloatArray
+from redetect.landmarks.map_file import read_path
+from redetect.plane import apply, compose, invert
+from redetect.slam.association.waking import wake_up
+from redetect.slam.cli import main
+from redetect.slam.recording import CircleRows, LineRows, Recording
+
+SIGMA_M = 0.05
+STEP = np.array([0.0, -0.25, 0.05])
+STEP_SIGMA = np.array([0.01, 0.02, 0.01])
+
+
+def drive(disc_xy: FloatArray, start: FloatArray, seed: int, steps: int = 40) -> Recording:
+    """Discs within 4 m, noisy, and some rows of nothing; the odometry errs as it says."""
+    rng = np.random.default_rng(seed)
+    measured = STEP + STEP_SIGMA * rng.standard_normal((steps, 3))
+    pose, frame, rows = start, [], []
+    for k in range(steps):
+        pose = compose(pose, STEP)
+        seen = apply(invert(pose), disc_xy)
+        near = seen[(np.hypot(*seen.T) < 4.0) & (seen[:, 1] < -0.5)]
+        clutter = rng.uniform([-3.0, -4.0], [3.0, -1.0], (int(rng.random() < 0.1), 2))
+        for xy in (*(near + SIGMA_M * rng.standard_normal(near.shape)), *clutter):
+            frame.append(k)
+            rows.append(xy)
+    count = len(rows)
+    return Recording(
+        tuple(f"f{k}" for k in range(steps)),
+        measured,
+        np.tile(np.diag(STEP_SIGMA**2), (steps, 1, 1)),
+        CircleRows(
+            np.array(frame, np.int64),
+            np.array(rows).reshape(-1, 2),
+            np.tile(SIGMA_M**2 * np.eye(2), (count, 1, 1)),
+            np.full(count, -1),
+        ),
+        LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ()),
+    )
+
+
+def test_the_pose_is_found_in_a_large_map() -> None:
+    squares = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        disc_xy = rng.uniform(0.0, [40.0, 30.0], (300, 2))
+        start = np.array([*rng.uniform([5.0, 5.0], [35.0, 25.0]), rng.uniform(-3.0, 3.0)])
+        woken = wake_up(drive(disc_xy, start, seed), disc_xy)
+        assert woken is not None
+        off = compose(invert(start), woken.pose)
+        assert np.hypot(off[0], off[1]) < 0.5
+        assert abs(off[2]) < 0.15
+        difference = woken.pose - start
+        difference[2] = off[2]
+        squares.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
+        assert woken.agreeing >= 0.5 * woken.discs
+    assert 0.05 < np.mean(squares) < 1.5
+
+
+def test_where_the_building_repeats_itself_nothing_is_certain() -> None:
+    rng = np.random.default_rng(1)
+    room = rng.uniform(0.0, 7.0, (25, 2))
+    disc_xy = np.concatenate([room, room + np.array([20.0, 0.0])])
+    assert wake_up(drive(disc_xy, np.array([3.0, 5.0, 0.3]), 1, steps=10), disc_xy) is None
+    one = wake_up(drive(room, np.array([3.0, 5.0, 0.3]), 1, steps=10), room)
+    assert one is not None
+    np.testing.assert_allclose(one.pose, [3.0, 5.0, 0.3], atol=0.4)
+
+
+def test_another_building_has_no_place_for_it() -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        here, there = rng.uniform(0.0, 30.0, (2, 250, 2))
+        assert wake_up(drive(here, np.array([15.0, 15.0, 0.0]), seed), there) is None
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_few_discs_are_no_place(count: int) -> None:
+    disc_xy = np.random.default_rng(2).uniform(0.0, 5.0, (count, 2))
+    assert wake_up(drive(disc_xy, np.zeros(3), 2), disc_xy) is None
+
+
+@pytest.mark.long
+def test_a_run_is_localised_from_an_unknown_start(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The demo run from its 25th frame on, without identifiers, in the map of the whole."""
+    run = project_root / "images" / "e"
+    assert main(["map", str(run), "-o", str(tmp_path / "map")]) == 0
+    head, *steps = (run / "map.circles").read_text().split("STEP ")
+    rest = [
+        "\n".join(
+            " ".join([*line.split()[:7], "-1"]) if line.startswith("LANDMARK_C") else line
+            for line in step.splitlines()
+        )
+        for step in steps[25:]
+    ]
+    part = tmp_path / "part.circles"
+    part.write_text(head + "".join(f"STEP {step}\n" for step in rest))
+    where = ["--map", str(tmp_path / "map" / "map.csv"), "--association", "joint"]
+    assert main(["localize", str(part), *where, "--lost", "-o", str(tmp_path / "out")]) == 0
+    assert "woke up at" in capsys.readouterr().out
+    found = read_path(tmp_path / "out" / "path.csv").poses[1:]
+    true = read_path(tmp_path / "map" / "path.csv").poses[26:]
+    off = np.hypot(*(found[:, :2] - true[:, :2]).T)
+    assert np.median(off) < 0.15
+    assert main(["localize", str(part), *where, "--lost", "--start", "1", "0", "0"]) == 1
+    assert "expected one of them" in capsys.readouterr().err
