@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.plane import apply, compose, fitted, rotation
+from redetect.plane import apply, fitted, rotation
 from redetect.slam.association.loops import (
     LoopSettings,
     best_motion,
@@ -23,6 +23,7 @@ from redetect.slam.association.loops import (
     log10_false_alarms,
     mutual_pairs,
 )
+from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
 
 #: Frames that are tried, and by how much more each time.
@@ -66,12 +67,10 @@ def wake_up(
     """
     if len(disc_xy) < settings.least_agreeing or len(recording) == 0:
         return None
-    poses = [np.zeros(3)]
-    for step in recording.steps[:_MOST_FRAMES]:
-        poses.append(compose(poses[-1], step))
-    rows = recording.circles
-    at = apply(np.array(poses)[np.minimum(rows.frame, _MOST_FRAMES - 1) + 1], rows.xy)
     most = min(len(recording), _MOST_FRAMES)
+    poses = chain_steps(recording.steps[:most])
+    rows = recording.circles.only(recording.circles.frame < most)
+    at = apply(poses[rows.frame + 1], rows.xy)
     frames, before = min(_FEWEST_FRAMES, most), -1
     while True:
         discs = _merged(at[rows.frame < frames])

@@ -1,7 +1,0 @@
-"""``python -m redetect.groundtruth`` is the command ``groundtruth``."""
-
-import sys
-
-from redetect.groundtruth.cli import main
-
-sys.exit(main())
