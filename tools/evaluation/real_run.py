@@ -65,7 +65,9 @@ def measure_run(run: Path, folder: Path) -> Iterator[tuple[str, ...]]:
         factors = []
         for calibrate in ((), ("--calibrate",)):
             mapped = output / f"map{len(calibrate)}"
-            run_program("redetect.slam", "map", rows, "--camera", camera, "-o", mapped, *calibrate)
+            run_program(
+                "redetect", "slam", "map", rows, "--camera", camera, "-o", mapped, *calibrate
+            )
             factors.append(json.loads((mapped / "table.json").read_text())["table"]["factor"])
         left = (result["lean"] or {}).get("left", {})
         median_m = left.get("median_m", result["error_median_m"])
