@@ -102,11 +102,11 @@ def test_a_soak_of_some_seconds(
     short = repeated_run(open_run(source), tmp_path_factory.mktemp("short") / "s", 2)
     compiled = ["all", str(short), "-o", str(tmp_path_factory.mktemp("compiled"))]
     subprocess.run([sys.executable, "-m", "detect", *compiled], check=True, capture_output=True)
-    arguments = ["--frames", "6000", "--jobs", "1", "--source", str(source)]
+    arguments = ["--frames", "3000", "--jobs", "1", "--source", str(source)]
     code = main([*arguments, "--json", str(figures), "--scratch", str(tmp_path)])
     said = capsys.readouterr()
     assert code in (0, 1), said.err
-    assert "6000 frames, 1 jobs" in said.out, said.err
+    assert "3000 frames, 1 jobs" in said.out, said.err
     found = json.loads(figures.read_text())
     assert 50.0 < found["resident_mib"][0] < 600.0
     assert 3 <= found["descriptors"][-1] <= found["descriptors"][0]
