@@ -31,7 +31,7 @@ class SettingsFile:
 
 
 def read_settings(path: Path) -> SettingsFile:
-    """Read settings from a JSON file, a log of detections or one of `write_settings`.
+    """Read settings from a JSON file, a log of detections or what `settings_text` gives.
 
     Raises
     ------

@@ -14,7 +14,7 @@ import math
 import secrets
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -46,19 +46,6 @@ _LONGEST_BYTES = 1 << 22
 #: Points of an outline, and half axes of an ellipse in standard deviations.
 _OUTLINE, _SIGMAS = 32, 3.0
 _LABELS_HEAD = "Discs with identifiers given by hand, on the page of `detect tune --serve`."
-
-
-@dataclass(frozen=True)
-class Label:
-    """A disc with an identifier that a person gave it."""
-
-    px: float
-    py: float
-    quality: float
-    cxx: float
-    cxy: float
-    cyy: float
-    id: int
 
 
 @dataclass
@@ -138,7 +125,7 @@ class TuningSession:
         labelled = {int(number): [_label(one) for one in some] for number, some in labels.items()}
         if any(labelled.values()):
             contents[LABELS_NAME] = format_head(_LABELS_HEAD) + b"".join(
-                format_frame(Frame(frame.step, _rows(labelled.get(number, []))))
+                format_frame(Frame(frame.step, tuple(labelled.get(number, ()))))
                 for number, frame in enumerate(self.frames)
             )
         with self._lock:
@@ -153,21 +140,15 @@ class TuningSession:
         return [str(self.output / name) for name in contents]
 
 
-def _label(values: Mapping[str, Any]) -> Label:
+def _label(values: Mapping[str, Any]) -> CircleLandmark:
+    """The row of a disc with the identifier that a person gave it."""
     try:
-        label = Label(**{name: float(value) for name, value in values.items()})  # type: ignore[arg-type]
-        return replace(label, id=int(label.id))
-    except (TypeError, ValueError, OverflowError):
+        numbers = {name: float(value) for name, value in values.items() if name != "id"}
+        return CircleLandmark(**numbers, ids=(int(values["id"]),))
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise DetectError(
             "a label: expected a position, its covariance and an identifier"
         ) from None
-
-
-def _rows(labels: Sequence[Label]) -> tuple[CircleLandmark, ...]:
-    return tuple(
-        CircleLandmark(one.px, one.py, one.quality, one.cxx, one.cxy, one.cyy, (one.id,))
-        for one in labels
-    )
 
 
 def _finite(value: float) -> float | None:

@@ -267,15 +267,8 @@ def find_matches(
             moved = ~np.isin(later.labels, earlier.labels)
             if min(fixed.sum(), moved.sum()) < settings.least_agreeing:
                 continue
-            turn, x, y, agreeing, _, hypotheses = best_motion(
-                later.xy[moved],
-                earlier.xy[fixed],
-                settings.length_tolerance_m,
-                settings.least_length_m,
-                settings.reach_m,
-                settings.most_turn_rad,
-                settings.most_shift_m,
-                settings.least_agreeing,
+            turn, x, y, agreeing, hypotheses = motion_onto(
+                later.xy[moved], earlier.xy[fixed], settings
             )
             tried += hypotheses
             if agreeing >= settings.least_agreeing:
@@ -294,6 +287,35 @@ def find_matches(
         ),
     )
     return [matches[n] for n in order]
+
+
+def motion_onto(
+    moved: FloatArray, fixed: FloatArray, settings: LoopSettings
+) -> tuple[float, float, float, int, int]:
+    """`best_motion` by settings: `turn_rad`, `shift_x, shift_y`, `agreeing`, `tried`."""
+    turn, x, y, agreeing, _, tried = best_motion(
+        moved, fixed, settings.length_tolerance_m, settings.least_length_m, settings.reach_m,
+        settings.most_turn_rad, settings.most_shift_m, settings.least_agreeing,
+    )  # fmt: skip
+    return turn, x, y, agreeing, tried
+
+
+def settled(
+    place: FloatArray, target: FloatArray, turn: float, offset: FloatArray, settings: LoopSettings
+) -> tuple[FloatArray, IntArray] | None:
+    """The pose that lays landmarks on those they agree with, by least squares, and which these are.
+
+    From a turn about the landmarks' middle and an offset of that; None if too few agree. Pairs are
+    (k, 2), as of `mutual_pairs`: first the target's.
+    """
+    centre = place.mean(axis=0)
+    pose = np.array([*(centre + offset - rotation(turn) @ centre), turn])
+    for _ in range(5):
+        pairs = mutual_pairs(target, apply(pose, place), settings.reach_m)
+        if len(pairs) < settings.least_agreeing:
+            return None
+        pose = fitted(place[pairs[:, 1]], target[pairs[:, 0]])
+    return pose, pairs
 
 
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
@@ -332,13 +354,10 @@ def _refined(
 ) -> Match | None:
     """Match by least squares over all landmarks that agree; None if too few agree then."""
     place, target = later.xy[moved], earlier.xy[fixed]
-    centre = place.mean(axis=0)
-    pose = np.array([*(centre + offset - rotation(turn) @ centre), turn])
-    for _ in range(5):
-        pairs = mutual_pairs(target, apply(pose, place), settings.reach_m)
-        if len(pairs) < settings.least_agreeing:
-            return None
-        pose = fitted(place[pairs[:, 1]], target[pairs[:, 0]])
+    found = settled(place, target, turn, offset, settings)
+    if found is None:
+        return None
+    pose, pairs = found
     after = apply(pose, place)
     nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.plane import apply, fitted, rotation
+from redetect.plane import apply, rotation
 from redetect.slam.association.loops import (
     LoopSettings,
-    best_motion,
     covered_area,
     log10_false_alarms,
-    mutual_pairs,
+    motion_onto,
+    settled,
 )
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
@@ -108,36 +108,23 @@ def _placed(
     """Pose, covariance, agreeing discs and false alarms of the only place that fits."""
     if len(discs) < settings.least_agreeing:
         return None
-    turn, x, y, agreeing, tried = _laid_on(discs, disc_xy, settings)
+    turn, x, y, agreeing, tried = motion_onto(discs, disc_xy, settings)
     if agreeing < settings.least_agreeing:
         return None
-    centre = discs.mean(axis=0)
-    pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
-    for _ in range(5):
-        pairs = mutual_pairs(disc_xy, apply(pose, discs), settings.reach_m)
-        if len(pairs) < settings.least_agreeing:
-            return None
-        pose = fitted(discs[pairs[:, 1]], disc_xy[pairs[:, 0]])
+    found = settled(discs, disc_xy, turn, np.array([x, y]), settings)
+    if found is None:
+        return None
+    pose, pairs = found
     chance = len(disc_xy) * np.pi * settings.reach_m**2 / covered_area(disc_xy)
     alarms = log10_false_alarms(len(pairs), len(discs), chance, tried)
     if alarms > math.log10(settings.false_alarms):
         return None
     others = np.delete(disc_xy, pairs[:, 0], axis=0)
     if len(others) >= settings.least_agreeing:
-        rival = _laid_on(discs, others, settings)[3]
+        rival = motion_onto(discs, others, settings)[3]
         if rival > _RIVAL_SHARE * len(pairs):
             return None
     return pose, _covariance(pose, discs[pairs[:, 1]], disc_xy[pairs[:, 0]]), len(pairs), alarms
-
-
-def _laid_on(
-    discs: FloatArray, disc_xy: FloatArray, settings: LoopSettings
-) -> tuple[float, float, float, int, int]:
-    turn, x, y, agreeing, _, tried = best_motion(
-        discs, disc_xy, settings.length_tolerance_m, settings.least_length_m, settings.reach_m,
-        settings.most_turn_rad, settings.most_shift_m, settings.least_agreeing,
-    )  # fmt: skip
-    return turn, x, y, agreeing, tried
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
