@@ -30,6 +30,7 @@ from detect.circles import detect_circles, disc_shape
 from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
+from detect.levelling import with_common
 from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
@@ -85,6 +86,8 @@ class TuningSession:
         image, camera = self.image(number), self.run.camera
         table = cached_disc_table(camera, disc_shape(settings))
         found = detect_circles(image, camera, table, settings)
+        if settings.refine:
+            found = with_common(found, camera, settings.calibration_px, by_verticals=False)
         explained = explain_discs(image, camera, settings)
         discs = [
             {

@@ -8,13 +8,14 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from camera import read_camera
+from camera import Camera, read_camera
 from detect.cli import main
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings
@@ -92,13 +93,16 @@ def test_detects_as_the_command_does(
     assert status == 200
     rows = tmp_path / "rows.circles"
     run = str(project_root / "images" / "e")
-    assert (
-        main(["circles", run, "--threshold", "0.6", "--calibration-px", "0", "-o", str(rows)]) == 0
-    )
+    assert main(["circles", run, "--threshold", "0.6", "-o", str(rows)]) == 0
     frame = list(read_frames(rows))[1]
     assert [(d["x"], d["y"]) for d in found["discs"]] == [
         pytest.approx((row.px, row.py), abs=1e-5) for row in frame.circles
     ]
+    np.testing.assert_allclose(
+        [d["covariance"] for d in found["discs"]],
+        [(row.cxx, row.cxy, row.cyy) for row in frame.circles],
+        rtol=1e-4,
+    )
     assert len(found["discs"]) >= 5
     assert all(one["reason"] for one in found["rejected"])
     # Outlines and ellipses are round the discs.
@@ -109,6 +113,19 @@ def test_detects_as_the_command_does(
         assert outline[:, 0].min() < u < outline[:, 0].max()
         assert outline[:, 1].min() < v < outline[:, 1].max()
         np.testing.assert_allclose(np.mean(disc["ellipse"], axis=0), [disc["x"], disc["y"]])
+
+
+def test_covariances_are_those_of_a_calibration_that_states_none(
+    project_root: Path, published_camera: Camera, tmp_path: Path
+) -> None:
+    run = replace(open_run(project_root / "images" / "e"), camera=published_camera)
+    frames = [frame for frame, _ in zip(run.frames, range(1))]
+    session = TuningSession(run, frames, CircleSettings(), tmp_path)
+    stated, doubted = (
+        np.array([d["covariance"] for d in session.detect(0, {"calibration_px": px})["discs"]])
+        for px in (0.0, 0.15)
+    )
+    assert np.all(doubted[:, [0, 2]] > stated[:, [0, 2]])
 
 
 @pytest.mark.parametrize(
