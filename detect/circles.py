@@ -29,7 +29,7 @@ from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import DiscSearch, FoundDiscs, Scene, search_discs
-from detect.discs.second_look import SecondLooks, Sought, second_looks
+from detect.discs.second_look import NO_LOOKS, SecondLooks, Sought, second_looks
 from detect.errors import FrameError
 from detect.grey_values import blank_margins, estimate_noise
 from detect.settings import CircleSettings, Polarity
@@ -51,8 +51,12 @@ _NOISE_ROWS = 16
 _EDGE, _LEAST_STEP = 5.5, 8.0
 #: Of the least quality, the samples that a group of centres shares must have this share.
 _PART_QUALITY = 0.8
-#: Discs of so little more than the least evidence are for the second look, where there is one.
+#: Discs of so little more than the least evidence are for the second look, where the polarity is
+#: stated.
 _DOUBTFUL = 1.0
+#: Where it is not, it is that of the discs of this evidence, if they are at least so many and all
+#: alike; a second look at the best candidates needs these log-odds more then.
+_CLEAR, _LEAST_CLEAR, _BEST, _UNSTATED = 4.0, 2, 20, 2.0
 
 
 @dataclass(frozen=True)
@@ -141,26 +145,26 @@ def _with_fit(
     image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The default detector: discs that are fitted from the best centres."""
-    noise, _, centres, found, scene = first_look(image, camera, table, settings)
+    first = first_look(image, camera, table, settings)
+    centres, found = first.centres, first.found
     pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
     floor_xy, fitted, evidence = found.floor_xy, found.covariance, found.evidence
-    if looks_twice(settings):
-        more = second_looks_at(image, camera, table, settings, floor_xy, noise)
-        is_disc = more.log_odds >= 0.0
-        if is_disc.any():
-            placed = place_all_by_part(
-                scene, found.radius, more.floor_xy[is_disc], more.step[is_disc], working_space()
-            )
-            more_xy, more_covariance = fitted_positions(placed)
-            last = [camera.width - 1, camera.height - 1]
-            more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
-            pixels = np.concatenate([pixels, more_pixels])
-            order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
-            pixels = pixels[order]
-            found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
-            floor_xy = np.concatenate([floor_xy, more_xy])[order]
-            fitted = np.concatenate([fitted, more_covariance])[order]
-            evidence = np.concatenate([evidence, settings.evidence + more.log_odds[is_disc]])[order]
+    more = second_look(image, camera, table, settings, first)
+    is_disc = more.log_odds >= 0.0
+    if is_disc.any():
+        placed = place_all_by_part(
+            first.scene, found.radius, more.floor_xy[is_disc], more.step[is_disc], working_space()
+        )
+        more_xy, more_covariance = fitted_positions(placed)
+        last = [camera.width - 1, camera.height - 1]
+        more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
+        pixels = np.concatenate([pixels, more_pixels])
+        order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
+        pixels = pixels[order]
+        found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
+        floor_xy = np.concatenate([floor_xy, more_xy])[order]
+        fitted = np.concatenate([fitted, more_covariance])[order]
+        evidence = np.concatenate([evidence, settings.evidence + more.log_odds[is_disc]])[order]
     covariance = refined_covariance(camera, floor_xy, fitted, settings)
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)
@@ -199,8 +203,32 @@ def first_look(
     return FirstLook(noise, weakest, centres, search_discs(scene, centres, weakest), scene)
 
 
-def looks_twice(settings: CircleSettings) -> bool:
-    """Whether there is a second look: of two signs, chance would speak for either."""
+def second_look(
+    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings,
+    first: FirstLook,
+) -> SecondLooks:  # fmt: skip
+    """Look again where the first look found no disc; other parameters as of `detect_circles`.
+
+    Candidates by edges have a sign. Where none is stated, that of the clear discs is taken, for
+    discs of one place are mostly alike; where these differ, or are few, there is no second look.
+    """
+    most, less = None, 0.0
+    if settings.polarity == "any" and settings.verify and settings.refine:
+        contrast = first.centres.contrast[first.found.centre]
+        contrast = contrast[first.found.evidence >= _CLEAR]
+        if len(contrast) >= _LEAST_CLEAR and (np.sign(contrast) == np.sign(contrast[0])).all():
+            settings = replace(settings, polarity="light" if contrast[0] > 0.0 else "dark")
+            most, less = _BEST, _UNSTATED
+    if not _looks_twice(settings):
+        return NO_LOOKS
+    candidates = candidates_at(image, camera, table, settings, first.noise)
+    best = HoughCandidates(candidates.floor_xy[:most], candidates.score[:most])
+    looks = second_looks_at(image, camera, settings, best, first.found.floor_xy, first.noise)
+    return looks._replace(log_odds=looks.log_odds - less)
+
+
+def _looks_twice(settings: CircleSettings) -> bool:
+    """Whether there is a second look at least: of two signs, chance would speak for either."""
     return settings.polarity != "any" and settings.verify and settings.refine
 
 
@@ -220,8 +248,8 @@ def candidates_at(
 def second_looks_at(
     image: NDArray[np.uint8],
     camera: Camera,
-    table: DiscTable,
     settings: CircleSettings,
+    candidates: HoughCandidates,
     found_xy: FloatArray,
     noise: float,
     networks: Networks | None = None,
@@ -230,8 +258,10 @@ def second_looks_at(
 
     Parameters
     ----------
-    image, camera, table, settings
+    image, camera, settings
         As of `detect_circles`; the polarity is stated.
+    candidates : HoughCandidates
+        Of `candidates_at`, or some of them.
     found_xy : (N, 2) float64
         Discs found already, metres.
     noise : float
@@ -243,8 +273,7 @@ def second_looks_at(
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
     return second_looks(
-        image, candidates_at(image, camera, table, settings, noise),
-        np.ascontiguousarray(found_xy), sought, _kernel_camera(camera).numbers,
+        image, candidates, np.ascontiguousarray(found_xy), sought, _kernel_camera(camera).numbers,
         networks or trained_networks(),
     )  # fmt: skip
 
@@ -287,9 +316,9 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
 
 
 def first_search(settings: CircleSettings) -> DiscSearch:
-    """What the first look goes by: a second one behind it decides about doubtful discs."""
+    """What the first look goes by: where a second is certain, that decides on doubtful discs."""
     search = _disc_search(settings)
-    if not looks_twice(settings):
+    if not _looks_twice(settings):
         return search
     return search._replace(least_evidence=search.least_evidence + _DOUBTFUL)
 

@@ -1,8 +1,9 @@
 """The radius of the discs in some images: that at which the evidence of all of them is largest.
 
-Discs are searched at radii that grow by a constant factor; a parabola through the logarithms of the
-best three radii gives the peak. Evidence is a log-odds (`detect.discs.evidence_kernels`), in which
-the radius of each fit has a part, so that its sum over the discs is a likelihood of the radius.
+Discs are searched at radii that grow by a constant factor, first at every second one, then beside
+the best of these; a parabola through the logarithms of the best three radii gives the peak.
+Evidence is a log-odds (`detect.discs.evidence_kernels`), in which the radius of each fit has a
+part, so that its sum over the discs is a likelihood of the radius.
 """
 
 from __future__ import annotations
@@ -45,14 +46,25 @@ def find_radius(
     count = math.ceil(math.log(LARGEST_M / SMALLEST_M) / math.log(FACTOR))
     radii = SMALLEST_M * FACTOR ** np.arange(count + 1)
     evidence, discs = np.zeros(len(radii)), np.zeros(len(radii), np.int64)
-    for k, radius_m in enumerate(radii.tolist()):
-        tried = replace(settings, radius_m=radius_m)
+
+    def try_radius(k: int) -> None:
+        tried = replace(settings, radius_m=float(radii[k]))
         table = build_disc_table(camera, disc_shape(tried))
         for image in images:
             found = detect_circles(image, camera, table, tried)
             evidence[k] += found.evidence.sum()
             discs[k] += len(found)
-    best = int(np.argmax(np.where(discs >= LEAST_DISCS, evidence, -np.inf)))
+
+    def best_radius() -> int:
+        return int(np.argmax(np.where(discs >= LEAST_DISCS, evidence, -np.inf)))
+
+    for k in range(0, count + 1, 2):
+        try_radius(k)
+    coarse = best_radius()
+    if discs[coarse] >= LEAST_DISCS:
+        for k in {max(coarse - 1, 0), min(coarse + 1, count)} - {coarse}:
+            try_radius(k)
+    best = best_radius()
     if discs[best] < LEAST_DISCS:
         return None
     shift = 0.0

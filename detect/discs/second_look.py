@@ -1,4 +1,4 @@
-"""A second look for discs of stated polarity: candidates by edges, followed round their rims.
+"""A second look for discs of one polarity: candidates by edges, followed round their rims.
 
 Glare or a sun patch beside a disc raises the total variance of its outlines, a cable across it
 leaves much that the fit of a whole disc does not explain, and far away a disc has few pixels. A
@@ -91,6 +91,9 @@ class SecondLooks(NamedTuple):
     step: FloatArray
     quality: FloatArray
     log_odds: FloatArray
+
+
+NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), np.empty((0, 2)), *np.empty((3, 0)))
 
 
 def second_looks(

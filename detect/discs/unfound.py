@@ -27,8 +27,7 @@ from detect.circles import (
     disc_shape,
     first_look,
     first_search,
-    looks_twice,
-    second_looks_at,
+    second_look,
 )
 from detect.discs.candidates import strong_and_alone
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, RADIUS_RANGE
@@ -227,9 +226,9 @@ def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate
         yield Candidate(u, v, x, y, q, contrast, "disc", evidence, settings.evidence)
     near = 0.5 * settings.separation_m
     taken = [found.floor_xy]
-    noise, weakest = 0.0, settings.least_contrast
+    weakest = settings.least_contrast
     if settings.verify or settings.refine:
-        noise, weakest, centres, by_fit, _ = scene.first
+        _, weakest, centres, by_fit, _ = scene.first
         looks, least = by_fit.looks, first_search(settings).least_evidence
         best = strong_and_alone(centres, table.floor_xy, weakest, near)
         at = looks.pixels
@@ -256,8 +255,7 @@ def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate
             stage: Stage = name  # type: ignore[assignment]
             yield Candidate(u, v, x, y, quality, contrast, stage, value, limit)
         taken.append(floor)
-    if looks_twice(settings):
-        more = second_looks_at(image, camera, table, settings, found.floor_xy, noise)
+        more = second_look(image, camera, table, settings, scene.first)
         dropped = more.log_odds < 0.0
         for xy, q, odds in zip(
             more.floor_xy[dropped], more.quality[dropped], more.log_odds[dropped].tolist()

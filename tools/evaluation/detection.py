@@ -18,7 +18,7 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.runs.plan import FramePlan, Job, Known
 from detect.runs.stream import detect_run
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, Polarity
 from detect.sources.opening import open_run
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import FrameTilt, read_tilts, squared_mahalanobis
@@ -86,11 +86,12 @@ class Rendered:
     """Detect the light discs of a rendered run and score them with its evaluate.py."""
 
     run: Positional[Path] = Path("../shared/data/rendered/r1")  # `evaluate.py` lies beside it.
+    polarity: Polarity = "light"  # Stated to the detector.
 
     def __call__(self) -> int:
         with tempfile.TemporaryDirectory() as folder:
             discs = Path(folder) / "detected.circles"
-            _detect(self.run, {"circles": discs}, circles=CircleSettings(polarity="light"))
+            _detect(self.run, {"circles": discs}, circles=CircleSettings(polarity=self.polarity))
             return _score(self.run.parent / "evaluate.py", self.run.name, discs, folder=folder)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
-from detect.circles import candidates_at, detect_circles, disc_shape, second_looks_at
+from detect.circles import candidates_at, disc_shape, first_look, second_looks_at
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_steps
@@ -105,7 +105,7 @@ class _Gathering:
         """
         camera, table = view
         noise = estimate_noise(image, 32)
-        found = detect_circles(image, camera, table, _FIRST)
+        found = first_look(image, camera, table, _FIRST).found
         numbers = camera_numbers(camera)
 
         def judged(place: FloatArray) -> tuple[bool, float, str]:
@@ -121,7 +121,7 @@ class _Gathering:
         for place, score in zip(candidates.floor_xy, candidates.score, strict=True):
             grey, scale = glance(image, numbers, place[0], place[1], _RADIUS)
             self.glances.append((np.array([score]), grey[None], scale[None], *judged(place)))
-        looks = second_looks_at(image, camera, table, _SETTINGS, _NO_PLACES, noise, _BY_RIM)
+        looks = second_looks_at(image, camera, _SETTINGS, candidates, _NO_PLACES, noise, _BY_RIM)
         for features, place in zip(looks.features, looks.floor_xy, strict=True):
             if np.isfinite(features).all():
                 self.looks.append((features, *self._views(image, camera, place), *judged(place)))
@@ -203,7 +203,7 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
         if number % every or not path.is_file():
             continue
         image = _read(path)
-        found = detect_circles(image, *view, _FIRST)
+        found = first_look(image, *view, _FIRST).found
         clear = _images(camera, found.floor_xy[found.evidence > _CLEAR], 0.0)
         gathering.add(image, view, clear, mapped, (_REAL_WEIGHT, _REAL_WEIGHT), "real")
         if number % (3 * every) == 0:
@@ -236,7 +236,7 @@ def _add_disturbed(
     rng: np.random.Generator,
     source: str,
 ) -> None:
-    found = detect_circles(image, *view, _FIRST)
+    found = first_look(image, *view, _FIRST).found
     clear = np.flatnonzero(found.evidence > 4.0)
     for i in (i for _ in range(_ROUNDS) for i in rng.permutation(clear)[:_PER_ROUND]):
         at = found.floor_xy[i]

@@ -13,7 +13,7 @@ from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.search import of_likely_sign
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
-from tests.detect.painted_floor import FLOOR, LIGHT, PaintedFloor
+from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 SETTINGS = CircleSettings(polarity="light")
 PLACES = np.array([(0.3, -2.0), (-0.5, -2.6), (0.5, -3.2)])
@@ -55,6 +55,26 @@ def test_a_disc_that_a_sun_patch_touches_is_a_row(
         rows += bool((distance < 0.03).any())
         assert (distance < 0.14).sum() <= 1
     assert rows >= 7  # none without the second look
+
+
+CLEAR_PLACES = [(-0.3, -1.4), (0.4, -1.5), (-0.9, -2.2)]
+
+
+@pytest.mark.parametrize(("dark", "rows"), [((), 8), ((0,), 0), ((0, 1), 0)])
+def test_without_a_polarity_the_clear_discs_have_to_agree(
+    published_camera: Camera, table: DiscTable, dark: tuple[int, ...], rows: int
+) -> None:
+    place = PLACES[0]
+    found_here = 0
+    for seed, angle in enumerate(np.arange(8) * np.pi / 4.0):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).shape(place, beside(angle), SUN)
+        for k, other in enumerate(CLEAR_PLACES):
+            floor.disc(other, DARK if k in dark else LIGHT)
+        image = floor.image(seed=seed)
+        found = detect_circles(image, published_camera, table, CircleSettings())
+        assert all(found_at(found, np.array(other)).min() < 0.01 for other in CLEAR_PLACES)
+        found_here += bool((found_at(found, place) < 0.03).any())
+    assert abs(found_here - rows) <= 1
 
 
 def square(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
