@@ -43,6 +43,16 @@ def camera_numbers(camera: Camera) -> FloatArray:
     )
 
 
+def published_camera_numbers(camera: Camera) -> FloatArray:
+    """`camera_numbers` of the data set's own detector.
+
+    It turns by the transpose of a rotation that its file gives in few digits, not by the inverse.
+    """
+    numbers = camera_numbers(camera)
+    numbers[10:19] = camera.rotation.T.ravel()
+    return numbers
+
+
 def lens_numbers(camera: Camera) -> FloatArray:
     """The distortion alone, as `straightened_point` takes it.
 

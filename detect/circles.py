@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import camera_numbers
+from camera.kernels import camera_numbers, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
@@ -375,17 +375,17 @@ class _KernelCamera(NamedTuple):
     """A camera in the forms that kernels take."""
 
     numbers: FloatArray
-    published: FloatArray  # the same with the transpose of the rotation for its inverse
+    published: FloatArray  # `published_camera_numbers`
     centre: FloatArray
     blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
-    published = camera_numbers(camera)
-    published[10:19] = camera.rotation.T.ravel()
     centre = np.array(camera.centre, np.float64)
-    return _KernelCamera(camera_numbers(camera), published, centre, blur_ratio_of(camera))
+    return _KernelCamera(
+        camera_numbers(camera), published_camera_numbers(camera), centre, blur_ratio_of(camera)
+    )
 
 
 def refined_covariance(

@@ -18,9 +18,11 @@ from functools import cached_property, lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
 
@@ -186,40 +188,57 @@ def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int
     return CentreGroups(first, np.bitwise_or.reduceat(bits, first), group_samples)
 
 
+class _Outlines(NamedTuple):
+    """Where the samples are about a centre."""
+
+    inner: float  # radii, metres
+    outer: float
+    unit: FloatArray  # (K, 2) directions, every second one first
+    paired: bool  # samples count in pairs, which are moved apart where they are the same pixel
+    apart_px: float
+
+
 def _sample_pixels(
     camera: Camera, centre_xy: FloatArray, down: FloatArray, shape: DiscShape
 ) -> NDArray[np.uint32]:
     """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
-    outside = camera.height * camera.width
-    radii = np.array([shape.inner_radius_m, shape.outer_radius_m])
+    paired = shape.least_pairs > 0
     unit = np.concatenate([ring(1.0, shape.samples)[0::2], ring(1.0, shape.samples)[1::2]])
-    samples_xy = centre_xy[:, None, None] + radii[:, None] * unit[:, None]
-    if not shape.least_pairs:
-        return _nearest_pixels(camera, camera.project_floor(samples_xy), -0.5)
-    # The data set's own detector turns by the transpose of a rotation that its file gives in few
-    # digits; by the inverse some samples would fall on other pixels.
-    pixels = _nearest_pixels(camera, _seen_published(camera, samples_xy), 0.0)
-    centre, pair = np.nonzero((pixels[..., 0] == pixels[..., 1]) & (pixels[..., 0] < outside))
-    moved = radii + shape.apart_px * down[centre, None] * [-1.0, 1.0]
-    moved_xy = centre_xy[centre, None] + moved[..., None] * unit[pair, None]
-    pixels[centre, pair] = _nearest_pixels(camera, _seen_published(camera, moved_xy), 0.0)
-    lacking = np.any(pixels == outside, axis=2, keepdims=True)
-    return np.where(lacking, np.uint32(outside), pixels)
+    outlines = _Outlines(
+        shape.inner_radius_m, shape.outer_radius_m, unit, paired, float(shape.apart_px)
+    )
+    numbers = published_camera_numbers(camera) if paired else camera_numbers(camera)
+    return _samples_of(numbers, camera.width, camera.height, centre_xy, down, outlines)
 
 
-def _seen_published(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """(..., 2) pixels of (..., 2) floor points, turned by the transpose of the rotation."""
-    points = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
-    return camera.project((points - camera.centre) @ camera.rotation)
-
-
-def _nearest_pixels(camera: Camera, seen: FloatArray, least: float) -> NDArray[np.uint32]:
-    """Index of the pixel nearest to places in the image; H * W outside, or before `least`."""
-    with np.errstate(invalid="ignore"):
-        nearest = np.floor(seen + 0.5)
-        inside = np.all((seen >= least) & (nearest < [camera.width, camera.height]), axis=-1)
-        index = nearest[..., 1] * camera.width + nearest[..., 0]
-    return np.where(inside, index, camera.height * camera.width).astype(np.uint32)
+@njit(cache=True, error_model="numpy", nogil=True)
+def _samples_of(
+    numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, down: FloatArray,
+    outlines: _Outlines,
+) -> NDArray[np.uint32]:  # fmt: skip
+    outside = width * height
+    samples = np.empty((len(centre_xy), len(outlines.unit), 2), np.uint32)
+    least = 0.0 if outlines.paired else -0.5
+    radius = np.empty(2)
+    pixel = np.empty(2, np.int64)
+    for i in range(len(centre_xy)):
+        for k in range(len(outlines.unit)):
+            radius[0], radius[1] = outlines.inner, outlines.outer
+            for attempt in range(2):
+                for j in range(2):
+                    x = centre_xy[i, 0] + radius[j] * outlines.unit[k, 0]
+                    y = centre_xy[i, 1] + radius[j] * outlines.unit[k, 1]
+                    u, v = project_floor_point(numbers, x, y)
+                    inside = u >= least and v >= least and u + 0.5 < width and v + 0.5 < height
+                    pixel[j] = int(v + 0.5) * width + int(u + 0.5) if inside else outside
+                if not (outlines.paired and pixel[0] == pixel[1] and pixel[0] < outside):
+                    break
+                radius[0] -= outlines.apart_px * down[i]
+                radius[1] += outlines.apart_px * down[i]
+            if outlines.paired and (pixel[0] == outside or pixel[1] == outside):
+                pixel[:] = outside
+            samples[i, k, 0], samples[i, k, 1] = pixel[0], pixel[1]
+    return samples
 
 
 def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatArray:
