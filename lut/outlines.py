@@ -224,7 +224,7 @@ def _samples_of(
     for i in range(len(centre_xy)):
         for k in range(len(outlines.unit)):
             radius[0], radius[1] = outlines.inner, outlines.outer
-            for attempt in range(2):
+            for _ in range(2):
                 for j in range(2):
                     x = centre_xy[i, 0] + radius[j] * outlines.unit[k, 0]
                     y = centre_xy[i, 1] + radius[j] * outlines.unit[k, 1]
