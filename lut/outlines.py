@@ -83,9 +83,11 @@ class CentreGroups(NamedTuple):
     #: (G,) the columns of its centres, counted from the first: a bit each.
     columns: NDArray[np.int32]
     #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
-    #: the first centre, each `GROUP_COLUMNS` or more before the end of the image; 0 for a centre
-    #: that sees fewer.
+    #: the first centre, each `GROUP_COLUMNS` or more before the end of the image; all `begin` for a
+    #: centre that sees fewer.
     samples: NDArray[np.uint32]
+    begin: int  # The pixels of all columns of all samples are from this one
+    end: int  # to the one before this.
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +163,7 @@ def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int
     column, row = pixels.T
     if samples.shape[1] < GROUP_SAMPLES or n == 0:
         single = np.arange(n, dtype=np.int32), np.ones(n, np.int32)
-        return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32))
+        return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32), 0, GROUP_COLUMNS)
     # The first centre that sees a sample elsewhere beside itself, or where a group would overrun.
     beside = samples.astype(np.int32) - column[:, None, None]
     moves = (beside[1:] != beside[:-1]) | (row[1:] != row[:-1])[:, None, None]
@@ -184,8 +186,11 @@ def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int
     # Of those that are shared, the first.
     chosen = np.argsort(~shared, axis=1, kind="stable")[:, :GROUP_SAMPLES]
     group_samples = np.take_along_axis(samples[first], chosen, axis=1)
-    group_samples[np.count_nonzero(shared, axis=1).min(axis=1) < GROUP_SAMPLES] = 0
-    return CentreGroups(first, np.bitwise_or.reduceat(bits, first), group_samples)
+    enough = np.count_nonzero(shared, axis=1).min(axis=1) >= GROUP_SAMPLES
+    begin = int(group_samples[enough].min(initial=max(outside - GROUP_COLUMNS, 0)))
+    group_samples[~enough] = begin
+    end = int(group_samples.max()) + GROUP_COLUMNS
+    return CentreGroups(first, np.bitwise_or.reduceat(bits, first), group_samples, begin, end)
 
 
 class _Outlines(NamedTuple):

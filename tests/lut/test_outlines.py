@@ -89,6 +89,8 @@ def assert_groups(table: DiscTable) -> None:
     groups, outside = table.groups, table.floor_xy[..., 0].size
     assert groups.samples.shape == (len(groups.first), GROUP_SAMPLES, 2)
     assert groups.samples.max(initial=0) <= max(outside - GROUP_COLUMNS, 0)
+    assert groups.samples.min(initial=groups.begin) == groups.begin
+    assert groups.samples.max(initial=groups.begin) + GROUP_COLUMNS == groups.end
     members = [np.flatnonzero(bits >> np.arange(GROUP_COLUMNS) & 1) for bits in groups.columns]
     assert sum(len(columns) for columns in members) == len(table.pixels)
     for first, columns, samples in zip(groups.first, members, groups.samples, strict=True):
@@ -96,7 +98,7 @@ def assert_groups(table: DiscTable) -> None:
         u, v = table.pixels[of_group].T
         assert np.array_equal(u, table.pixels[first, 0] + columns)
         assert np.all(v == table.pixels[first, 1])
-        if samples.any():
+        if (samples != groups.begin).any():
             for outline in range(2):
                 seen = samples[:, outline] + columns[:, None]
                 own = table.samples[of_group, :, outline]
