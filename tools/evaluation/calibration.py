@@ -18,12 +18,8 @@ from camera.calibration.choice import holdout_error
 from camera.calibration.images import read_grey
 from camera.calibration.model import INTRINSICS, CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
-from camera.formats.command import MODELS
-from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
-from camera.formats.models import ForeignCamera, Model
 from camera.uncertainty import (
     intrinsics_of,
-    pixel_grid,
     projection_sigma,
     with_intrinsics,
 )
@@ -262,37 +258,6 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
     return Comparison(len(points.starts), len(points.board), lens, errors)
 
 
-def _square(*distortion: float) -> ForeignCamera:
-    k1, k2, p1, p2, k3 = distortion
-    return ForeignCamera("radtan", 640, 480, 500.0, 500.0, 319.5, 239.5, (k1, k2, p1, p2, k3))
-
-
-#: OpenCV's plumb bob: k1 k2 p1 p2 k3; the last three as published with EuRoC's cam0, KITTI's raw
-#: data (camera 0) and TUM's fr1.
-PLUMB_BOBS: dict[str, ForeignCamera] = {
-    "tangential alone": _square(0.0, 0.0, 5e-3, 5e-3, 0.0),
-    "mild, radial": _square(-0.2, 0.05, 0.0, 0.0, 0.0),
-    "mild": _square(-0.2, 0.05, 2e-3, -3e-3, 0.0),
-    "mild, large p": _square(-0.2, 0.05, 5e-3, 5e-3, 0.0),
-    "strong, radial": _square(-0.3, 0.1, 0.0, 0.0, 0.0),
-    "strong, large p": _square(-0.3, 0.1, 5e-3, 5e-3, 0.0),
-    "wavy, radial": _square(0.1, -0.2, 0.0, 0.0, 0.05),
-    "wavy, large p": _square(0.1, -0.2, 5e-3, 5e-3, 0.05),
-    "KITTI": ForeignCamera(
-        "radtan", 1392, 512, 984.2439, 980.8141, 690.0, 233.1966,
-        (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722),
-    ),
-    "EuRoC": ForeignCamera(
-        "radtan", 752, 480, 458.654, 457.296, 367.215, 248.375,
-        (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
-    ),
-    "TUM fr1": ForeignCamera(
-        "radtan", 640, 480, 517.306408, 516.469215, 318.64304, 255.313989,
-        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
-    ),
-}  # fmt: skip
-
-
 _TYPES = ("checkerboard", "charuco", "asymmetric-circles")
 
 
@@ -395,40 +360,4 @@ class CameraPhotographs:
             )
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
-        return 0
-
-
-@dataclass(frozen=True)
-class CameraConversions:
-    """Convert a camera to each model and back; then cameras with OpenCV's plumb bob."""
-
-    camera: Positional[Path]  # The camera.
-
-    def __call__(self) -> int:
-        camera = read_camera(self.camera)
-        table = Table(
-            {"model": "<10", "rows": "<7", "there (px)": ".5f", "back (px)": ".5f",
-             "there and back against the camera (px)": ".5f"}
-        )  # fmt: skip
-        ways: list[tuple[Rows, Rows]] = [("same", "same"), ("double", "halve")]
-        for model in MODELS["opencv"]:
-            for out, home in ways:
-                there = convert_to_foreign(camera, model, out)
-                back = convert_to_camera(there.camera, home)
-                assert isinstance(back.camera, Camera)
-                whole = np.nanmax(projection_difference(camera, back.camera, rotate=False))
-                table.row(model, out, there.deviation_px, back.deviation_px, whole)
-        models: tuple[Model, ...] = ("radtan", "rational")
-        table = Table(
-            {"plumb bob": "<16", "p1 p2 move (px)": ".2f", "to .cam": ".2g",
-             **{f"on to {model}": ".2g" for model in models}}
-        )  # fmt: skip
-        for name, bob in PLUMB_BOBS.items():
-            k1, k2, _, _, k3 = bob.distortion
-            without = replace(bob, distortion=(k1, k2, 0.0, 0.0, k3))
-            rays = bob.undistort(pixel_grid(bob.width, bob.height))
-            moved = np.linalg.norm(bob.distort(rays) - without.distort(rays), axis=1).max()
-            known = convert_to_camera(bob)
-            on = [convert_to_foreign(known.camera, model).deviation_px for model in models]
-            table.row(name, moved, known.deviation_px, *on)
         return 0

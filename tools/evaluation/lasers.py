@@ -1,24 +1,22 @@
-"""Lasers against the truth: simulated sessions, and scans of a real log."""
+"""Lasers against the truth of simulated sessions."""
 
 from __future__ import annotations
 
-import gzip
 import io
 import json
 import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from tyro.conf import Positional, arg
 
 from redetect.groundtruth.cli import main as groundtruth
-from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
 from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
@@ -37,9 +35,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
-from redetect.plane import between
 from tools.arrays import BoolArray, FloatArray
-from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
@@ -178,82 +174,3 @@ def scanner_errors(found: tuple[Scanner, ...], exact: tuple[Scanner, ...]) -> di
         "scanner_deg": float(np.degrees(np.abs(error[:, 2])).mean()),
         "scanner_nees": float(nees),
     }
-
-
-def read_log(folder: Path, name: str, shortest_m: float) -> tuple[list[FloatArray], FloatArray]:
-    """Points of the scans and their reference poses. Returns `poses` (N, 3)."""
-    if not name:
-        names = sorted(p.name.removesuffix(".scans.csv.gz") for p in folder.glob("*.scans.csv.gz"))
-        if len(names) != 1:
-            raise GroundTruthError(f"{folder}: {len(names)} logs: expected one, or --log")
-        name = names[0]
-    meta = {"start_angle_rad": -np.pi / 2, "angle_step_rad": np.pi / 180, "max_range_m": 50.0}
-    described = folder / f"{name}.meta.json"
-    if described.is_file():
-        meta |= json.loads(described.read_text())
-    with gzip.open(folder / f"{name}.scans.csv.gz", "rt") as stream:
-        rows = np.loadtxt(stream, delimiter=",")
-    poses = np.loadtxt(folder / f"{name}.poses.csv", delimiter=",")
-    if len(rows) != len(poses) or not np.array_equal(rows[:, 0], poses[:, 0]):
-        raise GroundTruthError(f"{folder}: scans and poses of {name} are of different vertices")
-    ranges = rows[:, 2:]
-    angles = meta["start_angle_rad"] + meta["angle_step_rad"] * np.arange(ranges.shape[1])
-    beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    hit = (ranges > shortest_m) & (ranges < meta["max_range_m"])
-    return [r[h, None] * beams[h] for r, h in zip(ranges, hit)], poses[:, 1:4]
-
-
-@dataclass(frozen=True)
-class LaserLog:
-    """Match the consecutive scans of a log from zero motion and print the errors."""
-
-    folder: Positional[Path]  # With the log's scans and poses.
-    log: str = ""  # Its name; by default that of the only ``*.scans.csv.gz``.
-    every: int = 1  # Only every so many-th pair.
-    heading_step_deg: float = 10.0
-    """Distance of the headings that the matching begins from; 360: only no motion at all."""
-    shortest_m: float = 0.05  # Shorter readings are taken for none.
-    worst: Annotated[int, arg(aliases=["-n"])] = 0  # So many of the worst pairs are listed.
-
-    def __call__(self) -> int:
-        points, poses = read_log(self.folder, self.log, self.shortest_m)
-        pairs = np.arange(0, len(points) - 1, self.every)
-        found = np.full((len(pairs), 3), np.nan)
-        share = np.zeros((len(pairs), 2))
-        ambiguous = np.zeros(len(pairs), dtype=np.bool_)
-        covariances = np.tile(np.eye(3), (len(pairs), 1, 1))
-        began = time.perf_counter()
-        for row, i in enumerate(pairs):
-            step_deg = self.heading_step_deg
-            with suppress(GeometryError):
-                match = match_scans(points[i + 1], points[i], heading_step_deg=step_deg)
-                ambiguous[row], covariances[row] = match.ambiguous, match.covariance
-                found[row], share[row] = match.pose, (match.explained, match.rival)
-        elapsed = time.perf_counter() - began
-        truth = between(poses[:-1], poses[1:])[pairs]
-        error = pose_differences(found, truth)
-        shift_m, turn_deg = np.hypot(*error[:, :2].T), np.degrees(np.abs(error[:, 2]))
-        shift_m, turn_deg = (np.where(np.isnan(e), np.inf, e) for e in (shift_m, turn_deg))
-        gross = (shift_m > 0.15) | (turn_deg > 3.0)
-        print(f"pairs {len(pairs)}, {1e3 * elapsed / len(pairs):.1f} ms each")
-        print(f"gross failures (> 0.15 m or > 3 deg): {100 * gross.mean():.2f} % ({gross.sum()})")
-        print(
-            f"gross failures that are not flagged: {100 * np.mean(gross & ~ambiguous):.2f} % "
-            f"({np.sum(gross & ~ambiguous)}); flagged: {np.sum(gross & ambiguous)} of them, "
-            f"{np.sum(~gross & ambiguous)} of {np.sum(~gross)} others"
-        )
-        rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
-        if rows.any():
-            normalised = np.median(squared_mahalanobis(error[rows], covariances[rows])) / 3
-            print(f"gross failures: median squared error, normalised, {normalised:.1f}")
-        for percent in (50, 90, 95):
-            print(
-                f"{percent:3d} %: {np.percentile(shift_m, percent):.4f} m "
-                f"{np.percentile(turn_deg, percent):.3f} deg"
-            )
-        for row in np.argsort(-np.maximum(shift_m / 0.15, turn_deg / 3.0))[: self.worst]:
-            print(
-                f"pair {pairs[row]}: found {found[row].round(3)} reference {truth[row].round(3)} "
-                f"explained {share[row, 0]:.2f} rival {share[row, 1]:.2f}"
-            )
-        return 0
