@@ -10,10 +10,8 @@ from scipy.optimize import least_squares
 from scipy.special import erf
 
 from camera import Camera
-from camera.kernels import camera_numbers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from tools.arrays import FloatArray
-from tools.simulator.markers.kernels import project_point
 from tools.simulator.markers.rendering import (
     Imaging,
     exact_grey,
@@ -81,17 +79,6 @@ def _centroid(image: NDArray[np.floating]) -> FloatArray:
     v, u = np.indices(image.shape)
     total = float(image.sum())
     return np.array([float((u * image).sum()) / total, float((v * image).sum()) / total])
-
-
-def test_kernel_projects_as_the_camera_does(camera: Camera) -> None:
-    rng = np.random.default_rng(3)
-    points = np.column_stack([rng.normal(0.0, 1.0, (200, 2)), rng.uniform(-0.5, 3.0, 200)])
-    numbers = camera_numbers(camera)
-    ours = np.array([project_point(numbers, *point) for point in points])
-    theirs = camera.project(points)
-    theirs[points[:, 2] < 1e-3] = np.nan
-    np.testing.assert_allclose(ours, theirs, atol=1e-9)
-    assert 50 < np.isnan(ours[:, 0]).sum() + 50 < 150
 
 
 def test_rays_are_linear_within_a_pixel_to_a_thousandth(camera: Camera) -> None:
