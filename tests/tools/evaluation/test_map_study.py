@@ -10,7 +10,7 @@ import pytest
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.recording import read_recording
 from tools.evaluation.__main__ import main as evaluate
-from tools.evaluation.maps import distance, overconfident, read_truth, with_right_odometry
+from tools.evaluation.maps import disc_errors, path_distance, read_truth, with_right_odometry
 from tools.simulator.__main__ import main as simulate
 
 pytestmark = pytest.mark.long
@@ -23,14 +23,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_overconfident_covariances_double_the_factor(run: Path) -> None:
+def test_a_map_with_right_covariances_is_as_near_as_they_say(run: Path) -> None:
     truth = read_truth(run)
-    right = with_right_odometry(read_recording(run), truth, 1)
-    mapped = map_run(right)
+    mapped = map_run(with_right_odometry(read_recording(run), truth, 1))
     assert mapped.table.factor == pytest.approx(1.0, abs=0.2)
-    doubled = map_run(overconfident(right, 2.0))
-    assert doubled.table.factor == pytest.approx(2.0 * mapped.table.factor, rel=1e-6)
-    assert distance(mapped, truth).path_rms_m < 0.5
+    assert path_distance(mapped.estimate.poses, truth) < 0.5
+    off, nees = disc_errors(mapped, truth)
+    assert off < 0.5
+    assert 0.3 < nees < 3.0
 
 
 def test_only_wrong_steps_are_measured_anew(run: Path) -> None:
@@ -45,5 +45,5 @@ def test_tables_are_printed(run: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert evaluate(["map", str(run)]) == 0
     out = capsys.readouterr().out
     assert "as simulated" in out
-    assert "overconfident by 2" in out
+    assert "right covariances" in out
     assert evaluate(["nothing"]) == 2
