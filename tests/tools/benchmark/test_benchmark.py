@@ -68,7 +68,7 @@ def test_the_command_measures_everything(
     assert f"numpy {np.__version__}" in out
     tables = [
         [[cell.strip() for cell in line.strip("|").split("|")] for line in part.split("\n")]
-        for part in out.split("\n\n")
+        for part in out.strip().split("\n\n")
         if part.startswith("| ")
     ]
     kinds, sizes, discs, verticals, runs = tables
