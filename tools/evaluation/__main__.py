@@ -14,7 +14,6 @@ STUDIES = {
     "accuracy": "accuracy.AccuracyStudy",
     "association": "association.Association",
     "buildings": "detection.Buildings",
-    "camera-covariance": "calibration.CameraCovariance",
     "camera-photographs": "calibration.CameraPhotographs",
     "camera-rendered": "calibration.CameraRendered",
     "disturbed": "disturbed.Disturbed",

@@ -56,7 +56,7 @@ def _recorded(kind: BagKind) -> bytes:
     said = [
         Said("/cam/image_raw", 5e-9, ros.image(pixels, "mono8", 1.0)),
         Said("/cam/camera_info", 5e-9,
-             ros.camera_info(8, 8, "plumb_bob", [0.0] * 5, np.zeros(9), "frame")),
+             ros.camera_info(8, 8, "plumb_bob", [0.0] * 5, [0.0] * 9, "frame")),
         Said("/odom", 5e-9, ros.odometry(1.0, 2.0, 0.0, 1.0, np.zeros((3, 3)))),
         Said("/tf_static", 5e-9, ros.static_transforms(("b", "o", placed))),
     ]  # fmt: skip
