@@ -63,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def full_plan() -> SessionPlan:
-    return plan_session(SessionSettings())
+    return plan_session(SessionSettings(samples=1))
 
 
 def _corners_by_files(folder: Path, truth: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
