@@ -26,7 +26,6 @@ STUDIES = {
     "pictures": "pictures.Pictures",
     "real-run": "real_run.RealRun",
     "rendered": "detection.Rendered",
-    "rendered-lines": "detection.RenderedLines",
     "tilt": "detection.Tilt",
     "tilt-of-discs": "tilt_of_discs.TiltOfDiscs",
     "train-rim-network": "rim_network_training.TrainRimNetwork",
