@@ -77,6 +77,8 @@ def table_of_sessions(
             continue
         rows.append([row[key] for key in columns])
         table.row(str(seed), *rows[-1])
+    if not rows:
+        raise GroundTruthError("no session is left: expected at least one")
     return table, np.array(rows)
 
 
