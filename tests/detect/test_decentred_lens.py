@@ -20,7 +20,6 @@ from detect.settings import CircleSettings
 from lut import build_disc_table, build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, pinhole, render, tilted
 from tests.detect.painted_floor import PaintedFloor
-from tools.simulator.markers.kernels import project_point
 from tools.simulator.renderer import optics_of
 
 TANGENTIAL = (2e-3, -3e-3)
@@ -164,7 +163,6 @@ def test_straight_pixels_of_markers(decentred: Camera) -> None:
 def test_simulated_rays_are_the_cameras(
     decentred: Camera, polynomial: tuple[float, float, float]
 ) -> None:
-    from camera.kernels import camera_numbers
     from tools.simulator.frame_kernels import camera_ray
 
     if any(polynomial):
@@ -175,6 +173,3 @@ def test_simulated_rays_are_the_cameras(
     rays = np.array([camera_ray(a, b, optics.numbers, optics.inverse) for a, b in pixels])
     points = np.column_stack([rays, np.ones(len(rays))])
     np.testing.assert_allclose(decentred.project(points), pixels, atol=1e-9)
-    numbers = camera_numbers(decentred)
-    seen = np.array([project_point(numbers, *point) for point in points])
-    np.testing.assert_allclose(seen, pixels, atol=1e-9)

@@ -26,7 +26,9 @@ class SmallRun:
     line_xy: FloatArray
 
 
-def small_run(seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14) -> SmallRun:
+def small_run(
+    seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14, turn_sigma_rad: float = 0.006
+) -> SmallRun:
     """Two laps; `noise` is a factor on the errors' standard deviations, not on the covariances."""
     rng = np.random.default_rng(seed)
     true_steps = np.tile([0.01, -0.4, 4 * np.pi / steps], (steps, 1))
@@ -39,7 +41,7 @@ def small_run(seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14) -
     disc_xy = centre + out * (radius + rng.uniform(-0.4, 0.4, (discs, 1)))
     line_xy = centre + out[::2] * (radius + 2.5)
 
-    sigma = np.array([0.01, 0.012, 0.006])
+    sigma = np.array([0.01, 0.012, turn_sigma_rad])
     shape = np.diag(sigma) @ np.array([[1, 0.2, 0.3], [0.2, 1, -0.1], [0.3, -0.1, 1]])
     step_covariance = shape @ np.diag(sigma)
     measured = true_steps + noise * rng.multivariate_normal(np.zeros(3), step_covariance, steps)

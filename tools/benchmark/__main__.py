@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import tyro
 
+from detect import __version__
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
-from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
 from tools.arrays import ByteArray
 from tools.benchmark import functions as f
@@ -34,32 +37,25 @@ from tools.benchmark.material import (
     scaled_picture,
     wall_with_edges,
 )
-from tools.benchmark.report import (
-    Result,
-    RunTime,
-    Time,
-    format_markdown,
-    plot_png,
-    run_time,
-    this_machine,
-    times_of,
-)
-from tools.benchmark.timing import measure_in_turn
-from tools.evaluation.tables import write_json
-from tools.simulator.files import write_bytes
+from tools.benchmark.timing import decodings, measure_in_turn, number, spread
+from tools.evaluation.tables import markdown_table
 
 #: Pictures of each point of the growth curves.
 _GROWTH_PICTURES = 2
 #: A command that has taken this long is left out of later rounds, seconds.
 _RUN_BUDGET_S = 15.0
+_PACKAGES = ("numpy", "numba", "opencv-python-headless", "scikit-image")
+
+#: Of a table: what its pictures are, these, and the functions that are timed on them.
+Cases = Iterable[tuple[str, Sequence[Picture], dict[str, f.Function]]]
 
 
 @dataclass(frozen=True)
 class Benchmark:
     """Time the detectors, their parts and peers side by side, in one process.
 
-    Prints Markdown tables.
-    Example: python -m tools.benchmark --photographs ../shared/data/discs --plot /tmp/speed.png
+    Prints Markdown tables: ratios to decoding first, since they hold on any machine.
+    Example: python -m tools.benchmark --photographs ../shared/data/discs
     """
 
     run: Path = Path("images/e")  # The demo run: camera, pictures, and whole passes.
@@ -74,122 +70,100 @@ class Benchmark:
     frames: tuple[int, ...] = (80, 320, 1600, 6400)  # Lengths of the growing runs.
     jobs: tuple[int, ...] = (1, 2)  # Numbers of jobs, for the growing runs.
     seed: int = 0  # Of noise and places.
-    json: Path | None = None  # Write everything as JSON.
-    plot: Path | None = None  # Draw the ratios and the growth curves into a PNG.
-    markdown: Path | None = None  # Write the tables as Markdown.
-    force: bool = False  # Replace existing files.
 
     def __call__(self) -> int:
-        for path in (self.json, self.plot, self.markdown):
-            if path is not None and path.exists() and not self.force:
-                raise OutputExistsError(path)
-        result = benchmark(self)
-        text = format_markdown(result)
-        print(text)
-        if self.json is not None:
-            write_json(self.json, asdict(result), overwrite=self.force)
-        if self.plot is not None:
-            write_bytes(self.plot, plot_png(result), overwrite=self.force)
-        if self.markdown is not None:
-            write_bytes(self.markdown, text.encode(), overwrite=self.force)
+        import cv2
+        import numba
+
+        # All are measured on one core; only the jobs of whole passes may take more.
+        cv2.setNumThreads(1)
+        numba.set_num_threads(1)
+        run = open_run(self.run)
+        detectors = f.whole_detectors(run.camera)
+        settings = (
+            f"{key} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
+            for key, value in vars(self).items()
+        )
+        print(f"- {this_machine()}\n- settings: {', '.join(settings)}\n")
+        print("Median processor time per image, in times that decoding the same image takes "
+              "(quartiles; milliseconds):\n")  # fmt: skip
+        self._print_table(self._kinds(run))
+        print("\nOver the size of the image, Mpixel:\n")
+        self._print_table(self._sizes(run))
+        seeds = range(self.seed, self.seed + _GROWTH_PICTURES)
+        places = disc_places(run.camera, max(self.landmarks, default=0), self.seed)
+        print("\nOver the discs in the image:\n")
+        self._print_table(
+            (str(n), [jpeg_picture(floor_with_discs(run.camera, places[:n], s)) for s in seeds],
+             detectors)
+            for n in self.landmarks
+        )  # fmt: skip
+        print("\nOver the vertical edges in the image:\n")
+        self._print_table(
+            (str(n), [jpeg_picture(wall_with_edges(run.camera, n, s)) for s in seeds], detectors)
+            for n in self.landmarks
+        )
+        print("\nWhole runs, files in, files out, by the clock on the wall; one core that only "
+              "decodes the same files, or reads and decodes them, for comparison:\n")  # fmt: skip
+        head = ("command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
+                "times one job", "decoding alone", "with reading")  # fmt: skip
+        print("\n".join(markdown_table(head, self._runs(run))))
         return 0
 
+    def _kinds(self, run: Run) -> Cases:
+        everything = {**f.all_detectors(run.camera), **f.peers()}
+        yield "demo", run_pictures(run, self.pictures), everything
+        yield "noise", noise_pictures(run.camera, self.pictures, self.seed), everything
+        if self.photographs is not None:
+            pictures = photograph_pictures(self.photographs, run.camera, self.pictures)
+            yield "photographs", pictures, everything
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    command = tyro.cli(Benchmark, prog="python -m tools.benchmark", args=arguments)
-    return exit_code_of(command)
+    def _sizes(self, run: Run) -> Cases:
+        frames = run_pictures(run, _GROWTH_PICTURES)
+        for factor in self.factors:
+            camera = scaled_camera(run.camera, factor)
+            scaled = [scaled_picture(picture, camera, self.seed) for picture in frames]
+            yield f"{camera.width * camera.height / 1e6:.6g}", scaled, f.whole_detectors(camera)
 
+    def _print_table(self, cases: Cases) -> None:
+        """Times of functions, in turn with decoding, a column per case."""
+        columns = {}
+        for case, pictures, functions in cases:
+            print(f"{case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
+            timed = {f.DECODING: lambda picture: decode(picture.encoded), **functions}
+            bound = {name: _on_each(of, pictures) for name, of in timed.items()}
+            seconds = measure_in_turn(bound, len(pictures), self.rounds, self.budget_s)
+            columns[case] = decodings(seconds, f.DECODING)
+        names = next(iter(columns.values()), {})
+        rows = ([name, *(column[name] for column in columns.values())] for name in names)
+        print("\n".join(markdown_table(["", *columns], rows)))
 
-def benchmark(settings: Benchmark) -> Result:
-    """Measure everything.
-
-    Raises
-    ------
-    BenchmarkError, detect.errors.DetectError
-        If the run or the photographs cannot be used.
-    """
-    import cv2
-    import numba
-
-    # All are measured on one core; only the jobs of whole passes may take more.
-    cv2.setNumThreads(1)
-    numba.set_num_threads(1)
-    run = open_run(settings.run)
-    times: list[Time] = []
-    everything = {**f.all_detectors(run.camera), **f.peers()}
-    for case, pictures in _kinds(run, settings):
-        times += _timed("images", case, pictures, everything, settings)
-    frames = run_pictures(run, _GROWTH_PICTURES)
-    for factor in settings.factors:
-        camera = scaled_camera(run.camera, factor)
-        size = f"{camera.width * camera.height / 1e6:.6g}"
-        scaled = [scaled_picture(picture, camera, settings.seed) for picture in frames]
-        times += _timed("megapixels", size, scaled, f.whole_detectors(camera), settings)
-    places = disc_places(run.camera, max(settings.landmarks, default=0), settings.seed)
-    seeds = range(settings.seed, settings.seed + _GROWTH_PICTURES)
-    detectors = f.whole_detectors(run.camera)
-    for count in settings.landmarks:
-        floors = [jpeg_picture(floor_with_discs(run.camera, places[:count], s)) for s in seeds]
-        times += _timed("discs", str(count), floors, detectors, settings)
-    for count in settings.landmarks:
-        walls = [jpeg_picture(wall_with_edges(run.camera, count, seed)) for seed in seeds]
-        times += _timed("verticals", str(count), walls, detectors, settings)
-    described = {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in vars(settings).items()
-        if key not in ("json", "plot", "markdown", "force")
-    }
-    return Result(this_machine(), described, tuple(times), tuple(_runs(run, settings)))
+    def _runs(self, run: Run) -> Iterator[list[str]]:
+        """Whole runs: all commands once, and `detect all` over growing lengths and jobs."""
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            for command in f.commands(self.run, folder).values():
+                f.perform(command)  # compiles what is to be compiled
+            whole = repeated_run(run, folder / "whole", self.run_frames)
+            every = [(command, 1) for command in f.commands(whole, folder)]
+            yield from measure_runs(whole, every, folder, self.run_rounds)
+            for frames in self.frames:
+                growing = repeated_run(run, folder / f"frames{frames}", frames)
+                by_jobs = [("detect all", jobs) for jobs in self.jobs]
+                yield from measure_runs(growing, by_jobs, folder, self.run_rounds)
 
 
-def _kinds(run: Run, settings: Benchmark) -> Iterator[tuple[str, list[Picture]]]:
-    """Name and pictures of each kind."""
-    yield "demo", run_pictures(run, settings.pictures)
-    yield "noise", noise_pictures(run.camera, settings.pictures, settings.seed)
-    if settings.photographs is not None:
-        pictures = photograph_pictures(settings.photographs, run.camera, settings.pictures)
-        yield "photographs", pictures
-
-
-def _timed(
-    part: str,
-    case: str,
-    pictures: Sequence[Picture],
-    functions: dict[str, f.Function],
-    settings: Benchmark,
-) -> list[Time]:
-    """Times of functions, in turn with decoding."""
-    print(f"{part} {case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
-    decoding: dict[str, f.Function] = {f.DECODING: lambda picture: decode(picture.encoded)}
-
-    def of_pictures(function: f.Function) -> Callable[[int], object]:
-        return lambda number: function(pictures[number])
-
-    bound = {name: of_pictures(each) for name, each in {**decoding, **functions}.items()}
-    seconds = measure_in_turn(bound, len(pictures), settings.rounds, settings.budget_s)
-    return times_of(part, case, seconds, f.DECODING)
-
-
-def _runs(run: Run, settings: Benchmark) -> Iterator[RunTime]:
-    """Whole runs: all commands once, and `detect all` over growing lengths and numbers of jobs."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for command in f.commands(settings.run, folder).values():
-            f.perform(command)  # compiles what is to be compiled
-        whole = repeated_run(run, folder / "whole", settings.run_frames)
-        every = [(command, 1) for command in f.commands(whole, folder)]
-        yield from measure_runs(whole, every, folder, settings.run_rounds)
-        for frames in settings.frames:
-            growing = repeated_run(run, folder / f"frames{frames}", frames)
-            by_jobs = [("detect all", jobs) for jobs in settings.jobs]
-            yield from measure_runs(growing, by_jobs, folder, settings.run_rounds)
+def _on_each(function: f.Function, pictures: Sequence[Picture]) -> Callable[[int], object]:
+    return lambda number: function(pictures[number])
 
 
 def measure_runs(
     run: Path, chosen: Sequence[tuple[str, int]], folder: Path, rounds: int
-) -> list[RunTime]:
-    """Passes over a run of commands by name and jobs, in turn with decoding its files."""
+) -> Iterator[list[str]]:
+    """Rows of the table of whole runs: passes of commands by name and jobs, in turn with decoding.
+
+    Shares of decoding are per job, between passes of the same round.
+    """
     print(f"whole runs: {run}", file=sys.stderr, flush=True)
     paths = [frame.image for frame in open_run(run).frames if frame.image is not None]
     files = contents_of(paths)
@@ -210,12 +184,35 @@ def measure_runs(
     seconds = measure_in_turn(
         functions, 1, rounds, _RUN_BUDGET_S, time.perf_counter, warm_up=False, least_calls=1
     )
-    taken = {key: values[:, 0] for key, values in seconds.items()}
-    alone = [taken["decoding"], taken["reading"]]
-    return [
-        run_time(name, len(paths), jobs, taken[f"{name} {jobs}"], alone, taken.get(f"{name} 1"))
-        for name, jobs in chosen
-    ]
+    alone = [seconds["decoding"], seconds["reading"]]
+    for name, jobs in chosen:
+        taken, one_job = seconds[f"{name} {jobs}"], seconds.get(f"{name} 1")
+        rates = [number(len(paths) / float(np.nanmedian(of))) for of in (taken, *alone)]
+        gain = "" if one_job is None else number(float(np.nanmedian(one_job / taken)))
+        shares = [spread(of / taken / jobs) for of in alone]
+        yield [f"`{name}`", f"{len(paths)}", f"{jobs}", rates[0], *shares, gain, *rates[1:]]
+
+
+def this_machine() -> str:
+    """Processor, cores, system and versions, in a line."""
+    file = Path("/proc/cpuinfo")
+    rows = (
+        line.partition(":") for line in (file.read_text() if file.is_file() else "").split("\n")
+    )
+    names = [value.strip() for key, _, value in rows if key.strip() == "model name"]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    versions = [f"{name} {version(name)}" for name in _PACKAGES]
+    return ", ".join(
+        [(names or [platform.processor() or "unknown"])[0], f"{cores} cores",
+         f"{platform.system()} {platform.machine()}", f"redetect {__version__}",
+         f"python {platform.python_version()}", *versions]
+    )  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    command = tyro.cli(Benchmark, prog="python -m tools.benchmark", args=arguments)
+    return exit_code_of(command)
 
 
 if __name__ == "__main__":

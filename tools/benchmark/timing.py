@@ -9,36 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tools.arrays import FloatArray
 
 #: However slow a function is, it is called this often (as far as there are images and rounds).
 LEAST_CALLS = 3
-
-
-@dataclass(frozen=True)
-class Spread:
-    """What sums up repeated measurements."""
-
-    median: float  # In the unit of the values.
-    lower_quartile: float
-    upper_quartile: float
-    least: float
-    count: int  # Number of values.
-
-
-def spread_of(values: ArrayLike) -> Spread:
-    """Median, quartiles, minimum and number of some values; NaN are none."""
-    given = np.asarray(values, dtype=np.float64).ravel()
-    given = given[~np.isnan(given)]
-    if not given.size:
-        raise ValueError("no measurements: expected at least one")
-    lower, median, upper = np.percentile(given, [25.0, 50.0, 75.0])
-    return Spread(float(median), float(lower), float(upper), float(given.min()), given.size)
 
 
 def measure_in_turn(
@@ -55,33 +32,50 @@ def measure_in_turn(
 
     With `warm_up` every function is called once beforehand on the first image, so that compiling
     and first touches are not measured. Which function goes first changes from image to image.
+    A function is left out once it has taken `budget_s`.
+
+    Returns
+    -------
+    dict of (rounds, images) float64
+        Seconds by function, NaN where it was left out.
     """
     if warm_up:
         for function in functions.values():
             function(0)
     seconds = {name: np.full((rounds, images), np.nan) for name in functions}
-    spent = dict.fromkeys(functions, 0.0)
-    calls = dict.fromkeys(functions, 0)
     names = list(functions)
-    turn = 0
-    for round_ in range(rounds):
-        for image in range(images):
-            first = turn % len(names)
-            turn += 1
-            for name in names[first:] + names[:first]:
-                if spent[name] >= budget_s and calls[name] >= least_calls:
-                    continue
-                begin = clock()
-                functions[name](image)
-                took = clock() - begin
-                seconds[name][round_, image] = took
-                spent[name] += took
-                calls[name] += 1
+    for turn, (round_, image) in enumerate(np.ndindex(rounds, images)):
+        first = turn % len(names)
+        for name in names[first:] + names[:first]:
+            calls = np.count_nonzero(~np.isnan(seconds[name]))
+            if calls >= least_calls and np.nansum(seconds[name]) >= budget_s:
+                continue
+            begin = clock()
+            functions[name](image)
+            seconds[name][round_, image] = clock() - begin
     return seconds
 
 
-def paired_ratios(seconds: FloatArray, reference: FloatArray) -> FloatArray:
-    """Ratios between measurements of the same round and image, NaN where one of them is missing.
-    `seconds`, `reference` (rounds, images); returns (rounds, images).
+def decodings(seconds: Mapping[str, FloatArray], reference: str) -> dict[str, str]:
+    """By function: its time in those of a reference on the same image in the same round.
+
+    Median (quartiles) of these ratios, and the median time in milliseconds.
     """
-    return np.asarray(seconds / reference)
+    return {
+        name: f"{spread(taken / seconds[reference])}; {number(1e3 * float(np.nanmedian(taken)))} ms"
+        for name, taken in seconds.items()
+    }
+
+
+def spread(values: FloatArray) -> str:
+    """Median and quartiles of some values; NaN are none."""
+    lower, median, upper = map(number, np.nanpercentile(values, [25.0, 50.0, 75.0]).tolist())
+    return f"{median} ({lower} - {upper})"
+
+
+def number(value: float) -> str:
+    """A positive number in two or three digits, without an exponent."""
+    for least, digits in ((99.95, 0), (9.995, 1), (0.0995, 2), (0.00995, 3)):
+        if value >= least:
+            return f"{value:,.{digits}f}"
+    return f"{value:.4f}"

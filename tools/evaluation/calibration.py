@@ -1,9 +1,9 @@
-"""What calibrating and converting cameras is worth: rendered boards, photographs, conversions."""
+"""What calibrating cameras is worth: rendered boards, photographs."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +12,14 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.boards.points import circle_centroids, find_board
-from camera.calibration.adjustment import Estimate, Points, circle_shifts, fit_points
+from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
 from camera.calibration.images import read_grey
-from camera.calibration.model import INTRINSICS, CalibrationSettings, FreeLens
+from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
-from camera.formats.command import MODELS
-from camera.formats.conversion import Rows, convert_to_camera, convert_to_foreign
-from camera.formats.models import ForeignCamera, Model
 from camera.uncertainty import (
     intrinsics_of,
-    pixel_grid,
     projection_sigma,
     with_intrinsics,
 )
@@ -87,68 +83,6 @@ def calibrate_rendered(
     return Rendered(calibration, found, floor, len(seen))
 
 
-@dataclass(frozen=True)
-class Trials:
-    """Results of repeated calibrations."""
-
-    errors: FloatArray  # (T, 14) Estimated less true intrinsics.
-    covariances: FloatArray  # (T, 14, 14) As predicted.
-    nees: FloatArray
-    """(T,) Normalised squared errors of the projection, over its free directions; `freedom` on
-    average."""
-    freedom: int
-
-
-def monte_carlo(
-    camera: Camera,
-    board: Board,
-    *,
-    views: int,
-    trials: int,
-    sigma_px: float,
-    seed: int,
-    distances_m: tuple[float, float] = (0.2, 0.45),
-    outliers: float = 0.0,
-    seen: float = 1.0,
-) -> Trials:
-    """Calibrate again and again from the same poses with new noise."""
-    poses = board_poses(camera, board, views, seed, distances_m=distances_m)
-    truth = Estimate(intrinsics_of(camera), *map(np.stack, zip(*poses)))
-    rng = np.random.default_rng(seed + 1)
-    count = max(round(seen * len(board.points)), 6)
-    chosen = np.stack([np.sort(rng.choice(len(board.points), count, replace=False)) for _ in poses])
-    exact = Points(
-        board.points[chosen].reshape(-1, 3),
-        np.concatenate(
-            [camera.project(board.points[k] @ R.T + t) for k, (R, t) in zip(chosen, poses)]
-        ),
-        np.arange(views) * count,
-        camera.width,
-        camera.height,
-    )
-    radius_m = 0.5 * board.circle_m
-    pixels = exact.pixels + (circle_shifts(truth, exact, radius_m) if radius_m > 0.0 else 0.0)
-    aspect = camera.scale_y / camera.scale_x
-    lens, settings = FreeLens(5, camera.decentred), CalibrationSettings(aspect=aspect)
-    span = lens.span(aspect)
-    errors, covariances, nees = [], [], []
-    for _ in range(trials):
-        noise = rng.normal(scale=sigma_px, size=pixels.shape)
-        wrong = rng.random(len(pixels)) < outliers
-        noise[wrong] += 20.0 * sigma_px * rng.normal(size=(int(wrong.sum()), 2))
-        points = replace(exact, pixels=pixels + noise)
-        fit, _ = fit_points(truth, points, settings, lens, radius_m)
-        error = fit.estimate.intrinsics - truth.intrinsics
-        free = np.linalg.pinv(span)
-        reduced = free @ fit.covariance @ free.T
-        errors.append(error)
-        covariances.append(fit.covariance)
-        scale = np.sqrt(np.diag(reduced))
-        whitened = (free @ error) / scale
-        nees.append(whitened @ np.linalg.solve(reduced / np.outer(scale, scale), whitened))
-    return Trials(np.array(errors), np.array(covariances), np.array(nees), span.shape[1])
-
-
 DISC_RADIUS_M = 0.1
 
 
@@ -200,24 +134,19 @@ def splits(views: int) -> dict[str, list[IntArray]]:
     }
 
 
-def opencv_holdout(
-    points: Points, folds: list[IntArray], *, rational: bool, tangential: bool = True
-) -> float:
-    """RMS error (px) in the photographs left out, by OpenCV: their poses alone are fitted."""
+def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -> float:
+    """RMS error (px) in photographs left out, whose poses alone are fitted, by OpenCV's model."""
     import cv2
 
     every = np.arange(len(points.starts))
-    flags = cv2.CALIB_RATIONAL_MODEL if rational else 0
-    flags |= 0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST
+    flags = cv2.CALIB_RATIONAL_MODEL | (0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST)
     squares = 0.0
     size = (points.width, points.height)
     for out in folds:
         used = points.of(np.setdiff1d(every, out))
         board = [used.board[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
         seen = [used.pixels[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
-        _, K, d, _, _ = cv2.calibrateCamera(
-            board, seen, size, np.eye(3), np.zeros(8 if rational else 5), flags=flags
-        )
+        _, K, d, _, _ = cv2.calibrateCamera(board, seen, size, np.eye(3), np.zeros(8), flags=flags)
         for view in out:
             held = points.of(np.array([view]))
             _, rvec, tvec = cv2.solvePnP(held.board, held.pixels, K, d)
@@ -235,8 +164,8 @@ class Comparison:
     points: int
     lens: FreeLens  # Coefficients that are free here.
     errors: dict[str, dict[str, float]]
-    """By split: of this project (`ours`); of OpenCV's rational model (k1 to k6, p1, p2), the same
-    without p1 and p2 (`radial`), and its k1 k2 p1 p2 k3 (`five`)."""
+    """By split: of this project (`ours`); of OpenCV's rational model (k1 to k6, p1, p2), and the
+    same without p1 and p2 (`radial`)."""
 
 
 def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = False) -> Comparison:
@@ -253,44 +182,12 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
     errors = {
         name: {
             "ours": holdout_error(estimate, points, settings, lens, folds),
-            "rational": opencv_holdout(points, folds, rational=True),
-            "radial": opencv_holdout(points, folds, rational=True, tangential=False),
-            "five": opencv_holdout(points, folds, rational=False),
+            "rational": opencv_holdout(points, folds, tangential=True),
+            "radial": opencv_holdout(points, folds, tangential=False),
         }
         for name, folds in splits(len(points.starts)).items()
     }
     return Comparison(len(points.starts), len(points.board), lens, errors)
-
-
-def _square(*distortion: float) -> ForeignCamera:
-    k1, k2, p1, p2, k3 = distortion
-    return ForeignCamera("radtan", 640, 480, 500.0, 500.0, 319.5, 239.5, (k1, k2, p1, p2, k3))
-
-
-#: OpenCV's plumb bob: k1 k2 p1 p2 k3; the last three as published with EuRoC's cam0, KITTI's raw
-#: data (camera 0) and TUM's fr1.
-PLUMB_BOBS: dict[str, ForeignCamera] = {
-    "tangential alone": _square(0.0, 0.0, 5e-3, 5e-3, 0.0),
-    "mild, radial": _square(-0.2, 0.05, 0.0, 0.0, 0.0),
-    "mild": _square(-0.2, 0.05, 2e-3, -3e-3, 0.0),
-    "mild, large p": _square(-0.2, 0.05, 5e-3, 5e-3, 0.0),
-    "strong, radial": _square(-0.3, 0.1, 0.0, 0.0, 0.0),
-    "strong, large p": _square(-0.3, 0.1, 5e-3, 5e-3, 0.0),
-    "wavy, radial": _square(0.1, -0.2, 0.0, 0.0, 0.05),
-    "wavy, large p": _square(0.1, -0.2, 5e-3, 5e-3, 0.05),
-    "KITTI": ForeignCamera(
-        "radtan", 1392, 512, 984.2439, 980.8141, 690.0, 233.1966,
-        (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722),
-    ),
-    "EuRoC": ForeignCamera(
-        "radtan", 752, 480, 458.654, 457.296, 367.215, 248.375,
-        (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0),
-    ),
-    "TUM fr1": ForeignCamera(
-        "radtan", 640, 480, 517.306408, 516.469215, 318.64304, 255.313989,
-        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
-    ),
-}  # fmt: skip
 
 
 _TYPES = ("checkerboard", "charuco", "asymmetric-circles")
@@ -334,42 +231,6 @@ class CameraRendered:
 
 
 @dataclass(frozen=True)
-class CameraCovariance:
-    """Predicted against observed spread of a calibration, by Monte Carlo."""
-
-    camera: Positional[Path]  # The true camera.
-    boards: tuple[str, ...] = _TYPES  # 70 % of the corners of `charuco` are seen.
-    views: int = 25  # Boards in each calibration.
-    trials: int = 100  # Calibrations.
-    sigma_px: float = 0.03  # Noise of a coordinate.
-    outliers: float = 0.0  # Share of points that are 20 standard deviations off.
-    seed: int = 1  # Everything random follows from it.
-
-    def __call__(self) -> int:
-        camera = read_camera(self.camera)
-        for name in self.boards:
-            board, distances_m = BOARDS[name]
-            trials = monte_carlo(
-                camera, board, views=self.views, trials=self.trials, sigma_px=self.sigma_px,
-                seed=self.seed, distances_m=distances_m, outliers=self.outliers,
-                seen=0.7 if board.kind == "charuco" else 1.0,
-            )  # fmt: skip
-            predicted = np.sqrt(np.diag(trials.covariances.mean(axis=0)))
-            print(f"{name}: {self.trials} x {self.views} views, noise {self.sigma_px} px")
-            table = Table({"": "<9", "observed": "11.5g", "predicted": "11.5g", "ratio": "7.3f"})
-            for parameter, seen, said in zip(INTRINSICS, trials.errors.std(axis=0), predicted):
-                if said > 0.0:
-                    table.row(parameter, seen, said, seen / said)
-            band = np.sqrt(2 * trials.freedom / len(trials.nees))
-            print(
-                f"normalised squared error {trials.nees.mean():.2f} "
-                f"(expected {trials.freedom}, +- {band:.2f})",
-                flush=True,
-            )
-        return 0
-
-
-@dataclass(frozen=True)
 class CameraPhotographs:
     """Hold-out error on photographs of disc boards, against OpenCV's models.
 
@@ -383,8 +244,8 @@ class CameraPhotographs:
     polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
 
     def __call__(self) -> int:
-        print("RMS px; OpenCV: rational, the same without p1 p2 (radial), k1 k2 p1 p2 k3 (five)")
-        errors = dict.fromkeys(("ours", "rational", "radial", "five"), "8.4f")
+        print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
+        errors = dict.fromkeys(("ours", "rational", "radial"), "8.4f")
         table = Table(
             {"group": "<9", "views": "d", "points": "d", "held out": "<11", **errors,
              "free here": "<"}
@@ -395,40 +256,4 @@ class CameraPhotographs:
             )
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
-        return 0
-
-
-@dataclass(frozen=True)
-class CameraConversions:
-    """Convert a camera to each model and back; then cameras with OpenCV's plumb bob."""
-
-    camera: Positional[Path]  # The camera.
-
-    def __call__(self) -> int:
-        camera = read_camera(self.camera)
-        table = Table(
-            {"model": "<10", "rows": "<7", "there (px)": ".5f", "back (px)": ".5f",
-             "there and back against the camera (px)": ".5f"}
-        )  # fmt: skip
-        ways: list[tuple[Rows, Rows]] = [("same", "same"), ("double", "halve")]
-        for model in MODELS["opencv"]:
-            for out, home in ways:
-                there = convert_to_foreign(camera, model, out)
-                back = convert_to_camera(there.camera, home)
-                assert isinstance(back.camera, Camera)
-                whole = np.nanmax(projection_difference(camera, back.camera, rotate=False))
-                table.row(model, out, there.deviation_px, back.deviation_px, whole)
-        models: tuple[Model, ...] = ("radtan", "rational")
-        table = Table(
-            {"plumb bob": "<16", "p1 p2 move (px)": ".2f", "to .cam": ".2g",
-             **{f"on to {model}": ".2g" for model in models}}
-        )  # fmt: skip
-        for name, bob in PLUMB_BOBS.items():
-            k1, k2, _, _, k3 = bob.distortion
-            without = replace(bob, distortion=(k1, k2, 0.0, 0.0, k3))
-            rays = bob.undistort(pixel_grid(bob.width, bob.height))
-            moved = np.linalg.norm(bob.distort(rays) - without.distort(rays), axis=1).max()
-            known = convert_to_camera(bob)
-            on = [convert_to_foreign(known.camera, model).deviation_px for model in models]
-            table.row(name, moved, known.deviation_px, *on)
         return 0

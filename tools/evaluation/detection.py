@@ -83,33 +83,28 @@ class Buildings:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Detect the light discs of a rendered run and score them with its evaluate.py."""
+    """Detect a rendered run's light discs, its verticals and the tilt, and level the discs.
 
-    run: Positional[Path] = Path("../shared/data/rendered/r1")  # `evaluate.py` lies beside it.
-    polarity: Polarity = "light"  # Stated to the detector.
-
-    def __call__(self) -> int:
-        with tempfile.TemporaryDirectory() as folder:
-            discs = Path(folder) / "detected.circles"
-            _detect(self.run, {"circles": discs}, circles=CircleSettings(polarity=self.polarity))
-            return _score(self.run.parent / "evaluate.py", self.run.name, discs, folder=folder)
-
-
-@dataclass(frozen=True)
-class RenderedLines:
-    """Detect the verticals and the tilt of a rendered run; score both, and the discs levelled."""
+    Scored by its evaluate.py: the discs, the verticals, and the discs levelled.
+    """
 
     run: Positional[Path] = Path("../shared/data/rendered/r1")  # `evaluate.py` lies beside it.
     preset: Preset = "default"  # Of the line detector.
+    polarity: Polarity = "light"  # Stated to the detector of discs.
 
     def __call__(self) -> int:
+        code = 0
         with tempfile.TemporaryDirectory() as folder:
-            lines, discs = (Path(folder) / f"detected.{kind}" for kind in ("lines", "circles"))
+            discs, lines, levelled = (
+                Path(folder) / name
+                for name in ("detected.circles", "detected.lines", "levelled.circles")
+            )
+            settings = CircleSettings(polarity=self.polarity)
+            _detect(self.run, {"circles": discs}, circles=settings)
             tilts = _detect_lines(self.run, LINE_PRESETS[self.preset], lines)
-            settings = CircleSettings(polarity="light")
-            _detect(self.run, {"circles": discs}, Known(tilts=tilts), circles=settings)
-            code = 0
-            for path in (lines, discs):
+            _detect(self.run, {"circles": levelled}, Known(tilts=tilts), circles=settings)
+            for path in (discs, lines, levelled):
+                print(path.name, flush=True)
                 code |= _score(self.run.parent / "evaluate.py", self.run.name, path, folder=folder)
         _print_tilt_errors(self.run, tilts)
         return code

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from redetect.storage import write_whole
 from tools.benchmark.material import decode, jpeg_picture
-from tools.benchmark.report import Time, spread, times_of
-from tools.benchmark.timing import measure_in_turn
+from tools.benchmark.timing import decodings, measure_in_turn
 from tools.evaluation.markers_statistics import (
     FOUND,
     MISIDENTIFIED,
@@ -21,16 +19,13 @@ from tools.evaluation.markers_statistics import (
     PEERS,
     ScoredFrame,
     binned,
-    bins_json,
     bins_lines,
     counts_lines,
     detector_of,
     known_to_opencv,
     scored_frame,
-    statistics_picture,
     table_of,
 )
-from tools.evaluation.tables import write_json
 from tools.simulator.markers.samples import SampleFrame, SampleSettings, sample_frame
 from tools.simulator.markers.things import photograph_files
 from tools.simulator.parallel import in_order
@@ -123,7 +118,7 @@ def _search(state: tuple[str, tuple[str, ...]], path: Path) -> list[Offence]:
 
 def time_searches(
     settings: SampleSettings, frames: int, seed: int, *, rounds: int = 5
-) -> list[Time]:
+) -> dict[str, str]:
     """Time the search of rendered frames, decoding them, and OpenCV's detectors, in turn.
 
     The frames are those of the statistics, stored as JPEG files of quality 90. Our detector is
@@ -160,17 +155,7 @@ def time_searches(
         **{f"closing, radius {radius} px": close(radius) for radius in _RADII_PX},
         **{name: peer(name) for name in (_TIMED_PEERS if known_to_opencv(dictionary) else ())},
     }
-    seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
-    return times_of("markers", dictionary, seconds, DECODING)
-
-
-def timing_lines(times: Sequence[Time]) -> list[str]:
-    """A table: times in decodings of the same image, with quartiles, and in milliseconds."""
-    width = max(len(time.function) for time in times)
-    return [
-        f"{time.function:>{width}}: {spread(time.decodings)} x decoding, {time.ms.median:.3g} ms"
-        for time in times
-    ]
+    return decodings(measure_in_turn(functions, frames, rounds, _BUDGET_S), DECODING)
 
 
 @dataclass(frozen=True)
@@ -193,49 +178,31 @@ class Markers:
     photographs: tuple[Path, ...] = ()  # Folders of photographs without markers to search.
     seed: int = 1  # Of all frames.
     jobs: int = 1  # Processes.
-    output: Path | None = None  # Folder for markers.json and statistics.png.
-    force: bool = False  # Replace files that exist.
 
     def __call__(self) -> int:
-        content: dict[str, Any] = {
-            "settings": {
-                "statistics": self.statistics, "dictionary": self.dictionary,
-                "frames": self.frames, "dictionaries": list(self.dictionaries),
-                "photographic_backgrounds": self.backgrounds is not None, "seed": self.seed,
-            }
-        }  # fmt: skip
         wrong: list[Offence] = []
-        picture = b""
+        measured = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
         if self.statistics:
-            content["statistics"], found, picture = self._statistics()
-            wrong += found
+            frames = self._scored(measured, self.statistics)
+            table = table_of(frames)
+            print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
+            print("\n".join([*counts_lines(table), *bins_lines(binned(table))]))
+            wrong += _printed([one for one in offences(frames) if one.detector == OURS])
             if self.spot:
-                content["spot"] = self._spot()
+                self._spot(measured)
         if self.timing:
-            settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
-            times = time_searches(settings, self.timing, self.seed)
-            print(f"Processor time, {self.timing} frames of the statistics")
-            print("\n".join(timing_lines(times)))
-            content["timing"] = [asdict(time) for time in times]
+            times = time_searches(measured, self.timing, self.seed)
+            print(f"Processor time in decodings, {self.timing} frames of the statistics")
+            print("\n".join(f"{name:>24}: {taken}" for name, taken in times.items()))
         if self.frames:
-            content["search"], found = self._search_frames()
-            wrong += found
+            wrong += _printed(self._search_frames())
         if self.photographs:
             count, found = search_photographs(self.photographs, OURS, self.dictionaries, self.jobs)
             print(
                 f"{count} photographs, each searched for {len(self.dictionaries)} dictionaries: "
                 f"{len(found)} false markers"
             )
-            print("\n".join(_offence_lines(found)))
-            content["photographs"] = {"photographs": count, "offences": _offences_json(found)}
-            wrong += found
-        if self.output is not None:
-            self.output.mkdir(parents=True, exist_ok=True)
-            if picture:
-                place = self.output / "statistics.png"
-                with write_whole(place, overwrite=self.force) as stream:
-                    stream.write(picture)
-            write_json(self.output / "markers.json", content, overwrite=self.force)
+            wrong += _printed(found)
         return 1 if wrong else 0
 
     def _scored(self, settings: SampleSettings, frames: int) -> list[ScoredFrame]:
@@ -243,77 +210,43 @@ class Markers:
         detectors = (OURS, *(PEERS if known_to_opencv(self.dictionary) else ()))
         return score_frames(settings, detectors, frames, self.seed, self.jobs)
 
-    def _statistics(self) -> tuple[dict[str, Any], list[Offence], bytes]:
-        settings = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
-        frames = self._scored(settings, self.statistics)
-        table, bins = table_of(frames), binned(table_of(frames))
-        own = [offence for offence in offences(frames) if offence.detector == OURS]
-        print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
-        print("\n".join([*counts_lines(table), *bins_lines(bins), *_offence_lines(own)]))
-        content = {
-            "frames": table.frames,
-            "false": {name: len(of.false) for name, of in table.outcomes.items()},
-            "repeated": {name: of.repeated for name, of in table.outcomes.items()},
-            "bins": bins_json(bins), "offences": _offences_json(own),
-        }  # fmt: skip
-        title = (
-            f"{table.frames} rendered frames, {int(table.columns['clear'].sum())} markers of "
-            f"{self.dictionary} clearly in view: widths 12-200 px, slant to 70 deg, blur 0.3-3 px, "
-            "contrast 15-200, noise 1-5"
-        )
-        return content, own, statistics_picture(bins, title)
-
-    def _spot(self) -> dict[str, Any]:
+    def _spot(self, measured: SampleSettings) -> None:
         """Corners at a width of 60 px and a noise of 3: any light and blur, and good light."""
-        common = SampleSettings(
-            dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES, empty=0.0, markers=(2, 4),
-            width_px=(58.0, 62.0), noise_grey=(3.0, 3.0),
-        )  # fmt: skip
+        common = replace(
+            measured, empty=0.0, markers=(2, 4), width_px=(58.0, 62.0), noise_grey=(3.0, 3.0)
+        )
         good = replace(common, contrast_grey=(100.0, 200.0), blur_px=(0.5, 1.3), motion=0.0)
         cases = {"any light and blur": common, "contrast 100-200, blur 0.5-1.3 px, still": good}
-        content = {}
         for label, settings in cases.items():
             frames = self._scored(settings, max(20, self.statistics // 5))
             everything = binned(table_of(frames))[:1]
             print("\n".join([f"Width 58-62 px, noise 3, {label}", *bins_lines(everything)]))
-            content[label] = bins_json(everything)[0]
-        return content
 
-    def _search_frames(self) -> tuple[dict[str, Any], list[Offence]]:
+    def _search_frames(self) -> list[Offence]:
         settings = SampleSettings(
             dictionaries=self.dictionaries, samples=_SEARCHED_SAMPLES, photographs=self.backgrounds
         )
         frames = score_frames(settings, (OURS,), self.frames, self.seed, self.jobs)
-        table, found = table_of(frames), offences(frames)
         empty = sum(len(frame.rows) == 0 for frame in frames)
         print(f"Search of {len(frames)} frames, {empty} of them without any marker")
-        print("\n".join(counts_lines(table)))
-        by_dictionary = {}
+        print("\n".join(counts_lines(table_of(frames))))
         for name in self.dictionaries:
-            chosen = [frame for frame in frames if frame.dictionary == name]
-            clear = [frame.rows[:, 6] > 0.0 for frame in chosen]
-            status = [frame.outcomes[OURS].status for frame in chosen]
-            by_dictionary[name] = figures = {
-                "frames": len(chosen),
-                "clear": int(sum(c.sum() for c in clear)),
-                "found": int(sum((c & (s == FOUND)).sum() for c, s in zip(clear, status))),
-                "misidentified": int(sum((s == MISIDENTIFIED).sum() for s in status)),
-                "false": sum(len(frame.outcomes[OURS].false) for frame in chosen),
-            }
-            print(f"{name:>16}: " + ", ".join(f"{key} {value}" for key, value in figures.items()))
-        print("\n".join(_offence_lines(found)))
-        content = {
-            "frames": len(frames), "without_markers": empty,
-            "false": {name: len(of.false) for name, of in table.outcomes.items()},
-            "by_dictionary": by_dictionary, "offences": _offences_json(found),
-        }  # fmt: skip
-        return content, found
+            if not (chosen := [frame for frame in frames if frame.dictionary == name]):
+                continue
+            table = table_of(chosen)
+            outcome, clear = table.outcomes[OURS], table.columns["clear"] > 0.0
+            print(
+                f"{name:>16}: frames {table.frames}, clear {clear.sum()}, "
+                f"found {(clear & (outcome.status == FOUND)).sum()}, "
+                f"misidentified {(outcome.status == MISIDENTIFIED).sum()}, "
+                f"false {len(outcome.false)}"
+            )
+        return offences(frames)
 
 
-def _offence_lines(found: list[Offence]) -> list[str]:
-    lines = [f"  {one.detector}: {one.kind}: {one.place}" for one in found[:_SHOWN]]
-    return lines + ([f"  ... and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else [])
-
-
-def _offences_json(found: list[Offence]) -> list[dict[str, str]]:
-    return [offence._asdict() for offence in found]
+def _printed(found: list[Offence]) -> list[Offence]:
+    for one in found[:_SHOWN]:
+        print(f"  {one.detector}: {one.kind}: {one.place}")
+    if len(found) > _SHOWN:
+        print(f"  ... and {len(found) - _SHOWN} more")
+    return found

@@ -1,4 +1,4 @@
-"""Detected markers against the truth: scores, statistics by bins, tables and a picture."""
+"""Detected markers against the truth: scores, and statistics by bins."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from camera import Camera
 from redetect.landmarks import squared_mahalanobis
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from tools.evaluation.tables import picture
 from tools.simulator.markers.samples import SampleFrame
 from tools.simulator.markers.truth import MarkerTruth
 
@@ -31,8 +30,7 @@ _REFINEMENTS = {
 PEERS = tuple(_REFINEMENTS)
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
+class Found(NamedTuple):
     """Markers that a detector found in an image."""
 
     ids: IntArray  # (N,)
@@ -220,121 +218,78 @@ TITLES = {
 _FEWEST = 5
 
 
-@dataclass(frozen=True)
-class Figures:
-    """What a detector did with the clear markers of a bin."""
+class Figures(NamedTuple):
+    """What a detector did with the clear markers of a bin; errors NaN where it found too few."""
 
-    markers: int  # Clear markers in the bin.
-    found: int
-    misidentified: int
-    median_px: float
-    """Median distance of corners from the truth; NaN where fewer than 5 markers were found."""
+    rate: float  # Share of the markers that were found.
+    median_px: float  # Of the distances of corners from the truth.
     rms_px: float
     q95_px: float
     normalised: float
     """Mean squared error over the covariance per degree of freedom; NaN without covariances."""
 
-    @property
-    def rate(self) -> float:
-        """Share of the markers that were found."""
-        return self.found / self.markers if self.markers else float("nan")
 
+class Bin(NamedTuple):
+    """Figures of all detectors over the clear markers in one range of a quantity."""
 
-@dataclass(frozen=True)
-class Bin:
-    """Figures of all detectors over the markers of one range of a quantity."""
-
-    quantity: str  # What the range is of; empty for all markers together.
-    low: float
-    high: float
-    own: dict[str, Figures]
-    """By detector; errors over all markers that it found."""
-    shared: dict[str, tuple[Figures, Figures]]
-    """By peer: ours and the peer's, errors over the markers that both found."""
+    label: str
+    markers: int
+    own: dict[str, Figures]  # By detector, over all markers that it found.
+    shared: dict[str, tuple[float, float]]
+    """By peer: our median error and the peer's over the markers that both found, pixels."""
 
     @property
     def ahead_in_error(self) -> bool | None:
-        """Whether our median error is below every peer's on the shared markers.
-
-        None where there are too few.
-        """
-        pairs = [p for p in self.shared.values() if np.isfinite(p[1].median_px)]
-        if not pairs:
-            return None
-        return all(ours.median_px < peer.median_px for ours, peer in pairs)
+        """Whether our median error is below every peer's; None where there are too few markers."""
+        known = [medians for medians in self.shared.values() if np.isfinite(medians[1])]
+        return all(ours < peer for ours, peer in known) if known else None
 
     @property
     def ahead_in_rate(self) -> bool:
         """Whether we find at least as many markers as every peer."""
-        return all(f.found <= self.own[OURS].found for f in self.own.values())
+        return all(f.rate <= self.own[OURS].rate for f in self.own.values())
 
 
 def binned(table: Table) -> list[Bin]:
     """Figures of all markers that are clearly in view, and by bins of each quantity."""
     clear = table.columns["clear"] > 0.0
-    bins = [_bin(table, clear, "", 0.0, float("inf"))]
+    bins = [_bin(table, clear, "all")]
     for quantity, limits in BINS.items():
         values = table.columns[quantity]
         for low, high in itertools.pairwise(limits):
             inside = (values >= low) & ((values < high) | (values == limits[-1]) & (values == high))
-            bins.append(_bin(table, clear & inside, quantity, low, high))
+            bins.append(_bin(table, clear & inside, f"{TITLES[quantity]} {low:g}-{high:g}"))
     return bins
 
 
-def _bin(table: Table, inside: BoolArray, quantity: str, low: float, high: float) -> Bin:
-    own = {name: _figures(of, inside, inside) for name, of in table.outcomes.items()}
-    shared = {}
-    ours = table.outcomes.get(OURS)
-    for name, peer in table.outcomes.items():
-        if name != OURS and ours is not None:
-            both = inside & (ours.status == FOUND) & (peer.status == FOUND)
-            shared[name] = _figures(ours, inside, both), _figures(peer, inside, both)
-    return Bin(quantity, low, high, own, shared)
-
-
-def _figures(outcome: Outcome, inside: BoolArray, judged: BoolArray) -> Figures:
-    """Counts over the markers inside, errors over those of them that are judged and were found."""
-    found = judged & (outcome.status == FOUND)
-    wrong = inside & (outcome.status == MISIDENTIFIED)
-    counts = int(inside.sum()), int(found.sum()), int(wrong.sum())
-    if counts[1] < _FEWEST:
-        return Figures(*counts, *[float("nan")] * 4)
-    distances = np.linalg.norm(outcome.errors_px[found], axis=-1).ravel()
-    normalised = outcome.normalised[found].ravel()
-    normalised = normalised[np.isfinite(normalised)]
-    rms, q95 = np.sqrt(np.mean(distances**2)), np.quantile(distances, 0.95)
-    known = float(np.mean(normalised)) if len(normalised) else float("nan")
-    return Figures(*counts, float(np.median(distances)), float(rms), float(q95), known)
-
-
-def bins_json(bins: list[Bin]) -> list[dict[str, Any]]:
-    """Bins in plain numbers; what is not known is null."""
-    return [
-        {
-            "quantity": b.quantity or "all",
-            "low": b.low,
-            "high": b.high if np.isfinite(b.high) else None,
-            "own": {name: _figures_json(figures) for name, figures in b.own.items()},
-            "shared": {
-                name: {"ours": _figures_json(ours), "peer": _figures_json(peer)}
-                for name, (ours, peer) in b.shared.items()
-            },
-        }
-        for b in bins
-    ]
-
-
-def _figures_json(figures: Figures) -> dict[str, float | int | None]:
-    numbers = {**vars(figures), "rate": figures.rate}
-    return {
-        key: (None if isinstance(value, float) and not np.isfinite(value) else value)
-        for key, value in numbers.items()
+def _bin(table: Table, inside: BoolArray, label: str) -> Bin:
+    found = {name: inside & (of.status == FOUND) for name, of in table.outcomes.items()}
+    markers = int(inside.sum())
+    own = {
+        name: _figures(of, found[name], found[name].sum() / max(markers, 1))
+        for name, of in table.outcomes.items()
     }
+    shared = {}
+    if OURS in found:
+        for name in (name for name in found if name != OURS):
+            both = found[OURS] & found[name]
+            ours, peer = (_figures(table.outcomes[of], both, 1.0) for of in (OURS, name))
+            shared[name] = ours.median_px, peer.median_px
+    return Bin(label, markers, own, shared)
 
 
-# Of the colour-blind-safe set of Okabe and Ito.
-_COLOURS = ("#000000", "#999999", "#56B4E9", "#009E73", "#E69F00", "#D55E00")
-_LEAST_PX, _LARGEST_PX = 0.005, 3.0
+def _figures(outcome: Outcome, found: BoolArray, rate: float) -> Figures:
+    """Errors over some of the markers that were found."""
+    if found.sum() < _FEWEST:
+        return Figures(rate, *[float("nan")] * 4)
+    distances = np.linalg.norm(outcome.errors_px[found], axis=-1)
+    normalised = outcome.normalised[found]
+    known = np.isfinite(normalised)
+    return Figures(
+        rate, float(np.median(distances)), float(np.sqrt(np.mean(distances**2))),
+        float(np.quantile(distances, 0.95)),
+        float(np.mean(normalised[known])) if known.any() else float("nan"),
+    )  # fmt: skip
 
 
 def counts_lines(table: Table) -> list[str]:
@@ -356,61 +311,21 @@ def bins_lines(bins: list[Bin]) -> list[str]:
     Errors over the markers that each detector found itself; then our median and the peer's over
     those that both found.
     """
-    names = list(bins[0].own)
-    above = "".join(f"  {name:>29}" for name in names)
+    above = "".join(f"  {name:>29}" for name in bins[0].own)
     lines = [
         f"{'':32}{'markers':>8}{above}   error^2/dof  shared: ours peer ...",
-        " " * 40 + f"  {'found  median    rms    95 %':>29}" * len(names),
+        " " * 40 + f"  {'found  median    rms    95 %':>29}" * len(bins[0].own),
     ]
     for b in bins:
-        if not b.own[names[0]].markers:
+        if not b.markers:
             continue
-        label = f"{TITLES[b.quantity]} {b.low:g}-{b.high:g}" if b.quantity else "all"
-        cells = [f"{label:32.32}{b.own[names[0]].markers:8d}"]
-        cells += [
-            f"  {b.own[n].rate:8.3f} {b.own[n].median_px:6.3f} {b.own[n].rms_px:6.3f} "
-            f"{b.own[n].q95_px:6.3f}"
-            for n in names
-        ]
-        cells.append(f"  {b.own[names[0]].normalised:10.2f}  ")
-        cells += [f" {ours.median_px:.3f}<{peer.median_px:.3f}" for ours, peer in b.shared.values()]
+        line = f"{b.label:32.32}{b.markers:8d}"
+        for f in b.own.values():
+            line += f"  {f.rate:8.3f} {f.median_px:6.3f} {f.rms_px:6.3f} {f.q95_px:6.3f}"
+        line += f"  {next(iter(b.own.values())).normalised:10.2f}  "
+        line += "".join(f" {ours:.3f}<{peer:.3f}" for ours, peer in b.shared.values())
         if b.shared:
             error = {True: "ahead", False: "BEHIND", None: "-"}[b.ahead_in_error]
-            cells.append(f"  error {error}, rate {'ahead' if b.ahead_in_rate else 'BEHIND'}")
-        lines.append("".join(cells))
+            line += f"  error {error}, rate {'ahead' if b.ahead_in_rate else 'BEHIND'}"
+        lines.append(line)
     return lines
-
-
-def statistics_picture(bins: list[Bin], title: str) -> bytes:
-    """A PNG: corner error above, detection rate below, over each quantity."""
-    return picture((15.0, 6.5), lambda figure: _draw(figure, bins, title), dpi=80)
-
-
-def _draw(figure: Any, bins: list[Bin], title: str) -> None:
-    names = list(bins[0].own)
-    axes = figure.subplots(2, len(BINS), sharey="row", squeeze=False)
-    for column, quantity in enumerate(BINS):
-        chosen = [b for b in bins if b.quantity == quantity]
-        linear = quantity == "slant_deg"
-        middle = [0.5 * (b.low + b.high) if linear else np.sqrt(b.low * b.high) for b in chosen]
-        for name, colour in zip(names, _COLOURS):
-            own = [b.own[name] for b in chosen]
-            style = {"color": colour, "lw": 2.2 if name == OURS else 1.2, "label": name}
-            axes[0, column].plot(middle, [f.median_px for f in own], "o-", ms=3, **style)
-            axes[0, column].plot(middle, [f.q95_px for f in own], ":", **style)
-            axes[1, column].plot(middle, [f.rate for f in own], "o-", ms=3, **style)
-        for row in axes[:, column]:
-            row.grid(alpha=0.3)
-            if not linear:
-                row.set_xscale("log")
-                ticks = BINS[quantity]
-                row.set_xticks(ticks, [f"{t:g}" for t in ticks])
-                row.minorticks_off()
-        axes[0, column].set_yscale("log")
-        axes[0, column].set_ylim(_LEAST_PX, _LARGEST_PX)
-        axes[1, column].set_ylim(0.0, 1.02)
-        axes[1, column].set_xlabel(TITLES[quantity])
-    axes[0, 0].set_ylabel("corner error / px\nmedian, dotted 95 %")
-    axes[1, 0].set_ylabel("share of clear markers found")
-    axes[1, 0].legend(fontsize=8, loc="lower right")
-    figure.suptitle(title, fontsize=10)

@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tyro.conf import Positional
 
@@ -37,13 +36,6 @@ def run_program(program: str, *arguments: object) -> None:
     subprocess.run([sys.executable, "-m", program, *words], check=True, stdout=subprocess.DEVNULL)
 
 
-def compare_rows(run: Path, rows: Path, *flags: object) -> dict[str, Any]:
-    """What `detect compare` finds."""
-    compared = rows.with_suffix(".compared.json")
-    run_program("detect", "compare", run, "--detected", rows, *flags, "--json", compared)
-    return dict(json.loads(compared.read_text()))
-
-
 def measure_run(run: Path, folder: Path) -> Iterator[tuple[str, ...]]:
     """Detect a run in each of the ways, compare and map it; files go into `folder`.
 
@@ -61,7 +53,11 @@ def measure_run(run: Path, folder: Path) -> Iterator[tuple[str, ...]]:
             run_program("detect", command, run, *flags, "--ids-from", shipped, "--output", target)
         else:
             rows.write_bytes(shipped.read_bytes())
-        result = compare_rows(run, rows, "--only-identified")
+        compared = output / "compared.json"
+        run_program(
+            "detect", "compare", run, "--detected", rows, "--only-identified", "--json", compared
+        )
+        result = json.loads(compared.read_text())
         factors = []
         for calibrate in ((), ("--calibrate",)):
             mapped = output / f"map{len(calibrate)}"

@@ -1,15 +1,11 @@
-"""One way to write what studies find: tables on the terminal or in Markdown, JSON, pictures."""
+"""One way to write what studies find: tables on the terminal or in Markdown, pictures."""
 
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-from redetect.storage import write_whole
 
 
 class Table:
@@ -42,12 +38,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[s
     """Lines of a table in Markdown."""
     rule = "|" + "---|" * len(head)
     return [f"| {' | '.join(head)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
-
-
-def write_json(path: Path, content: Any, *, overwrite: bool) -> None:
-    """Write plain values as JSON, ending with a line end."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def picture(size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int) -> bytes:

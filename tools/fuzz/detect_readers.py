@@ -31,7 +31,7 @@ from lut.cache import cached_vertical_table
 from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
 from tools.arrays import ByteArray
-from tools.fuzz.reader import CAMERA_TEXT, NUMBERS, Reader
+from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader
 
 #: Images are read for a calibration of this size.
 _SIZE = (8, 8)
@@ -215,9 +215,6 @@ _JOURNALS = (
 _JOURNAL_WORDS = (
     b"[", b"]", b",", b'"', b"null", b"true", b"-1", b"1" * 30, b"1e999", b"NaN", b"{}",
 )  # fmt: skip
-_NPZ_WORDS = (
-    b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", struct.pack("<I", 0xFFFFFFFF),
-)  # fmt: skip
 _DETECT, _FRAME = (DetectError,), (FrameError,)
 
 DETECT_READERS: tuple[Reader, ...] = (
@@ -238,6 +235,6 @@ DETECT_READERS: tuple[Reader, ...] = (
     Reader("log", "detected.log.json", is_log, (),
            (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
            (b"{", b"}", b"\xef\xbb\xbf"), needed=False),
-    Reader("cached table", "table", _table, (), (), _NPZ_WORDS, files=10,
+    Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,
            made_seeds=_table_content),
 )  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.reference_poses import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.scoring import read_relations
-from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NUMBERS, Reader
+from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NPZ_WORDS, NUMBERS, Reader
 
 
 def _survey() -> Survey:
@@ -86,9 +85,6 @@ _DXF_WORDS = (
     )),
     b"1e999", b"\n70\n", b"\n2\n", b"BLOCKS",
 )  # fmt: skip
-_NPZ_WORDS = (
-    b"times_s.npy", b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", struct.pack("<I", 0xFFFFFFFF),
-)  # fmt: skip
 _SCAN_ARRAYS = _npz(times_s=np.arange(2.0), ranges_mm=np.ones((2, 3), np.uint16))
 _SCANNERS_JSON = f'{{"version": 1, "scanners": [{_SCANNER_JSON}]}}'
 _ROBOT_JSON = (
@@ -115,7 +111,8 @@ GROUNDTRUTH_READERS: tuple[Reader, ...] = (
             b"7 0.1 1 2 3\n", words=(b"t,", *NUMBERS)),
     _reader("packed scans", "a.scans.csv.gz", read_scans,
             gzip.compress(b"0.1,1,2,3\n0.2,1,2,80\n", mtime=0), words=()),
-    _reader("scan arrays", "a.scans.npz", read_scans, _SCAN_ARRAYS, words=_NPZ_WORDS),
+    _reader("scan arrays", "a.scans.npz", read_scans, _SCAN_ARRAYS,
+            words=(b"times_s.npy", *NPZ_WORDS)),
     _reader("scanners", "scanners.json", read_scanners, _SCANNERS_JSON.encode(), words=JSON_WORDS),
     _reader("robot", "robot.json", read_robot, _ROBOT_JSON.encode(), words=JSON_WORDS),
     _reader("building", "building.csv", read_building, b"x1_m,y1_m,x2_m,y2_m\n0,0,1,1\n"),

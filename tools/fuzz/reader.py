@@ -17,6 +17,8 @@ NUMBERS = (b"nan", b"inf", b"1e308", b"-1e-320", b"1_0", b"0x1", b",", b"#", b"\
 
 JSON_WORDS = (b"[", b"]", b"{", b"}", b'"', b":", b"null", b"true", b"1e999", b"NaN", b"-0")
 
+NPZ_WORDS = (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", b"\xff\xff\xff\xff")
+
 CAMERA_TEXT = PUBLISHED_CAMERA.encode()
 
 #: Characters of a message beside the file's name.

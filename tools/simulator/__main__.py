@@ -107,29 +107,6 @@ class Rows(_Drive):
 
 
 @dataclass(frozen=True)
-class Reenact:
-    """Render what the camera of a recorded run would have seen."""
-
-    landmarks: Positional[Path]  # The recorded run's .circles file.
-    output: Positional[Path]  # Folder of the run; its name is the run's.
-    camera: Path  # The calibration (.cam) that belongs to it.
-    world: Path  # What `python -m tools.reenactment prepare` wrote.
-    every: int = 5  # Render every n-th frame.
-    seed: int = 1  # Of noise and light.
-    jobs: int = 1  # Processes that render.
-    force: bool = False  # Replace files that exist.
-
-    def __call__(self) -> str:
-        from tools.simulator.reenact import prepare, write_reenactment
-
-        run = prepare(self.landmarks, self.camera, self.world, self.seed)
-        frames = write_reenactment(
-            run, self.output, self.every, jobs=self.jobs, overwrite=self.force
-        )
-        return f"{frames} frames"
-
-
-@dataclass(frozen=True)
 class MarkerFrames:
     """Render random frames of markers among things that look like markers, with exact truth."""
 
@@ -220,7 +197,6 @@ def main(arguments: list[str] | None = None) -> int:
         Annotated[Demo, subcommand("demo")]
         | Annotated[Run, subcommand("run")]
         | Annotated[Rows, subcommand("rows")]
-        | Annotated[Reenact, subcommand("reenact")]
         | Annotated[MarkerFrames, subcommand("marker-frames")]
         | Annotated[MarkerSession, subcommand("marker-session")]
         | Annotated[MarkerDemo, subcommand("marker-demo")]

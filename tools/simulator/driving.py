@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +12,6 @@ from camera.uncertainty import with_pose
 from redetect.groundtruth.trajectories.transforms import transform
 from redetect.landmarks import Step
 from redetect.plane import between
-from redetect.slam.models import move, move_jacobians
-from redetect.slam.recording import Recording
 from tools.arrays import FloatArray
 
 
@@ -209,24 +206,8 @@ def measured_steps(
     return np.asarray(measured)
 
 
-def step_record(prefix: str, step: FloatArray, covariance: FloatArray | None = None) -> Step:
-    """Row of a measured step; by default its covariance is that of the measured movement."""
-    c = step_covariance(step) if covariance is None else covariance
+def step_record(prefix: str, step: FloatArray) -> Step:
+    """Row of a measured step, its covariance that of the measured movement."""
+    c = step_covariance(step)
     numbers = *step, c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2]
     return Step(prefix, *map(float, numbers))
-
-
-def joined_steps(recording: Recording, kept: Sequence[int]) -> list[Step]:
-    """Odometry of a run of which only some frames are kept."""
-    joined: list[Step] = []
-    first = 0
-    for last in kept:
-        pose, covariance = np.zeros(3), np.zeros((3, 3))
-        for k in range(first, last + 1):
-            by_pose, by_step = move_jacobians(pose, recording.steps[k])
-            covariance = by_pose @ covariance @ by_pose.T
-            covariance += by_step @ recording.step_covariance[k] @ by_step.T
-            pose = move(pose, recording.steps[k])
-        joined.append(step_record(recording.prefixes[last], pose, covariance))
-        first = last + 1
-    return joined

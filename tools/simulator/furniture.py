@@ -331,7 +331,7 @@ def lay_discs(
     `path` (N, 3); `within` (x0, y0, x1, y1).
     """
     total = count + lookalikes
-    boxes = [(ring.min(axis=0), ring.max(axis=0)) for ring in building.footprints]
+    boxes = np.array([(ring.min(axis=0), ring.max(axis=0)) for ring in building.footprints])
     walls = _low_segments(building)
     chosen: list[tuple[float, float, float]] = []
     tries = 0
@@ -392,13 +392,15 @@ def _low_segments(building: Construction) -> FloatArray:
 def _crowded(
     place: FloatArray,
     seen_from: FloatArray,
-    boxes: list[tuple[FloatArray, FloatArray]],
+    boxes: FloatArray,
     walls: FloatArray,
 ) -> bool:
-    """Whether something stands on, next to or between the place and the path."""
-    for low, high in boxes:
-        if np.all(place > low - _FROM_FURNITURE_M) and np.all(place < high + _FROM_FURNITURE_M):
-            return True
+    """Whether something stands on, next to or between the place and the path.
+    `boxes` (N, 2, 2) are opposite corners; `walls` (K, 4).
+    """
+    low, high = boxes[:, 0] - _FROM_FURNITURE_M, boxes[:, 1] + _FROM_FURNITURE_M
+    if np.any(np.all((place > low) & (place < high), axis=1)):
+        return True
     a, b = walls[:, :2], walls[:, 2:]
     along = b - a
     squared = np.maximum((along**2).sum(axis=1), 1e-12)

@@ -204,13 +204,11 @@ FULL_ROUTE = (
 _INTO_ROOM_M = 2.3
 
 
-def office_route(
-    office: Office, rng: np.random.Generator, visits: float, rounds: int = 3
-) -> FloatArray:
+def office_route(office: Office, rng: np.random.Generator, visits: float) -> FloatArray:
     """The corners of a way through the office. Returns (K, 2)."""
     corners: list[FloatArray] = [np.array(FULL_ROUTE[0])]
     unvisited = {id(room) for room in office.rooms if room.enterable}
-    for _ in range(rounds):
+    for _ in range(3):
         for goal in FULL_ROUTE[1:]:
             start, end = corners[-1], np.array(goal)
             length = float(np.linalg.norm(end - start))

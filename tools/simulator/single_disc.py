@@ -142,16 +142,9 @@ def render_disc(
     Raises
     ------
     ValueError
-        If a parameter is out of its range or part of the disc is not in front of the camera.
+        If there is noise without `rng`, or part of the disc is not in front of the camera.
     """
     blur_u, blur_v = blur_px if isinstance(blur_px, tuple) else (blur_px, blur_px)
-    if radius_m <= 0.0 or surround <= 0.0 or supersampling < 1 or not 0.0 < row_aperture <= 1.0:
-        raise ValueError(
-            f"radius_m {radius_m}, surround {surround}, supersampling {supersampling}, "
-            f"row_aperture {row_aperture}: expected positive numbers, an aperture of at most 1"
-        )
-    if min(blur_u, blur_v, noise_sigma) < 0.0:
-        raise ValueError(f"blur_px {blur_px}, noise_sigma {noise_sigma}: expected none negative")
     if noise_sigma > 0.0 and rng is None:
         raise ValueError("rng is None: expected a numpy Generator, since there is noise")
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from detect.sources.opening import open_run
-from redetect.storage import OutputExistsError
 from redetect.storage.command_line import exit_code_of
 from tools.benchmark.material import repeated_run
-from tools.evaluation.tables import write_json
 from tools.soak.long_run import SoakResult, soak
 from tools.soak.short_runs import ShortRuns, repeat_short_runs
 
@@ -29,31 +27,20 @@ class Soak:
     jobs: int = 2  # Processes that share the work.
     short: int = 0
     """So many runs of eight frames instead, one after the other, with and without workers."""
-    warm: bool = False
-    """Fork the short runs from a process that has everything loaded, instead of starting an
-    interpreter for each: a tenth of a second for each, and no workers."""
     source: Path = Path("images/e")  # A run folder whose images are repeated.
     scratch: Path | None = None
     """Where the run and its results are made, and removed again; on the source's file system."""
-    json: Path | None = None  # Write the figures as JSON.
-    force: bool = False  # Replace an existing JSON file.
 
     def __call__(self) -> int:
-        if self.json is not None and self.json.exists() and not self.force:
-            raise OutputExistsError(self.json)
         result: ShortRuns | SoakResult
         with tempfile.TemporaryDirectory(dir=self.scratch, prefix="soak-") as name:
             folder = Path(name)
             if self.short:
-                result = repeat_short_runs(
-                    self.source, folder, self.short, self.jobs, warm=self.warm
-                )
+                result = repeat_short_runs(self.source, folder, self.short, self.jobs)
             else:
                 run = repeated_run(open_run(self.source), folder / "soak", self.frames, 0)
                 result = soak(run, folder / "results", self.frames, self.jobs)
         print(result)
-        if self.json is not None:
-            write_json(self.json, asdict(result), overwrite=self.force)
         for sentence in result.unmet():
             print(sentence, file=sys.stderr)
         return 1 if result.unmet() else 0

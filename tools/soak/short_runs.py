@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import subprocess
 import sys
-import tempfile
 import time
-from contextlib import redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from unittest.mock import patch
 
 import psutil  # type: ignore[import-untyped,unused-ignore]
 
@@ -61,32 +58,29 @@ class ShortRuns:
         )
 
 
-def repeat_short_runs(
-    source: Path, folder: Path, runs: int, jobs: int, *, warm: bool = False
-) -> ShortRuns:
-    """Carry out `detect all` on a few frames again and again."""
+def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> ShortRuns:
+    """Carry out `detect all` on a few frames again and again, every second time with workers."""
     run = repeated_run(open_run(source), folder / "short", _FRAMES)
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
         path.mkdir()
     mark = f"REDETECT_SOAK={folder}"
     added = {"REDETECT_SOAK": str(folder), "TMPDIR": str(temporary), "REDETECT_CACHE": str(caches)}
-    arguments = ["all", str(run), "-o", str(output), "--force", "--jobs"]
+    command = [sys.executable, "-m", "detect", "all", str(run), "-o", str(output), "--force"]
     first: dict[str, bytes] = {}
     cached = different = 0
     shared = _shared()
-    with patch.dict(os.environ, added), patch.object(tempfile, "tempdir", None):
-        if warm:
-            _command([*arguments, "1"])  # loads all that is needed
-        for number in range(runs):
-            if warm:
-                _forked([*arguments, "1"])
-            else:
-                _started([*arguments, str(jobs if number % 2 else 1)])
-            found = {path.name: path.read_bytes() for path in output.iterdir()}
-            if number == 0:
-                first, cached = found, len(_names(caches))
-            different += found != first
+    for number in range(runs):
+        words = [*command, "--jobs", str(jobs if number % 2 else 1)]
+        done = subprocess.run(
+            words, env=os.environ | added, capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+        found = {path.name: path.read_bytes() for path in output.iterdir()}
+        if number == 0:
+            first, cached = found, len(_names(caches))
+        different += found != first
     return ShortRuns(
         runs=runs,
         processes=len(marked(mark)),
@@ -107,32 +101,6 @@ def marked(variable: str) -> list[int]:
             if process.pid != os.getpid() and process.environ().get(name) == value:
                 found.append(process.pid)
     return found
-
-
-def _started(arguments: list[str]) -> None:
-    """Carry out a command in a new process."""
-    command = [sys.executable, "-m", "detect", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
-
-
-def _forked(arguments: list[str]) -> None:
-    """Carry out a command in a copy of this process, which ends as any of Python's does."""
-    process = multiprocessing.get_context("fork").Process(target=_command, args=(arguments,))
-    process.start()
-    process.join()
-    if process.exitcode != 0:
-        raise SoakError(f"detect ended with {process.exitcode}")
-
-
-def _command(arguments: list[str]) -> None:
-    from detect.cli import main
-
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
-        code = main(arguments)
-    if code != 0:
-        sys.exit(code)
 
 
 def _shared() -> set[str]:

@@ -7,13 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tools.benchmark.timing import (
-    LEAST_CALLS,
-    Spread,
-    measure_in_turn,
-    paired_ratios,
-    spread_of,
-)
+from tools.benchmark.timing import LEAST_CALLS, decodings, measure_in_turn, number
 
 
 class Machine:
@@ -35,17 +29,33 @@ class Machine:
         return call
 
 
-def test_spread_is_that_of_known_numbers() -> None:
-    assert spread_of([4.0, 1.0, 3.0, 2.0, 5.0]) == Spread(3.0, 2.0, 4.0, 1.0, 5)
+def test_times_and_ratios_are_medians_of_calls_and_of_pairs() -> None:
+    seconds = {
+        "decoding": np.array([[0.001, 0.002], [0.003, 0.004]]),
+        "own": np.array([[0.004, 0.006], [0.006, 0.004]]),
+        "slow": np.array([[0.040, np.nan], [0.030, np.nan]]),
+    }
+    found = decodings(seconds, "decoding")
+    # The pairs' ratios are 4, 3, 2, 1; the ratio of the medians would be 2.
+    assert found["own"] == "2.50 (1.75 - 3.25); 5.00 ms"
+    assert found["decoding"] == "1.00 (1.00 - 1.00); 2.50 ms"
+    assert found["slow"] == "25.0 (17.5 - 32.5); 35.0 ms"
 
 
-def test_spread_leaves_out_what_was_not_measured() -> None:
-    assert spread_of(np.array([[np.nan, 2.0], [8.0, np.nan]])) == Spread(5.0, 3.5, 6.5, 2.0, 2)
-
-
-def test_spread_of_nothing_is_an_error() -> None:
-    with pytest.raises(ValueError, match="no measurements"):
-        spread_of([np.nan])
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1458.2, "1,458"),
+        (99.96, "100"),
+        (12.34, "12.3"),
+        (9.996, "10.0"),
+        (1.0, "1.00"),
+        (0.0712, "0.071"),
+        (0.0041, "0.0041"),
+    ],
+)
+def test_numbers_keep_two_or_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
 
 
 def test_every_function_gets_every_image_in_every_round_and_its_own_time() -> None:
@@ -121,11 +131,5 @@ def test_load_cancels_out_of_ratios() -> None:
     }
     # The warm-up's two calls put the changes of load between images.
     seconds = measure_in_turn(functions, 2, 20, 1e9, machine.clock)
-    ratios = paired_ratios(seconds["detector"], seconds["decoding"])
     assert np.ptp(seconds["detector"]) > 10.0
-    assert spread_of(ratios).median == pytest.approx(4.0, rel=1e-9)
-
-
-def test_ratios_are_missing_where_either_was_not_measured() -> None:
-    ratios = paired_ratios(np.array([[6.0, np.nan, 1.0]]), np.array([[2.0, 2.0, np.nan]]))
-    np.testing.assert_array_equal(ratios, [[3.0, np.nan, np.nan]])
+    assert decodings(seconds, "decoding")["detector"].startswith("4.00 (4.00 - 4.00)")

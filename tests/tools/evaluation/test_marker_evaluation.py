@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,6 @@ from tools.evaluation.markers import (
     score_frames,
     search_photographs,
     time_searches,
-    timing_lines,
 )
 from tools.evaluation.markers_statistics import (
     BINS,
@@ -28,17 +26,16 @@ from tools.evaluation.markers_statistics import (
     MISSED,
     OURS,
     PEERS,
+    TITLES,
     Found,
     Outcome,
     ScoredFrame,
     binned,
-    bins_json,
     bins_lines,
     counts_lines,
     detector_of,
     known_to_opencv,
     score_frame,
-    statistics_picture,
     table_of,
 )
 from tools.simulator.markers.samples import SampleSettings, sample_frame
@@ -105,19 +102,17 @@ def test_bins_compare_like_with_like() -> None:
     large = widths > 100.0
     table = table_of(_scored(widths, {OURS: 0.1, "aruco": 0.3}, {OURS: every, "aruco": large}))
     bins = binned(table)
-    assert bins[0].quantity == ""
+    assert bins[0].label == "all"
     assert bins[0].own[OURS].rate == 1.0
     assert bins[0].own["aruco"].rate == 0.5
     assert bins[0].own[OURS].median_px == pytest.approx(0.1)
-    ours, peer = bins[0].shared["aruco"]
-    assert (ours.found, peer.found) == (10, 10)
-    assert (ours.median_px, peer.median_px) == pytest.approx((0.1, 0.3))
+    assert bins[0].shared["aruco"] == pytest.approx((0.1, 0.3))
     assert bins[0].ahead_in_error
     assert bins[0].ahead_in_rate
-    by_width = {b.low: b for b in bins if b.quantity == "width_px"}
-    assert by_width[28].own["aruco"].found == 0
-    assert by_width[28].ahead_in_error is None
-    assert by_width[130].own[OURS].markers == 10
+    by_width = {b.label: b for b in bins}
+    assert by_width["width / px 28-40"].own["aruco"].rate == 0.0
+    assert by_width["width / px 28-40"].ahead_in_error is None
+    assert by_width["width / px 130-200"].markers == 10
     behind = binned(
         table_of(_scored(widths, {OURS: 0.4, "aruco": 0.3}, {OURS: large, "aruco": every}))
     )
@@ -125,7 +120,6 @@ def test_bins_compare_like_with_like() -> None:
     assert not behind[0].ahead_in_rate
     text = "\n".join(bins_lines(behind))
     assert "BEHIND" in text
-    json.dumps(bins_json(bins), allow_nan=False)
 
 
 def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
@@ -136,8 +130,7 @@ def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
     for quantity, limits in BINS.items():
         values = table.columns[quantity][clear]
         inside = np.count_nonzero((values >= limits[0]) & (values <= limits[-1]))
-        assert sum(b.own[OURS].markers for b in bins if b.quantity == quantity) == inside
-    assert statistics_picture(bins, "a title") == statistics_picture(bins, "a title")
+        assert sum(b.markers for b in bins if b.label.startswith(TITLES[quantity])) == inside
     assert counts_lines(table)[0].startswith("2 frames")
 
 
@@ -193,25 +186,15 @@ def test_photographs_are_searched(tmp_path: Path) -> None:
 def test_searches_are_timed_beside_decoding() -> None:
     settings = SampleSettings(dictionaries=("4x4_50",), samples=2)
     times = time_searches(settings, 2, 1, rounds=3)
-    by_name = {time.function: time for time in times}
-    assert {DECODING, SEARCH, GIVEN_WIDTH, "aruco", "aruco apriltag"} <= set(by_name)
-    assert all(time.decodings.count == time.ms.count == 6 for time in times)
-    decoding = by_name[DECODING].decodings
-    assert decoding.lower_quartile == decoding.upper_quartile == 1.0
-    lines = timing_lines(times)
-    assert len(lines) == len(times)
-    assert "decoding: 1.00 (1.00 - 1.00) x decoding" in lines[0]
+    assert {DECODING, SEARCH, GIVEN_WIDTH, "aruco", "aruco apriltag"} <= set(times)
+    assert times[DECODING].startswith("1.00 (1.00 - 1.00); ")
 
 
 @pytest.mark.long
-def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["markers", "--statistics", "2", "--no-spot", "--frames", "2", "--output",
-                 str(tmp_path / "out"), "--dictionary", "4x4_50"]  # fmt: skip
+def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["markers", "--statistics", "2", "--no-spot", "--frames", "2",
+                 "--dictionary", "4x4_50"]  # fmt: skip
     assert main(arguments) in (0, 1)
-    assert "clearly in view" in capsys.readouterr().out
-    content = json.loads((tmp_path / "out" / "markers.json").read_text())
-    assert content["search"]["frames"] == 2
-    assert len(content["statistics"]["bins"]) == 1 + sum(len(b) - 1 for b in BINS.values())
-    assert (tmp_path / "out" / "statistics.png").read_bytes().startswith(b"\x89PNG")
-    assert main(arguments) == 1
-    assert "exists already" in capsys.readouterr().err
+    out = capsys.readouterr().out
+    assert "clearly in view" in out
+    assert "Search of 2 frames" in out

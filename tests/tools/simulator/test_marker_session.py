@@ -44,6 +44,7 @@ from tools.simulator.markers.session import (
     disturbed_rig,
     plan_session,
     random_for,
+    seen_markers,
     view_frame,
     write_session,
 )
@@ -184,8 +185,8 @@ def test_markers_are_seen_by_several_cameras(full_plan: SessionPlan) -> None:
     for frame in (0, 7, 100):
         seen = 0
         for camera in range(4):
-            good = [m for m in view_frame(full_plan, camera, frame).markers
-                    if m.clear and m.slant_deg < 65.0]  # fmt: skip
+            markers = seen_markers(full_plan, camera, full_plan.poses[frame])
+            good = [m for m in markers if m.clear and m.slant_deg < 65.0]
             widths += [m.width_px for m in good]
             seen += bool(good)
         cameras_per_pose.append(seen)

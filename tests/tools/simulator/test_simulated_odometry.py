@@ -9,17 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.landmarks import Frame, Step, parse_record
+from redetect.landmarks import Step, parse_record
 from redetect.plane import between
-from redetect.slam.recording import recording_of_frames
 from tools.simulator.driving import (
     DriveStyle,
     drive,
-    joined_steps,
     measured_steps,
     robot_tilt,
     step_covariance,
-    step_record,
 )
 
 PRINTED_STEPS = [
@@ -88,32 +85,6 @@ def test_wrong_odometry_is_far_beyond_its_covariance() -> None:
     total = (steps - between(poses[:-1], poses[1:]))[100:200].sum(axis=0)
     covariance = step_covariance(steps[100:200]).sum(axis=0)
     assert total @ np.linalg.solve(covariance, total) > chi2.ppf(1.0 - 1e-6, 3)
-
-
-def test_joined_steps_are_the_way_between_frames() -> None:
-    poses = drive(ROUTE, 40, DriveStyle(), np.random.default_rng(2))
-    true = between(poses[:-1], poses[1:])
-    rows = [step_record(f"s.{k}", step) for k, step in enumerate(true)]
-    kept = [0, 7, 19, 39]
-    joined = joined_steps(recording_of_frames([Frame(row) for row in rows], "s"), kept)
-    assert [s.prefix for s in joined] == ["s.0", "s.7", "s.19", "s.39"]
-    ends = poses[[0, *(k + 1 for k in kept)]]
-    found = np.array([[s.dx, s.dy, s.dphi] for s in joined])
-    np.testing.assert_allclose(found, between(ends[:-1], ends[1:]), atol=1e-12)
-    # The covariance is that of many drives with errors.
-    ways = []
-    for seed in range(3000):
-        noisy = measured_steps(poses[:9], np.random.default_rng(seed))[1:8]
-        pose = np.zeros(3)
-        for dx, dy, dphi in noisy:
-            c, s = np.cos(pose[2]), np.sin(pose[2])
-            pose += [c * dx - s * dy, s * dx + c * dy, dphi]
-        ways.append(pose)
-    s = joined[1]
-    claimed = np.array([[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi],
-                        [s.cxphi, s.cyphi, s.cphiphi]])  # fmt: skip
-    scale = np.sqrt(np.outer(np.diag(claimed), np.diag(claimed)))
-    np.testing.assert_allclose(np.cov(np.array(ways).T) / scale, claimed / scale, atol=0.08)
 
 
 def test_drive_goes_where_the_route_goes() -> None:

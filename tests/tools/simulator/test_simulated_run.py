@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,13 @@ def demo_truth(demo_folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def rows_plan() -> RunPlan:
     return plan_run(SETTINGS, lit=False)
+
+
+@pytest.fixture(scope="module")
+def rows_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rows") / "sim"
+    write_rows(SETTINGS, folder, noisy=True)
+    return folder
 
 
 def test_demo_run_is_complete(demo_folder: Path, published_camera: Camera) -> None:
@@ -148,11 +156,11 @@ def test_demo_edges_lie_on_grey_value_edges(
 
 
 def test_rows_are_the_truth_plus_noise_of_their_covariance(
-    tmp_path: Path, rows_plan: RunPlan
+    rows_folder: Path, rows_plan: RunPlan
 ) -> None:
-    count = write_rows(SETTINGS, tmp_path / "sim", noisy=True)
-    frames = list(read_frames(tmp_path / "sim" / "map.circles"))
-    assert sum(len(f.circles) for f in frames) == count > 100
+    frames = list(read_frames(rows_folder / "map.circles"))
+    count = sum(len(f.circles) for f in frames)
+    assert count > 100
     squared, unlabelled = [], 0
     for k, frame in enumerate(frames):
         truth = disc_in_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
@@ -170,26 +178,24 @@ def test_rows_are_the_truth_plus_noise_of_their_covariance(
 
 
 @pytest.mark.long
-def test_exact_rows_and_missed_rows(tmp_path: Path, rows_plan: RunPlan) -> None:
-    every = write_rows(SETTINGS, tmp_path / "exact", noisy=False)
+def test_exact_rows_and_missed_rows(tmp_path: Path, rows_folder: Path, rows_plan: RunPlan) -> None:
+    every = sum(len(frame.circles) for frame in read_frames(rows_folder / "map.circles"))
     some = write_rows(SETTINGS, tmp_path / "some", noisy=False, miss=0.3)
     assert 0.55 * every < some < 0.85 * every
-    for k, frame in enumerate(read_frames(tmp_path / "exact" / "map.circles")):
+    for k, frame in enumerate(read_frames(tmp_path / "some" / "map.circles")):
         truth = disc_in_robot(rows_plan.poses[k + 1], rows_plan.disc_xy)
         for row in frame.circles:
             assert np.abs(truth - [row.px, row.py]).max(axis=1).min() < 1e-5
 
 
 @pytest.mark.long
-def test_same_seed_same_bytes_other_seed_other_run(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        write_rows(replace(SETTINGS, seed=seed, frames=12, discs=8), tmp_path / name)
+def test_same_seed_same_bytes_other_seed_other_run(tmp_path: Path, rows_folder: Path) -> None:
+    for name, seed in (("again", 3), ("other", 4)):
+        write_rows(replace(SETTINGS, seed=seed), tmp_path / name)
     for file in ("map.circles", "sim.txt", "truth.json"):
-        first, again, other = ((tmp_path / n / file).read_bytes() for n in ("a", "b", "c"))
-        assert first == again
-        assert first != other
+        first = (rows_folder / file).read_bytes()
+        assert first == (tmp_path / "again" / file).read_bytes()
+        assert first != (tmp_path / "other" / file).read_bytes()
 
 
 def test_discs_keep_apart_and_can_be_driven_past(rows_plan: RunPlan) -> None:
@@ -220,10 +226,12 @@ def test_existing_run_is_not_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["rows", str(tmp_path / "run"), "--frames", "5", "--discs", "4"]
-    assert main(arguments) == 0
-    first = (tmp_path / "run" / "map.circles").read_bytes()
-    capsys.readouterr()
+    calibration = tmp_path / "run" / "run.cam"
+    calibration.parent.mkdir()
+    calibration.write_text("mine")
     assert main(arguments) == 1
     assert "exists already" in capsys.readouterr().err
+    assert calibration.read_text() == "mine"
     assert main([*arguments, "--force"]) == 0
-    assert (tmp_path / "run" / "map.circles").read_bytes() == first
+    assert read_camera(calibration)
+    assert len(list(read_frames(tmp_path / "run" / "map.circles"))) == 5

@@ -9,86 +9,47 @@ import numba as nb
 import numpy as np
 
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.plane import compose
+from redetect.plane import between, compose
 from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _meet(
-    ox: float, oy: float, dx: float, dy: float, wall: FloatArray, nearest: np.float64
-) -> np.float64:
-    """Distance to a wall x1, y1, x2, y2 along a unit direction, if below `nearest`."""
-    ex, ey = wall[2] - wall[0], wall[3] - wall[1]
-    rx, ry = wall[0] - ox, wall[1] - oy
-    across = dx * ey - dy * ex
-    beside = rx * dy - ry * dx
-    # Both ends on the same side of the ray, or a wall along it, whose end its neighbour shows.
-    if beside * (beside - across) > 0.0 or across == 0.0:
-        return nearest
-    distance = (rx * ey - ry * ex) / across
-    if 0.0 < distance < nearest:
-        return np.float64(distance)
-    return nearest
-
-
-@nb.njit(cache=True, error_model="numpy")
-def cast_on_walls(
-    origins: FloatArray, directions: FloatArray, walls: FloatArray, ranges: FloatArray
-) -> None:
-    """Shorten ranges to the nearest wall.
-    `origins` (B, 2); `directions` (B,); `walls` (S, 4); `ranges` (B,).
+def cast_on_walls(rays: FloatArray, walls: FloatArray, ranges: FloatArray) -> None:
+    """Shorten the ranges (B,) of rays x, y, direction (B, 3) to the nearest wall.
+    `walls` (S, 4) are x1, y1, x2, y2.
     """
     for b in range(ranges.size):
-        dx, dy = np.cos(directions[b]), np.sin(directions[b])
-        nearest = ranges[b]
+        dx, dy = np.cos(rays[b, 2]), np.sin(rays[b, 2])
         for s in range(walls.shape[0]):
-            nearest = _meet(origins[b, 0], origins[b, 1], dx, dy, walls[s], nearest)
-        ranges[b] = nearest
-
-
-@nb.njit(cache=True, error_model="numpy")
-def cast_on_robot(
-    origins: FloatArray,
-    directions: FloatArray,
-    robot_poses: FloatArray,
-    sides: FloatArray,
-    ranges: FloatArray,
-) -> None:
-    """Shorten ranges to a polygon that stands elsewhere for every ray.
-    `origins`, `directions` (B, 2); `robot_poses` (B, 3); `sides` (K, 4); `ranges` (B,).
-    """
-    for b in range(ranges.size):
-        c, s = np.cos(robot_poses[b, 2]), np.sin(robot_poses[b, 2])
-        x, y = origins[b, 0] - robot_poses[b, 0], origins[b, 1] - robot_poses[b, 1]
-        ox, oy = c * x + s * y, c * y - s * x
-        angle = directions[b] - robot_poses[b, 2]
-        dx, dy = np.cos(angle), np.sin(angle)
-        nearest = ranges[b]
-        for k in range(sides.shape[0]):
-            nearest = _meet(ox, oy, dx, dy, sides[k], nearest)
-        ranges[b] = nearest
+            ex, ey = walls[s, 2] - walls[s, 0], walls[s, 3] - walls[s, 1]
+            rx, ry = walls[s, 0] - rays[b, 0], walls[s, 1] - rays[b, 1]
+            across = dx * ey - dy * ex
+            beside = rx * dy - ry * dx
+            # Both ends on the same side of the ray, or a wall along it, whose end its neighbour
+            # shows.
+            if beside * (beside - across) > 0.0 or across == 0.0:
+                continue
+            distance = (rx * ey - ry * ex) / across
+            if 0.0 < distance < ranges[b]:
+                ranges[b] = distance
 
 
 @nb.njit(cache=True, error_model="numpy")
 def cast_on_discs(
-    origins: FloatArray,
-    directions: FloatArray,
-    discs: FloatArray,
-    of_ray: IntArray,
-    ranges: FloatArray,
+    rays: FloatArray, discs: FloatArray, of_ray: IntArray, ranges: FloatArray
 ) -> None:
-    """Shorten ranges to discs that stand elsewhere from scan to scan.
-    `origins`, `directions` (B, 2); `discs` (N, D, 3); `of_ray` (B,); `ranges` (B,).
+    """Shorten the ranges (B,) of rays (B, 3) to discs that stand elsewhere from scan to scan.
+    `discs` (N, D, 3) are x, y, radius; `of_ray` (B,) is each ray's scan.
     """
     for b in range(ranges.size):
-        dx, dy = np.cos(directions[b]), np.sin(directions[b])
+        dx, dy = np.cos(rays[b, 2]), np.sin(rays[b, 2])
         here = discs[of_ray[b]]
         for d in range(here.shape[0]):
             radius = here[d, 2]
             if radius <= 0.0:
                 continue
-            x, y = here[d, 0] - origins[b, 0], here[d, 1] - origins[b, 1]
+            x, y = here[d, 0] - rays[b, 0], here[d, 1] - rays[b, 1]
             along = x * dx + y * dy
             across = x * dy - y * dx
             deep = radius * radius - across * across
@@ -128,22 +89,20 @@ def true_ranges(
         times = times_s[first : first + _AT_ONCE]
         count = len(times)
         of_ray = np.repeat(np.arange(count), readings)
-        origin = np.tile(scanner.pose, (count * readings, 1))
+        rays = np.tile(scanner.pose, (count * readings, 1))
         if carrier is not None:
-            origin = compose(_of_rays(carrier, times, sweep_s, share), origin)
-        directions = origin[:, 2] + np.tile(scanner.angles_rad, count)
-        origins = np.ascontiguousarray(origin[:, :2])
+            rays = compose(_of_rays(carrier, times, sweep_s, share), rays)
+        rays[:, 2] += np.tile(scanner.angles_rad, count)
         distances = np.full(count * readings, np.inf)
         if carrier is None:
-            cast_on_walls(origins[:readings], directions[:readings], scene.walls,
-                          distances[:readings])  # fmt: skip
+            cast_on_walls(rays[:readings], scene.walls, distances[:readings])
             distances = np.tile(distances[:readings], count)
         else:
-            cast_on_walls(origins, directions, scene.walls, distances)
+            cast_on_walls(rays, scene.walls, distances)
         if scene.robot_poses is not None:
             robot = _of_rays(scene.robot_poses, times, sweep_s, share)
-            cast_on_robot(origins, directions, robot, scene.sides, distances)
-        cast_on_discs(origins, directions, scene.legs(times), of_ray, distances)
+            cast_on_walls(between(robot, rays), scene.sides, distances)
+        cast_on_discs(rays, scene.legs(times), of_ray, distances)
         ranges[first : first + count] = distances.reshape(count, readings)
     return ranges
 
@@ -156,8 +115,8 @@ def _of_rays(
         return np.repeat(poses(times), len(share), axis=0)
     begin, end = poses(times - 0.5 * sweep_s), poses(times + 0.5 * sweep_s)
     weight = (share + 0.5)[:, None]
-    between = begin[:, None] * (1.0 - weight) + end[:, None] * weight
-    return np.asarray(between.reshape(-1, 3))
+    each = begin[:, None] * (1.0 - weight) + end[:, None] * weight
+    return np.asarray(each.reshape(-1, 3))
 
 
 def measured(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from camera.kernels import brown_shift_point, has_brown
+from camera.kernels import project_direction
 from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
 
 
@@ -40,40 +40,16 @@ _NEAREST = 1e-3
 
 
 @nb.njit(cache=True, error_model="numpy")
-def project_point(numbers: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
-    """Pixel of a point in the camera frame; both NaN where it is not seen.
-    `numbers` as `camera.kernels.camera_numbers` gives them.
-    """
-    if z < _NEAREST:
-        return math.nan, math.nan
-    x /= z
-    y /= z
-    r = math.sqrt(x * x + y * y)
-    if not r <= numbers[9]:
-        return math.nan, math.nan
-    factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
-        1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
-    )
-    u, v = numbers[0] * x * factor, numbers[1] * y * factor
-    if has_brown(numbers[22:27]):
-        x_shift, y_shift = brown_shift_point(
-            numbers[22], numbers[23], numbers[24], numbers[25], numbers[26], x, y
-        )
-        u += numbers[0] * x_shift
-        v += numbers[1] * y_shift
-    return u + numbers[2], v + numbers[3]
-
-
-@nb.njit(cache=True, error_model="numpy")
 def _texel_point(
     numbers: FloatArray, from_texel: FloatArray, a: float, b: float
 ) -> tuple[float, float]:
-    return project_point(
-        numbers,
-        from_texel[0, 0] * a + from_texel[0, 1] * b + from_texel[0, 2],
-        from_texel[1, 0] * a + from_texel[1, 1] * b + from_texel[1, 2],
-        from_texel[2, 0] * a + from_texel[2, 1] * b + from_texel[2, 2],
-    )
+    """Pixel of a place on a surface; both NaN where it is not seen."""
+    z = from_texel[2, 0] * a + from_texel[2, 1] * b + from_texel[2, 2]
+    if z < _NEAREST:
+        return math.nan, math.nan
+    x = from_texel[0, 0] * a + from_texel[0, 1] * b + from_texel[0, 2]
+    y = from_texel[1, 0] * a + from_texel[1, 1] * b + from_texel[1, 2]
+    return project_direction(numbers, x, y, z)
 
 
 @nb.njit(cache=True, error_model="numpy")

@@ -14,6 +14,7 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers
+from camera.uncertainty import with_pose
 from tools.arrays import ByteArray, Float32Array, FloatArray
 from tools.simulator.markers.kernels import SurfaceArrays, mark_edges, shade
 from tools.simulator.markers.surface import Surface, Texture, plain
@@ -58,7 +59,8 @@ def render_light(
         )
     if samples < 1 or samples & (samples - 1):
         raise ValueError(f"{samples} rays: expected a power of two")
-    rays, numbers = pixel_rays(camera), camera_numbers(camera)
+    # Surfaces are in the camera frame, wherever it is mounted.
+    rays, numbers = pixel_rays(camera), camera_numbers(with_pose(camera, np.eye(3, 4)))
     light = background.copy()
     if fine:
         light = np.repeat(np.repeat(background, 2, axis=0), 2, axis=1)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from camera import Camera
+from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
 from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.trajectories.transforms import planar_transform, transform
@@ -81,7 +82,7 @@ def robot_surfaces(rig: Rig, rng: np.random.Generator) -> list[Surface]:
     """All that is seen of the robot, in its own frame: first its boards in the rig's order."""
     known = marker_dictionary(rig.dictionary)
     boards = [
-        marker_surface(known, marker, float(width), pose, quiet_cells=_QUIET_CELLS, back=0.3)
+        marker_surface(known, marker, float(width), pose, _QUIET_CELLS)
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
     ]
     lifted = planar_transform(0.0, 0.0, 0.0)
@@ -113,7 +114,6 @@ def _panel(rng: np.random.Generator) -> Texture:
 
 CAMERA_NAMES = "abcd"
 
-_NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 _MARGIN_M = 1.6
 _HEIGHT_M = 3.2
 _COEF = (0.0, -0.13, 0.0, 0.12, 0.0)
@@ -140,7 +140,7 @@ def room_cameras(
         centre = 0.5 * (np.array([width, height]) - 1.0) + rng.normal(0.0, 0.006 * width, 2)
         cameras.append(
             Camera(width, height, focal, focal * rng.uniform(0.998, 1.002), float(centre[0]),
-                   float(centre[1]), _COEF, _NO_MOUNTING)
+                   float(centre[1]), _COEF, IDENTITY)
         )  # fmt: skip
     return tuple(cameras), np.stack(poses)
 

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from camera import Camera, format_camera, write_camera
+from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import marker_dictionary
 from redetect.groundtruth.trajectories.transforms import transform
 from tools.arrays import ByteArray, Float32Array, FloatArray
@@ -143,7 +144,6 @@ def backing_box(rng: np.random.Generator, card: Surface) -> list[Surface]:
     return box_sides((depth, across, upward), textures, card.pose @ box_against(foot))
 
 
-_NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 _MARKER_M = 0.2
 _WHITEST = 252.0
 _MOST_EXPOSURES = 8
@@ -221,8 +221,7 @@ def sample_cameras(width: int, height: int) -> tuple[Camera, ...]:
         (0.61, (-0.0620672, -0.324903, 0.314764, 1.52524, -0.480806)),
     )
     return tuple(
-        Camera(width, height, f * width, f * width, *centre, coef, _NO_MOUNTING)
-        for f, coef in lenses
+        Camera(width, height, f * width, f * width, *centre, coef, IDENTITY) for f, coef in lenses
     )
 
 
@@ -285,7 +284,7 @@ class _Scene:
         if placed is None:
             return
         pose = random_pose(rng, self.camera, placed.pixel, width_px, slant, _MARKER_M)
-        card = marker_surface(self.dictionary, marker_id, _MARKER_M, pose, quiet_cells=quiet)
+        card = marker_surface(self.dictionary, marker_id, _MARKER_M, pose, quiet)
         self.cards.append((len(self.surfaces), marker_id))
         self._put(card, placed, boxed)
         if boxed:

@@ -262,11 +262,9 @@ def view_robot(
     imaging = settings.imaging
     background = _shadowed(plan, camera, pose)
     light = render_light(model, exposures, background, fine=imaging.fine, samples=settings.samples)
-    illumination = plan.illumination(camera)
     rng = random_for(settings.seed, "frame", camera, noise)
-    image = grey_image(light, illumination, imaging, rng)
-    surfaces = _surfaces(plan, camera_from_world, pose)
-    return View(image, _markers(plan, model, surfaces, illumination, imaging.gain))
+    image = grey_image(light, plan.illumination(camera), imaging, rng)
+    return View(image, seen_markers(plan, camera, pose))
 
 
 def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray) -> list[Surface]:
@@ -316,13 +314,10 @@ def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     return darker
 
 
-def _markers(
-    plan: SessionPlan,
-    model: Camera,
-    surfaces: list[Surface],
-    illumination: Float32Array,
-    gain: float,
-) -> tuple[MarkerTruth, ...]:
+def seen_markers(plan: SessionPlan, camera: int, pose: FloatArray) -> tuple[MarkerTruth, ...]:
+    """The rig's markers that have any part in view of a camera. `pose` (3,)."""
+    model, illumination = plan.network.cameras[camera], plan.illumination(camera)
+    surfaces = _surfaces(plan, plan.camera_from_world[camera], pose)
     result = []
     arrays = surface_arrays(model, surfaces)
     for which, (marker, width) in enumerate(zip(plan.rig.ids, plan.rig.widths_m)):
@@ -335,7 +330,8 @@ def _markers(
             np.rint(corners.mean(axis=0)).astype(int), 0, [model.width - 1, model.height - 1]
         )
         lightest = float(np.nanmax(card.texture.values)) / WHITE
-        contrast = gain * float(illumination[v, u]) * (WHITE - BLACK) * lightest
+        light = plan.settings.imaging.gain * float(illumination[v, u])
+        contrast = light * (WHITE - BLACK) * lightest
         result.append(
             MarkerTruth(
                 plan.rig.dictionary, int(marker), corners, card.pose, float(width),

@@ -126,41 +126,28 @@ _TRIES = 64
 _FINE = 4
 
 
-def marker_texture(
-    dictionary: MarkerDictionary,
-    marker_id: int,
-    *,
-    quiet_cells: int = 1,
-    black: float = BLACK,
-    white: float = WHITE,
-) -> Texture:
+def marker_texture(dictionary: MarkerDictionary, marker_id: int, quiet_cells: int = 1) -> Texture:
     """A marker as it is printed, on a white card."""
     where = np.flatnonzero(dictionary.ids == marker_id)
     if len(where) == 0:
         raise ValueError(f"marker {marker_id}: not in {dictionary.name}")
-    return pattern_texture(dictionary, dictionary.patterns[where[0]], quiet_cells, black, white)
+    return pattern_texture(dictionary, dictionary.patterns[where[0]], quiet_cells)
 
 
-def pattern_texture(
-    dictionary: MarkerDictionary,
-    pattern: BoolArray,
-    quiet_cells: int = 1,
-    black: float = BLACK,
-    white: float = WHITE,
-) -> Texture:
-    """Any pattern laid out as the dictionary's markers are; parameters as in `marker_texture`."""
+def pattern_texture(dictionary: MarkerDictionary, pattern: BoolArray, quiet_cells: int) -> Texture:
+    """Any pattern laid out as the dictionary's markers are, on a white card."""
     cells = round(1.0 / dictionary.cell)
     first = dictionary.centres[0] * cells - 0.5
     # The cells of RAWSEEDS lie half a cell off the others' grid.
     per_cell = 1 if abs(first - round(first)) < 1e-9 else 2
     quiet = quiet_cells * per_cell
     side = cells * per_cell + 2 * quiet
-    values = np.full((side, side), white, dtype=np.float32)
-    values[quiet : side - quiet, quiet : side - quiet] = black
+    values = np.full((side, side), WHITE, dtype=np.float32)
+    values[quiet : side - quiet, quiet : side - quiet] = BLACK
     begin = quiet + round(first * per_cell)
     inner = np.repeat(np.repeat(pattern, per_cell, axis=0), per_cell, axis=1)
     end = begin + len(inner)
-    values[begin:end, begin:end][inner] = white
+    values[begin:end, begin:end][inner] = WHITE
     return Texture(values)
 
 
@@ -169,18 +156,12 @@ def marker_surface(
     marker_id: int,
     width_m: float,
     pose: FloatArray,
-    *,
     quiet_cells: int = 1,
-    black: float = BLACK,
-    white: float = WHITE,
-    back: float = 0.3,
 ) -> Surface:
     """A marker whose black square is `width_m` wide, as a card in space. `pose` (4, 4)."""
-    texture = marker_texture(
-        dictionary, marker_id, quiet_cells=quiet_cells, black=black, white=white
-    )
+    texture = marker_texture(dictionary, marker_id, quiet_cells)
     card_m = width_m * (1.0 + 2.0 * quiet_cells * dictionary.cell)
-    return Surface(pose, card_m, card_m, texture, back)
+    return Surface(pose, card_m, card_m, texture, back=0.3)
 
 
 def pattern_distance(dictionary: MarkerDictionary, pattern: BoolArray) -> int:

@@ -1,24 +1,24 @@
-"""Lasers against the truth: simulated sessions, and scans of a real log."""
+"""Lasers, clocks and fusion against the exact truth of simulated sessions."""
 
 from __future__ import annotations
 
-import gzip
 import io
 import json
 import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from tyro.conf import Positional, arg
+from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main as groundtruth
-from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
 from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
@@ -31,20 +31,19 @@ from redetect.groundtruth.lasers.tracking import (
     track_without_suspects,
 )
 from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
     matched_streams,
     pose_differences,
     read_planar_poses,
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
-from redetect.plane import between
 from tools.arrays import BoolArray, FloatArray
-from tools.evaluation.scan_matching import match_scans
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
 
-_COLUMNS = {
+_LASER_COLUMNS = {
     "sets": ".0f", "found": ".4f", "mm": ".2f", "max_mm": ".1f", "deg": "7.4f", "abs_deg": ".3f",
     "max_deg": ".2f", "nees": "6.3f", "lost_s": ".2f", "disturbed": ".3f", "scanner_mm": ".2f",
     "scanner_deg": ".3f", "scanner_nees": ".2f", "set_ms": ".3f", "speed": ".0f",
@@ -78,6 +77,8 @@ def table_of_sessions(
             continue
         rows.append([row[key] for key in columns])
         table.row(str(seed), *rows[-1])
+    if not rows:
+        raise GroundTruthError("no session is left: expected at least one")
     return table, np.array(rows)
 
 
@@ -98,7 +99,7 @@ class LaserSessions:
 
     def __call__(self) -> int:
         seeds = range(self.first, self.first + self.seeds)
-        table, rows = table_of_sessions(_COLUMNS, seeds, self._measured)
+        table, rows = table_of_sessions(_LASER_COLUMNS, seeds, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
@@ -180,80 +181,118 @@ def scanner_errors(found: tuple[Scanner, ...], exact: tuple[Scanner, ...]) -> di
     }
 
 
-def read_log(folder: Path, name: str, shortest_m: float) -> tuple[list[FloatArray], FloatArray]:
-    """Points of the scans and their reference poses. Returns `poses` (N, 3)."""
-    if not name:
-        names = sorted(p.name.removesuffix(".scans.csv.gz") for p in folder.glob("*.scans.csv.gz"))
-        if len(names) != 1:
-            raise GroundTruthError(f"{folder}: {len(names)} logs: expected one, or --log")
-        name = names[0]
-    meta = {"start_angle_rad": -np.pi / 2, "angle_step_rad": np.pi / 180, "max_range_m": 50.0}
-    described = folder / f"{name}.meta.json"
-    if described.is_file():
-        meta |= json.loads(described.read_text())
-    with gzip.open(folder / f"{name}.scans.csv.gz", "rt") as stream:
-        rows = np.loadtxt(stream, delimiter=",")
-    poses = np.loadtxt(folder / f"{name}.poses.csv", delimiter=",")
-    if len(rows) != len(poses) or not np.array_equal(rows[:, 0], poses[:, 0]):
-        raise GroundTruthError(f"{folder}: scans and poses of {name} are of different vertices")
-    ranges = rows[:, 2:]
-    angles = meta["start_angle_rad"] + meta["angle_step_rad"] * np.arange(ranges.shape[1])
-    beams = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    hit = (ranges > shortest_m) & (ranges < meta["max_range_m"])
-    return [r[h, None] * beams[h] for r, h in zip(ranges, hit)], poses[:, 1:4]
+Fault = Literal["none", "clock", "camera", "laser", "scanner", "crossing"]
+
+_CONTINUOUS_S = 0.5
+_FAULTS: dict[Fault, Faults] = {
+    "none": Faults(),
+    "clock": Faults(clock_jump_s=0.3),
+    "camera": Faults(lost_camera_s=20.0),
+    "laser": Faults(lost_laser_s=10.0),
+    "scanner": Faults(moved_scanner="fixed0", by=(0.05, 0.0, 0.0)),
+    "crossing": Faults(crossing=True),
+}
+
+
+_FUSION_COLUMNS = {
+    "clock_ms": ".2f", "clock_ppm": ".1f", "segments": ".0f", "laser_mm": ".2f",
+    "laser_rms_mm": ".2f", "laser_deg": ".3f", "laser_nees": ".2f", "camera_rms_mm": ".1f",
+    "seen_mm": ".2f", "seen_rms_mm": ".2f", "seen_deg": ".3f", "seen_nees": ".2f",
+    "bridged_mm": ".1f", "bridged_nees": ".2f", "instant_nees": ".2f", "rejected": ".0f",
+    "restarts": ".0f",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class LaserLog:
-    """Match the consecutive scans of a log from zero motion and print the errors."""
+class FusionStudy:
+    """Simulate sessions, run lasers, laser, sync and fuse, and compare each with the exact truth.
 
-    folder: Positional[Path]  # With the log's scans and poses.
-    log: str = ""  # Its name; by default that of the only ``*.scans.csv.gz``.
-    every: int = 1  # Only every so many-th pair.
-    heading_step_deg: float = 10.0
-    """Distance of the headings that the matching begins from; 360: only no motion at all."""
-    shortest_m: float = 0.05  # Shorter readings are taken for none.
-    worst: Annotated[int, arg(aliases=["-n"])] = 0  # So many of the worst pairs are listed.
+    Segments of the clock, the lasers' poses, fused poses where the laser sees the robot, bridged
+    ones, and the NEES at one instant of each session.
+    """
+
+    seeds: int = 20  # Seeds first, first + 1, ...
+    first: int = 1
+    fault: Fault = "none"
+    """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
+    a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
+    beside the robot."""
+    visits: int = 3
 
     def __call__(self) -> int:
-        points, poses = read_log(self.folder, self.log, self.shortest_m)
-        pairs = np.arange(0, len(points) - 1, self.every)
-        found = np.full((len(pairs), 3), np.nan)
-        share = np.zeros((len(pairs), 2))
-        ambiguous = np.zeros(len(pairs), dtype=np.bool_)
-        covariances = np.tile(np.eye(3), (len(pairs), 1, 1))
-        began = time.perf_counter()
-        for row, i in enumerate(pairs):
-            step_deg = self.heading_step_deg
-            with suppress(GeometryError):
-                match = match_scans(points[i + 1], points[i], heading_step_deg=step_deg)
-                ambiguous[row], covariances[row] = match.ambiguous, match.covariance
-                found[row], share[row] = match.pose, (match.explained, match.rival)
-        elapsed = time.perf_counter() - began
-        truth = between(poses[:-1], poses[1:])[pairs]
-        error = pose_differences(found, truth)
-        shift_m, turn_deg = np.hypot(*error[:, :2].T), np.degrees(np.abs(error[:, 2]))
-        shift_m, turn_deg = (np.where(np.isnan(e), np.inf, e) for e in (shift_m, turn_deg))
-        gross = (shift_m > 0.15) | (turn_deg > 3.0)
-        print(f"pairs {len(pairs)}, {1e3 * elapsed / len(pairs):.1f} ms each")
-        print(f"gross failures (> 0.15 m or > 3 deg): {100 * gross.mean():.2f} % ({gross.sum()})")
-        print(
-            f"gross failures that are not flagged: {100 * np.mean(gross & ~ambiguous):.2f} % "
-            f"({np.sum(gross & ~ambiguous)}); flagged: {np.sum(gross & ambiguous)} of them, "
-            f"{np.sum(~gross & ambiguous)} of {np.sum(~gross)} others"
-        )
-        rows = gross & np.isfinite(covariances).all(axis=(1, 2)) & ~np.isnan(found[:, 0])
-        if rows.any():
-            normalised = np.median(squared_mahalanobis(error[rows], covariances[rows])) / 3
-            print(f"gross failures: median squared error, normalised, {normalised:.1f}")
-        for percent in (50, 90, 95):
-            print(
-                f"{percent:3d} %: {np.percentile(shift_m, percent):.4f} m "
-                f"{np.percentile(turn_deg, percent):.3f} deg"
-            )
-        for row in np.argsort(-np.maximum(shift_m / 0.15, turn_deg / 3.0))[: self.worst]:
-            print(
-                f"pair {pairs[row]}: found {found[row].round(3)} reference {truth[row].round(3)} "
-                f"explained {share[row, 0]:.2f} rival {share[row, 1]:.2f}"
-            )
+        settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
+
+        def measured(session: Path, seed: int) -> dict[str, float]:
+            write_session(settings, session, seed=seed)
+            return errors_of_session(session)
+
+        seeds = range(self.first, self.first + self.seeds)
+        table, rows = table_of_sessions(_FUSION_COLUMNS, seeds, measured)
+        table.row("mean", *np.nanmean(rows, axis=0))
+        table.row("worst", *np.nanmax(rows, axis=0))
+        band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
+        print(f"95 % band of the mean NEES at one instant: {band[0]:.2f} to {band[1]:.2f}")
         return 0
+
+
+def errors_of_session(session: Path) -> dict[str, float]:
+    """Run the commands on one session and measure their results."""
+    at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
+    clock = session / "clock.json"
+    run_groundtruth("lasers", session)
+    run_groundtruth("laser", session)
+    run_groundtruth("sync", at["odometry"], at["laser"], "-o", clock)
+    streams = ["--laser", at["laser"], "--camera", at["camera"]]
+    run_groundtruth("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
+
+    truth = read_planar_poses(session / "truth.csv")
+    laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
+    seen = _seen_by(laser, fused.times_s)
+    alone = score_poses(*matched_streams(laser, truth))
+    inside = score_poses(*matched_streams(fused.only(seen), truth))
+    bridged = score_poses(*matched_streams(fused.only(~seen), truth))
+    instant = fused.only(np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
+    account = json.loads((session / "fused.json").read_text())
+    return {
+        **_clock_errors(session, list(read_clock(clock).segments)),
+        "laser_mm": 1e3 * alone.position_mean_m,
+        "laser_rms_mm": 1e3 * alone.position_rmse_m,
+        "laser_deg": float(np.degrees(alone.angle_sigma_rad)),
+        "laser_nees": alone.normalised_error,
+        "camera_rms_mm": 1e3 * score_poses(*matched_streams(camera, truth)).position_rmse_m,
+        "seen_mm": 1e3 * inside.position_mean_m,
+        "seen_rms_mm": 1e3 * inside.position_rmse_m,
+        "seen_deg": float(np.degrees(inside.angle_sigma_rad)),
+        "seen_nees": inside.normalised_error,
+        "bridged_mm": 1e3 * bridged.position_mean_m,
+        "bridged_nees": bridged.normalised_error,
+        "instant_nees": score_poses(*matched_streams(instant, truth)).normalised_error,
+        "rejected": float(len(account["rejected"])),
+        "restarts": float(len(account["restarts_s"])),
+    }
+
+
+def _seen_by(laser: PlanarPoses, times_s: FloatArray) -> BoolArray:
+    """Which times lie between poses of the laser that follow each other closely."""
+    after = np.clip(np.searchsorted(laser.times_s, times_s), 1, len(laser) - 1)
+    close = laser.times_s[after] - laser.times_s[after - 1] < _CONTINUOUS_S
+    inside = (times_s >= laser.times_s[0]) & (times_s <= laser.times_s[-1])
+    return np.asarray(close & inside)
+
+
+def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, float]:
+    """Largest errors of offset (ms) and rate (ppm) over the segments with turns."""
+    pieces = json.loads((session / "truth.json").read_text())["clock"]["pieces"]
+    turning = [segment for segment in segments if segment.status != "no turns"]
+    offsets, rates = [], []
+    for segment in turning:
+        begun = [p for p in pieces if p["from_s"] is None or p["from_s"] <= segment.reference_s]
+        piece = begun[-1]
+        exact = piece["offset_s"] + piece["drift"] * (segment.reference_s - piece["reference_s"])
+        offsets.append(1e3 * abs(segment.offset_s - exact))
+        rates.append(1e6 * abs(segment.rate - 1.0 - piece["drift"]))
+    return {
+        "clock_ms": max(offsets, default=np.nan),
+        "clock_ppm": max(rates, default=np.nan),
+        "segments": float(len(turning)),
+    }

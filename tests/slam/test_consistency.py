@@ -1,0 +1,113 @@
+"""Normalised estimation error squared (NEES) of both filters' poses, over seeded simulated runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from redetect.array_types import FloatArray
+from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
+from redetect.slam.filters.frames import FilterRun, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
+from tests.slam.ekf_rows import NOTHING
+from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
+
+pytestmark = pytest.mark.long
+
+RUNS = 50
+#: Enough for what is far outside the band.
+FEW_RUNS = 20
+
+Estimate = Callable[[SmallRun, int], FilterRun]
+
+
+def band(runs: int) -> tuple[float, float]:
+    """Where 95 % of the means of `runs` NEES of poses lie if the covariances are right."""
+    low, high = chi2.interval(0.95, 3 * runs)
+    return low / runs, high / runs
+
+
+def localized(sigma_m: float, map_errors: MapErrors) -> Estimate:
+    """Localisation in the true map, or in one with errors that it states."""
+
+    def estimate(run: SmallRun, seed: int) -> FilterRun:
+        rng = np.random.default_rng([seed, 1])
+
+        def measured(xy: FloatArray) -> Landmarks:
+            noisy = xy + sigma_m * rng.standard_normal(xy.shape)
+            covariance = np.tile(sigma_m**2 * np.eye(2), (len(xy), 1, 1))
+            ones = np.ones(len(xy), dtype=np.int64)
+            return Landmarks(1 + np.arange(len(xy)), noisy, covariance, ones)
+
+        known = LandmarkMap(discs=measured(run.disc_xy), lines=measured(run.line_xy))
+        localizer = Localizer(known, camera_xy=CAMERA_XY, map_errors=map_errors)
+        return run_filter(run.recording, localizer)
+
+    return estimate
+
+
+def mapped(jacobians: JacobiansAt) -> Estimate:
+    """EKF-SLAM."""
+    return lambda run, _: run_ekf(run.recording, EkfSlam(camera_xy=CAMERA_XY, jacobians=jacobians))
+
+
+def mean_nees(
+    estimate: Estimate, runs: int, *, lines: bool = False, noise: float = 1.0, turn: float = 0.006
+) -> FloatArray:
+    """(N,) NEES of the pose after each step, mean of all runs; expected is 3."""
+    nees = []
+    for seed in range(runs):
+        run = _run(seed, noise, turn)
+        if not lines:
+            run = replace(run, recording=replace(run.recording, lines=NOTHING))
+        path = estimate(run, seed).path
+        assert path.covariance is not None
+        error = path.poses[1:] - run.poses[1:]
+        error[:, 2] = wrap_angle(error[:, 2])
+        nees.append(squared_mahalanobis(error, path.covariance[1:]))
+    return np.asarray(np.mean(nees, axis=0))
+
+
+@cache
+def _run(seed: int, noise: float, turn: float) -> SmallRun:
+    return small_run(seed, noise, turn_sigma_rad=turn)
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [localized(0.0, "considered"), localized(0.05, "considered"), mapped("first")],
+    ids=["localizer, exact map", "localizer, map of 5 cm", "EKF-SLAM"],
+)
+@pytest.mark.parametrize("lines", [False, True])
+def test_errors_are_as_large_as_covariances_say(estimate: Estimate, lines: bool) -> None:
+    nees = mean_nees(estimate, RUNS, lines=lines)
+    low, high = band(RUNS)
+    # Means of successive steps are correlated: so many of them leave the band together.
+    assert np.mean((nees >= low) & (nees <= high)) > 0.85
+    assert 2.5 < nees.mean() < 3.5
+    assert low < nees[-6:].mean() < high
+
+
+@pytest.mark.parametrize(
+    ("estimate", "noise", "turn"),
+    [
+        (localized(0.05, "ignored"), 1.0, 0.006),
+        (localized(0.05, "white"), 1.0, 0.006),
+        (localized(0.0, "considered"), 1.44, 0.006),
+        (mapped("first"), 1.44, 0.006),
+        (mapped("latest"), 1.0, 0.1),
+    ],
+    ids=["map errors ignored", "map errors white", "localizer", "EKF-SLAM", "heading error"],
+)
+def test_what_is_wrong_shows(estimate: Estimate, noise: float, turn: float) -> None:
+    nees = mean_nees(estimate, FEW_RUNS, noise=noise, turn=turn)
+    low, high = band(FEW_RUNS)
+    assert np.mean((nees >= low) & (nees <= high)) < 0.5
+    assert nees.mean() > high
