@@ -31,13 +31,13 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import Polynomial as PowerSeries
-from numpy.typing import NDArray
+
+from redetect.array_types import FloatArray
 
 Coef = tuple[float, float, float, float, float]
 Polynomial = tuple[float, float, float]
 Brown = tuple[float, float, float, float, float]
 Tangential = tuple[float, float]
-FloatArray = NDArray[np.float64]
 
 NO_POLYNOMIAL: Polynomial = (0.0, 0.0, 0.0)
 NOT_TANGENTIAL: Tangential = (0.0, 0.0)
@@ -297,13 +297,3 @@ def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) 
     lens = np.array([*coef, *brown, r_max])
     straighten_points(lens, seen, np.interp(radius, seen_there, there), straight)
     return straight.reshape(np.shape(distorted))
-
-
-def first_unseen(border: FloatArray, coef: Coef, brown: Brown) -> int:
-    """Index of the first of (N, 2) distorted normalised places at which nothing is seen; -1: none.
-
-    The visible region has no holes: it contains an image whose border it contains.
-    """
-    r_max = one_to_one_radius(coef, brown)
-    unseen = np.isnan(straightened(border, coef, brown, r_max)[:, 0])
-    return int(np.argmax(unseen)) if unseen.any() else -1

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, fit_points
 from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
+from redetect.array_types import IntArray
 from redetect.least_squares.solver import StartError
-
-IntArray = NDArray[np.int64]
 
 _FOLDS = 8
 # An additional coefficient must lower the sum of squared hold-out errors by this many variances.
@@ -159,7 +157,7 @@ def holdout_error(
     For held-out points only the poses are fitted. Each view is in one of the `folds`, by default
     every `_FOLDS`-th.
     """
-    every = np.arange(len(points.starts))
+    every = np.arange(len(points.counts))
     if folds is None:
         number = min(_FOLDS, len(every))
         folds = [every[every % number == fold] for fold in range(number)]

@@ -13,13 +13,13 @@ from camera.calibration.adjustment import project_estimate
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
+from redetect.array_types import FloatArray
 from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 _ARROW_SHARE = 0.05
 
@@ -128,8 +128,7 @@ _STEPS = 400
 def drawn_corners(image: Picture, calibration: Calibration, view: int) -> Picture:
     """A board's points where they were found (circles) and where they project (crosses)."""
     points, estimate = calibration.points, calibration.adjusted.estimate
-    first = int(points.starts[view])
-    rows = slice(first, first + int(points.counts[view]))
+    rows = points.views == view
     found = points.pixels[rows]
     projected = project_estimate(estimate, points)[0][rows]
     picture, scale = _enlarged(image)

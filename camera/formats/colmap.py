@@ -13,7 +13,7 @@ import pycolmap
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from camera.formats.yaml_files import foreign, shortest
+from camera.formats.yaml_files import foreign, name_of_one, shortest
 from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5
@@ -63,13 +63,7 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
                     f"after line {rows[fields[0]][0]}: expected different numbers"
                 )
             rows[fields[0]] = (number, fields)
-    held = one_line(", ".join(rows), _LONGEST_LIST)
-    if camera_name and camera_name not in rows:
-        raise ConversionError(f"{name}: no camera {camera_name}: it holds {held}")
-    if not camera_name and len(rows) != 1:
-        there = f"it holds {held}: give --camera-name" if rows else "it holds none"
-        raise ConversionError(f"{name}: expected one camera, {there}")
-    number, fields = rows[camera_name or next(iter(rows))]
+    number, fields = rows[name_of_one(list(rows), camera_name, name)]
     where = f"{name}:{number}"
     try:
         width, height = int(fields[2]), int(fields[3])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,31 +15,9 @@ import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt, one_line
 
-_LARGEST_FILE_BYTES = 1 << 20
 _MOST_CAMERAS = 1000
-
-
-def read_content(path: Path) -> bytes:
-    """The content of a calibration file."""
-    try:
-        return read_bounded(path, _LARGEST_FILE_BYTES)
-    except FileNotFoundError:
-        raise ConversionError(f"{path}: no such calibration file") from None
-    except OSError as error:
-        raise ConversionError(
-            f"{path}: cannot be read as a calibration: {error.strerror}"
-        ) from None
-
-
-def text_of(content: bytes, name: str) -> str:
-    """The content of a calibration file as text."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConversionError(f"{name}: is no text: expected a calibration") from None
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
@@ -197,6 +174,17 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
     return "radtan" if count <= 5 else "rational"
 
 
+def name_of_one(held: Sequence[str], camera_name: str, name: str, what: str = "camera") -> str:
+    """The name of the camera that is asked for of those that a file holds, or of the only one."""
+    listed = one_line(", ".join(held), _LONGEST_LIST) or "none"
+    if camera_name and camera_name not in held:
+        raise ConversionError(f"{name}: no camera {camera_name}: it holds {listed}")
+    if not camera_name and len(held) != 1:
+        advice = ": give --camera-name" if held else ""
+        raise ConversionError(f"{name}: expected one {what}: it holds {listed}{advice}")
+    return camera_name or held[0]
+
+
 def foreign(
     name: str,
     model: Model,
@@ -348,15 +336,7 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     content = parse_yaml(text, name)
     cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
     cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
-    held = one_line(", ".join(cameras), _LONGEST_LIST)
-    if camera_name:
-        if camera_name not in cameras:
-            raise ConversionError(f"{name}: no {camera_name}: it holds {held}")
-    elif len(cameras) != 1:
-        there = f"it holds {held}: give --camera-name" if cameras else "it holds none"
-        raise ConversionError(f"{name}: expected one camera (cam0 with intrinsics), {there}")
-    else:
-        camera_name = next(iter(cameras))
+    camera_name = name_of_one(list(cameras), camera_name, name, "camera (cam0 with intrinsics)")
     entry: dict[str, Any] = cameras[camera_name]
     where = f"{name}: {one_line(camera_name, _LONGEST_LIST)}"
     if entry.get("camera_model", "pinhole") != "pinhole":

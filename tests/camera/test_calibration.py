@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.boards.board import Board
@@ -35,8 +34,6 @@ from camera.uncertainty import (
 )
 from tools.evaluation.boards import board_poses, projection_difference
 from tools.evaluation.calibration import monte_carlo
-
-FloatArray = NDArray[np.float64]
 
 BOARD = Board("checkerboard", 9, 6, 0.04)
 HALF = CalibrationSettings(aspect=0.5)
@@ -260,7 +257,7 @@ def test_pose_covariance_is_what_repetition_shows(published_camera: Camera) -> N
     nees = []
     for _ in range(150):
         noisy = exact + rng.normal(scale=0.1, size=exact.shape)
-        points = Points(BOARD.points, noisy, np.zeros(1, dtype=np.int64), 768, 288)
+        points = Points(BOARD.points, noisy, np.zeros(len(noisy), dtype=np.int64), 768, 288)
         fit = adjust(truth, points, np.zeros((COUNT, 0)), robust=False, sigma_px=0.1)
         turn = fit.estimate.rotations[0] @ R.T
         vector = 0.5 * np.array(
@@ -276,7 +273,7 @@ def test_circles_shift_is_that_of_the_rendered_area(published_camera: Camera) ->
     R, t = board_poses(published_camera, board, 1, 2, distances_m=(0.2, 0.25))[0]
     truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
     centres = published_camera.project(board.points @ R.T + t)
-    points = Points(board.points, centres, np.zeros(1, dtype=np.int64), 768, 288)
+    points = Points(board.points, centres, np.zeros(len(centres), dtype=np.int64), 768, 288)
     shifts = circle_shifts(truth, points, 0.015)
     # By brute force: the middle of all fine pixels whose ray meets the first circle.
     u, v = np.round(centres[0])
@@ -346,7 +343,7 @@ def test_parallel_boards_are_refused() -> None:
 
 def test_what_of_the_image_was_not_covered_is_told(published_camera: Camera) -> None:
     pixels = np.random.default_rng(0).uniform([10, 10], [500, 180], size=(500, 2))
-    points = Points(np.zeros((500, 3)), pixels, np.zeros(1, dtype=np.int64), 768, 288)
+    points = Points(np.zeros((500, 3)), pixels, np.zeros(500, dtype=np.int64), 768, 288)
     told = "\n".join(coverage_warnings(intrinsics_of(published_camera), points))
     assert "bottom left" in told
     assert "top right" in told

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.distortion import largest_distorted_radius
@@ -26,11 +25,9 @@ from lut import (
     ring,
 )
 from lut.outlines import floor_positions
+from redetect.array_types import BoolArray, IntArray
 from redetect.landmarks import read_frames
 from tests.camera.strategies import cameras
-
-IntArray = NDArray[np.int64]
-
 
 # -- the reference --------------------------------------------------------------------------------
 
@@ -44,8 +41,8 @@ class Outlines:
 
     column: IntArray
     row: IntArray
-    inside: NDArray[np.bool_]
-    usable: NDArray[np.bool_]
+    inside: BoolArray
+    usable: BoolArray
     doubtful: bool
 
 

@@ -122,7 +122,7 @@ def monte_carlo(
         np.concatenate(
             [camera.project(board.points[k] @ R.T + t) for k, (R, t) in zip(chosen, poses)]
         ),
-        np.arange(views) * count,
+        np.repeat(np.arange(views), count),
         camera.width,
         camera.height,
     )
@@ -206,15 +206,16 @@ def opencv_holdout(
     """RMS error (px) in the photographs left out, by OpenCV: their poses alone are fitted."""
     import cv2
 
-    every = np.arange(len(points.starts))
+    every = np.arange(len(points.counts))
     flags = cv2.CALIB_RATIONAL_MODEL if rational else 0
     flags |= 0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST
     squares = 0.0
     size = (points.width, points.height)
     for out in folds:
         used = points.of(np.setdiff1d(every, out))
-        board = [used.board[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
-        seen = [used.pixels[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
+        rows = [used.views == view for view in range(len(used.counts))]
+        board = [used.board[chosen].astype(np.float32) for chosen in rows]
+        seen = [used.pixels[chosen].astype(np.float32) for chosen in rows]
         _, K, d, _, _ = cv2.calibrateCamera(
             board, seen, size, np.eye(3), np.zeros(8 if rational else 5), flags=flags
         )
@@ -257,9 +258,9 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
             "radial": opencv_holdout(points, folds, rational=True, tangential=False),
             "five": opencv_holdout(points, folds, rational=False),
         }
-        for name, folds in splits(len(points.starts)).items()
+        for name, folds in splits(len(points.counts)).items()
     }
-    return Comparison(len(points.starts), len(points.board), lens, errors)
+    return Comparison(len(points.counts), len(points.board), lens, errors)
 
 
 def _square(*distortion: float) -> ForeignCamera:
