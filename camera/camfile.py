@@ -118,11 +118,10 @@ def format_camera(camera: Camera) -> str:
         f"scaleX: {_shortest(camera.scale_x)} scaleY: {_shortest(camera.scale_y)} "
         f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
     )
-    lines.append(f"coef: {{ {' '.join(_shortest(c) for c in camera.coef)} }}")
-    if camera.decentred:
-        lines.append(f"tangential: {{ {' '.join(_shortest(p) for p in camera.tangential)} }}")
-    if any(camera.polynomial):
-        lines.append(f"polynomial: {{ {' '.join(_shortest(k) for k in camera.polynomial)} }}")
+    for key in ("coef", "tangential", "polynomial"):
+        terms = getattr(camera, key)
+        if key == "coef" or any(terms):
+            lines.append(f"{key}: {{ {' '.join(map(_shortest, terms))} }}")
     if camera.covariance is not None:
         ends = [row * (row + 1) // 2 for row in range(PARAMETERS + 1)]
         rows = [camera.covariance[first:last] for first, last in pairwise(ends)]

@@ -103,6 +103,10 @@ class Estimate:
     rotations: FloatArray
     translations: FloatArray
 
+    def of(self, views: IntArray) -> Estimate:
+        """With the poses of some views only."""
+        return Estimate(self.intrinsics, self.rotations[views], self.translations[views])
+
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:

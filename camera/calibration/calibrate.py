@@ -17,7 +17,7 @@ from camera.calibration.adjustment import (
     fit_points,
     project_estimate,
 )
-from camera.calibration.choice import choose_lens, of_views
+from camera.calibration.choice import choose_lens
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg
 from camera.errors import CalibrationError
@@ -208,16 +208,15 @@ def calibrate(
     demand_enough(len(views))
     measured = points_of(views, board, size)
     names = tuple(view.name for view in views)
+    radius = 0.5 * board.circle_m
     try:
         start = first_estimate(measured, settings.aspect)
+        start = _staged(start, measured, settings, radius)
     except StartError:
         raise CalibrationError(
             "no camera explains the points found: are --columns, --rows and the kind of --board "
             "right, and do all pictures show the same board by the same camera at the same zoom?"
         ) from None
-    radius = 0.5 * board.circle_m
-    start = _staged(start, measured, settings, radius)
-
     outliers: tuple[tuple[str, float], ...] = ()
     # Outliers are detected with the fullest model: residuals of a simpler one are partly its own.
     most = settings.most
@@ -238,7 +237,7 @@ def calibrate(
         demand_enough(len(kept), f" without {', '.join(name for name, _ in outliers)}")
         names = tuple(names[v] for v in kept)
         measured = measured.of(kept)
-        start = of_views(start, kept)
+        start = start.of(kept)
     measured, wrong = _without_wrong_points(start, measured, first[0].sigma_px, settings, radius)
 
     lens, tried = choose_lens(start, measured, settings, radius)

@@ -140,11 +140,6 @@ def tangential_significance(adjusted: Adjusted) -> float:
     return float(found @ np.linalg.pinv(covariance) @ found)
 
 
-def of_views(estimate: Estimate, views: IntArray) -> Estimate:
-    """An estimate with the poses of some views only."""
-    return Estimate(estimate.intrinsics, estimate.rotations[views], estimate.translations[views])
-
-
 def holdout_error(
     estimate: Estimate,
     points: Points,
@@ -165,9 +160,9 @@ def holdout_error(
     span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
     for out in folds:
         used = np.setdiff1d(every, out)
-        fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
+        fit = adjust(estimate.of(used), points.of(used), span, robust=settings.robust)
         held = points.of(out)
-        there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)
+        there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
             test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point lies past this fit's fold

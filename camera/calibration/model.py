@@ -58,8 +58,9 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's border must be seen at radii that stay below the fold by this share.
 _FOLD_MARGIN = 0.01
-# Number of directions in which a lens's limit is computed, and of places on each side of the image.
-_DIRECTIONS = 128
+# Directions in which a lens's limit is computed, and number of places on each side of the image.
+_ANGLES = np.linspace(-np.pi, np.pi, 128)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _BORDER_PLACES = 9
 
 
@@ -131,8 +132,7 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
         return False
     coef, brown = lens_of(intrinsics)
     r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
-    angle = np.linspace(-np.pi, np.pi, _DIRECTIONS)
-    edge = r_max * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    edge = r_max * _DIRECTIONS
     edge = edge * radial_factor(np.array(r_max), coef) + brown_shift(edge, brown)
     border = border_pixels(width, height, _BORDER_PLACES)
     border = (border - intrinsics[2:4]) / intrinsics[:2]

@@ -99,9 +99,9 @@ def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
         pass
     rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
     for view in range(len(points.counts)):
-        one = Estimate(estimate.intrinsics, rotations[[view]], translations[[view]])
+        one = np.array([view])
         try:
-            fit = adjust(one, points.of(np.array([view])), nothing, tolerance=_LOOSE).estimate
+            fit = adjust(estimate.of(one), points.of(one), nothing, tolerance=_LOOSE).estimate
         except (StartError, np.linalg.LinAlgError):
             continue
         rotations[view], translations[view] = fit.rotations[0], fit.translations[0]

@@ -102,6 +102,21 @@ def whole(value: Any, key: str, name: str) -> int:
     return value
 
 
+def image_size(content: dict[str, Any], name: str) -> tuple[int, int]:
+    """Width and height of the images, as OpenCV or ROS name them."""
+    sides = []
+    for side in ("width", "height"):
+        key = f"image_{side}"
+        found = [content[k] for k in (key, f"image_{side.title()}", side) if k in content]
+        if not found:
+            # OpenCV itself does not require the size; its stereo sample writes none.
+            raise ConversionError(
+                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
+            )
+        sides.append(whole(found[0], key, name))
+    return sides[0], sides[1]
+
+
 def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a 3 x 3 camera matrix without skew."""
     m = numbers(value, key, name)
@@ -137,15 +152,7 @@ _FISHEYE = ("1", "true", "fisheye", "equidistant")
 def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of an OpenCV YAML file."""
     content = parse_yaml(text, name)
-    sides = []
-    for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
-        if key not in content and other not in content:
-            # OpenCV itself does not require the size; its stereo sample writes none.
-            raise ConversionError(
-                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
-            )
-        sides.append(whole(first_of(content, (key, other), name), key, name))
-    width, height = sides
+    width, height = image_size(content, name)
     fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
     d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
     kind = content.get("fisheye_model", content.get("distortion_model", 0))
@@ -255,20 +262,15 @@ def camera_from_message(
             f"{', '.join(_ROS_MODELS)}"
         )
     model = _ROS_MODELS[label]
-    allowed = {"radtan": (0, 4, 5), "rational": (8, 12, 14), "fisheye": (4,)}[model]
-    if len(d) not in allowed or any(d[12:]):
-        raise ConversionError(
-            f"{name}: {len(d)} coefficients of {label}: expected "
-            f"{' or '.join(str(count) for count in allowed)}, without tilt"
-        )
+    if opencv_model(d, fisheye=model == "fisheye", name=name) != model:
+        raise ConversionError(f"{name}: {len(d)} coefficients, which are not of {label}")
     return foreign(name, model, width, height, pinhole, d)
 
 
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of a camera_info YAML file, or of an echoed message."""
     content = parse_yaml(text, name)
-    width = whole(first_of(content, ("image_width", "width"), name), "image_width", name)
-    height = whole(first_of(content, ("image_height", "height"), name), "image_height", name)
+    width, height = image_size(content, name)
     for key in ("binning_x", "binning_y"):
         binning = content.get(key)
         if isinstance(binning, int) and binning > 1:

@@ -64,7 +64,7 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool 
 def read_content(
     path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
 ) -> bytes:
-    """The content of a file of a kind; what is wrong with it (`read_bounded`) becomes an `error`."""
+    """The content of a file of a kind; what `read_bounded` refuses becomes an `error`."""
     try:
         return read_bounded(path, largest_bytes)
     except FileNotFoundError:

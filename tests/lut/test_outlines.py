@@ -14,7 +14,6 @@ from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
 from camera import Camera
-from camera.distortion import largest_distorted_radius
 from lut import (
     GROUP_COLUMNS,
     GROUP_SAMPLES,
@@ -27,7 +26,7 @@ from lut import (
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, IntArray
 from redetect.landmarks import read_frames
-from tests.camera.strategies import cameras
+from tests.camera.strategies import cameras, largest_distorted_radius
 
 # -- the reference --------------------------------------------------------------------------------
 

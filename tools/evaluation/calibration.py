@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -240,8 +241,23 @@ class Comparison:
     without p1 and p2 (`radial`), and its k1 k2 p1 p2 k3 (`five`)."""
 
 
-def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = False) -> Comparison:
-    """Hold out photographs of a camera, by each of `splits`."""
+#: OpenCV's models, by their names in `Comparison.errors`.
+OPENCV: dict[str, dict[str, bool]] = {
+    "rational": {"rational": True},
+    "radial": {"rational": True, "tangential": False},
+    "five": {"rational": False},
+}
+
+
+def compare(
+    folder: Path,
+    group: str,
+    *,
+    free_aspect: bool,
+    polynomial: bool = False,
+    peers: Sequence[str] = tuple(OPENCV),
+) -> Comparison:
+    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
@@ -254,9 +270,7 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
     errors = {
         name: {
             "ours": holdout_error(estimate, points, settings, lens, folds),
-            "rational": opencv_holdout(points, folds, rational=True),
-            "radial": opencv_holdout(points, folds, rational=True, tangential=False),
-            "five": opencv_holdout(points, folds, rational=False),
+            **{peer: opencv_holdout(points, folds, **OPENCV[peer]) for peer in peers},
         }
         for name, folds in splits(len(points.counts)).items()
     }
