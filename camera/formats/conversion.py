@@ -25,7 +25,7 @@ EXACT_PX = 1e-6
 _LAWSON_ROUNDS = 25
 _STEPS = 60
 _LAWSON_STEPS = 5
-# Distance that impossible parameters count as, so that no step leads there.
+# What parameters count as that cannot be or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
 
 
@@ -75,16 +75,21 @@ class CameraFit(NamedTuple):
 
         def away(moved: FloatArray) -> FloatArray:
             at = start + span @ moved
-            if not self.possible(at):
-                return np.full(self.pixels.size, _REFUSED_PX)
-            return np.asarray(root * (self.project(at)[0] - self.pixels)).ravel()
+            if self.possible(at):
+                found = np.asarray(root * (self.project(at)[0] - self.pixels)).ravel()
+                if np.all(np.isfinite(found)):
+                    return found
+            return np.full(self.pixels.size, _REFUSED_PX)
 
         def jacobian(moved: FloatArray) -> FloatArray:
             by = root[..., None] * (self.project(start + span @ moved)[1] @ span)
             return np.asarray(by).reshape(-1, span.shape[1])
 
+        begin = np.zeros(span.shape[1])
+        if away(begin)[0] == _REFUSED_PX:
+            return start
         found = least_squares(
-            away, np.zeros(span.shape[1]), jacobian, method="lm", x_scale="jac", ftol=1e-9,
+            away, begin, jacobian, method="lm", x_scale="jac", ftol=1e-9,
             max_nfev=_STEPS if weights is None else _LAWSON_STEPS,
         )  # fmt: skip
         return np.asarray(start + span @ found.x)
