@@ -58,8 +58,7 @@ def check_numbers(camera: Camera) -> None:
 def check_one_to_one(camera: Camera) -> None:
     """Refuse a distortion that folds so far inside the image that less than half of it is left."""
     beyond = _first_unseen(camera)
-    share = seen_share(camera)
-    if beyond is None or share >= LEAST_SEEN_SHARE:
+    if beyond is None or (share := seen_share(camera)) >= LEAST_SEEN_SHARE:
         return
     parts = (("tangential", "p1 p2"), ("polynomial", "k1 k2 k3"))
     terms = ", ".join(

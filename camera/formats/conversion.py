@@ -216,9 +216,9 @@ def convert_to_camera(
 ) -> Converted:
     """Convert to the project's model, exactly or by a fit.
 
-    A polynomial and tangential terms without a denominator are copied. Else the
-    rational part is fitted beside the source's tangential terms and, where it comes not near, all
-    of them and a polynomial together.
+    A polynomial and tangential terms without a denominator are copied. Else the rational part is
+    fitted beside the source's tangential terms and, where it comes not near, all of them and a
+    polynomial together.
 
     Parameters
     ----------
