@@ -5,15 +5,9 @@
 >>> camera.floor_from_pixel([384, 200])             # doctest: +SKIP
 """
 
-from camera.camfile import format_camera, parse_camera, read_camera, write_camera
-from camera.errors import CameraError
-from camera.model import Camera
-
-__all__ = [
-    "Camera",
-    "CameraError",
-    "format_camera",
-    "parse_camera",
-    "read_camera",
-    "write_camera",
-]
+from camera.camfile import format_camera as format_camera
+from camera.camfile import parse_camera as parse_camera
+from camera.camfile import read_camera as read_camera
+from camera.camfile import write_camera as write_camera
+from camera.errors import CameraError as CameraError
+from camera.model import Camera as Camera

@@ -12,16 +12,16 @@ from __future__ import annotations
 import os
 import re
 from itertools import pairwise
-from pathlib import Path
 
 from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
 from redetect.storage import write_bytes
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_text
 
 CLASS_NAME = "SmRadialDistortedCamera"
-_LARGEST_FILE_BYTES = 1 << 20
+#: More than any calibration has.
+LARGEST_FILE_BYTES = 1 << 20
 _LARGEST_EXCERPT = 40
 
 _TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
@@ -52,16 +52,8 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
         If the file cannot be read or does not describe a possible camera; the message names the
         file and, if a single line is wrong, the line.
     """
-    path = Path(path)
-    try:
-        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig")
-    except FileNotFoundError:
-        raise CameraError(f"{path}: no such calibration file") from None
-    except OSError as error:
-        raise CameraError(f"{path}: cannot be read as a .cam file: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise CameraError(f"{path}: cannot be read as a .cam file: it is no text") from None
-    return parse_camera(text, name=str(path))
+    text = read_text(path, LARGEST_FILE_BYTES, "calibration file", CameraError)
+    return parse_camera(text, name=os.fspath(path))
 
 
 def parse_camera(text: str, name: str = "<text>") -> Camera:
@@ -126,11 +118,10 @@ def format_camera(camera: Camera) -> str:
         f"scaleX: {_shortest(camera.scale_x)} scaleY: {_shortest(camera.scale_y)} "
         f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
     )
-    lines.append(f"coef: {{ {' '.join(_shortest(c) for c in camera.coef)} }}")
-    if camera.decentred:
-        lines.append(f"tangential: {{ {' '.join(_shortest(p) for p in camera.tangential)} }}")
-    if any(camera.polynomial):
-        lines.append(f"polynomial: {{ {' '.join(_shortest(k) for k in camera.polynomial)} }}")
+    for key in ("coef", "tangential", "polynomial"):
+        terms = getattr(camera, key)
+        if key == "coef" or any(terms):
+            lines.append(f"{key}: {{ {' '.join(map(_shortest, terms))} }}")
     if camera.covariance is not None:
         ends = [row * (row + 1) // 2 for row in range(PARAMETERS + 1)]
         rows = [camera.covariance[first:last] for first, last in pairwise(ends)]

@@ -30,14 +30,14 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import Polynomial as PowerSeries
-from numpy.typing import NDArray
+from numpy.polynomial.polynomial import polyroots
+
+from redetect.array_types import FloatArray
 
 Coef = tuple[float, float, float, float, float]
 Polynomial = tuple[float, float, float]
 Brown = tuple[float, float, float, float, float]
 Tangential = tuple[float, float]
-FloatArray = NDArray[np.float64]
 
 NO_POLYNOMIAL: Polynomial = (0.0, 0.0, 0.0)
 NOT_TANGENTIAL: Tangential = (0.0, 0.0)
@@ -102,19 +102,19 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     Past it the image folds back on itself and the projection is undefined.
     """
     a2, a3, b1, b2, b3 = coef
-    r = PowerSeries([0.0, 1.0])
-    numerator = PowerSeries([0.0, a2, a3])
-    denominator = PowerSeries([1.0, b1, b2, b3])
-    # g' * D^2; at r = 0 it is 1, so g grows until the first positive root.
-    growth = (
-        denominator**2
-        + numerator * denominator
-        + r * (numerator.deriv() * denominator - numerator * denominator.deriv())
-    )
+    # Coefficients of the powers of r, from 0 on.
+    numerator, its_slope = np.array([0.0, a2, a3]), np.array([a2, 2.0 * a3])
+    denominator, slope = np.array([1.0, b1, b2, b3]), np.array([b1, 2.0 * b2, 3.0 * b3])
+    # g' D^2 = D^2 + N D + r (N' D - N D'); at r = 0 it is 1, so g grows until the first positive
+    # root.
+    squared = np.convolve(denominator, denominator)
+    growth = np.zeros(13)
+    growth[:7] = squared
+    growth[:6] += np.convolve(numerator, denominator)
+    growth[1:6] += np.convolve(its_slope, denominator) - np.convolve(numerator, slope)
     if any(polynomial):
         k1, k2, k3 = polynomial
-        steps = PowerSeries([0.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
-        growth = growth + steps * denominator**2
+        growth += np.convolve([0.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3], squared)
     # Stay a little short of a root, so that rounding does not reach past it: near a pole even of
     # second order the denominator must remain more than rounding.
     fold = _first_positive_root(growth) * (1.0 - 1e-12)
@@ -122,11 +122,12 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     return min(fold, pole)
 
 
-def _first_positive_root(polynomial: PowerSeries) -> float:
-    """The smallest positive root of a polynomial whose constant term is 1."""
+def _first_positive_root(coefficients: FloatArray) -> float:
+    """The smallest positive root of a polynomial in r whose constant term is 1."""
     # In 1/r the polynomial is monic and the root sought the largest one, so that it is found well
     # even when the higher coefficients all but vanish.
-    inverse = PowerSeries(polynomial.trim(_NEGLIGIBLE).coef[::-1]).roots()
+    last = np.flatnonzero(np.abs(coefficients) > _NEGLIGIBLE)[-1]
+    inverse = polyroots(coefficients[last::-1])
     # Rounding can make a conjugate pair of a double root.
     real = inverse.real[np.abs(inverse.imag) <= 1e-6 * np.abs(inverse)]
     largest = float(max(real, default=0.0))
@@ -150,11 +151,6 @@ def inverse_table(
     radius.setflags(write=False)
     distorted.setflags(write=False)
     return distorted, radius
-
-
-def largest_distorted_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
-    """Largest distorted radius at which a ray is seen: g at the fold or at `RADIUS_LIMIT`."""
-    return float(inverse_table(coef, polynomial)[0][-1])
 
 
 def undistorted_radius(
@@ -297,13 +293,3 @@ def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) 
     lens = np.array([*coef, *brown, r_max])
     straighten_points(lens, seen, np.interp(radius, seen_there, there), straight)
     return straight.reshape(np.shape(distorted))
-
-
-def first_unseen(border: FloatArray, coef: Coef, brown: Brown) -> int:
-    """Index of the first of (N, 2) distorted normalised places at which nothing is seen; -1: none.
-
-    The visible region has no holes: it contains an image whose border it contains.
-    """
-    r_max = one_to_one_radius(coef, brown)
-    unseen = np.isnan(straightened(border, coef, brown, r_max)[:, 0])
-    return int(np.argmax(unseen)) if unseen.any() else -1

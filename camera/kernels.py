@@ -9,12 +9,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from camera.model import Camera
-
-FloatArray = NDArray[np.float64]
-
+from redetect.array_types import FloatArray
 
 _NEWTON_STEPS = 100
 _LAST_STEP = 1e-9

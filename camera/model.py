@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera.distortion import (
     NO_POLYNOMIAL,
@@ -45,8 +45,8 @@ from camera.model_checks import (
     checked_whole,
     seen_share,
 )
+from redetect.array_types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Pose = tuple[tuple[float, float, float, float], ...]
 
 #: Number of a calibration's parameters: 14 intrinsics, position and rotation.

@@ -8,16 +8,11 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from camera.distortion import (
-    LARGEST_COEFFICIENT,
-    first_unseen,
-    fold_radius,
-    largest_distorted_radius,
-    one_to_one_radius,
-)
+from camera.distortion import LARGEST_COEFFICIENT
 from camera.errors import CameraError
+from redetect.array_types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from camera.model import Camera, Pose
@@ -26,7 +21,7 @@ _ROTATION_TOLERANCE = 1e-3
 _LARGEST_SIDE_PX = 65536
 #: Least share of the image that must see anything.
 LEAST_SEEN_SHARE = 0.5
-# Number of places along each side of the image that are checked to be inside the lens's limit.
+# Number of places along each side of the image that are checked.
 _PLACES = 65
 
 
@@ -62,13 +57,21 @@ def check_numbers(camera: Camera) -> None:
 
 def check_one_to_one(camera: Camera) -> None:
     """Refuse a distortion that folds so far inside the image that less than half of it is left."""
-    fold = _fold_inside(camera)
-    share = seen_share(camera) if fold else 1.0
-    if share < LEAST_SEEN_SHARE:
-        raise CameraError(
-            f"the distortion folds inside the image: {fold}; {100.0 * share:.0f} % of the image "
-            f"see anything, expected {100.0 * LEAST_SEEN_SHARE:.0f}"
-        )
+    beyond = _first_unseen(camera)
+    if beyond is None or (share := seen_share(camera)) >= LEAST_SEEN_SHARE:
+        return
+    parts = (("tangential", "p1 p2"), ("polynomial", "k1 k2 k3"))
+    terms = ", ".join(
+        f"{name} {symbols} = {' '.join(f'{value:g}' for value in getattr(camera, name))}"
+        for name, symbols in parts
+        if any(getattr(camera, name))
+    )
+    u, v = beyond
+    raise CameraError(
+        f"the distortion folds inside the image: {f'with {terms} ' if terms else ''}it is "
+        f"one-to-one only up to r = {camera.r_max:.6g}, which pixel ({u:g}, {v:g}) lies beyond; "
+        f"{100.0 * share:.0f} % of the image see anything, expected {100.0 * LEAST_SEEN_SHARE:.0f}"
+    )
 
 
 def seen_share(camera: Camera) -> float:
@@ -76,54 +79,29 @@ def seen_share(camera: Camera) -> float:
 
     Fits of few coefficients often fold in the corners, where no board was.
     """
-    if not _fold_inside(camera):
+    if _first_unseen(camera) is None:
         return 1.0
     middles = (np.arange(_PLACES) + 0.5) / _PLACES
     u, v = camera.width * middles - 0.5, camera.height * middles - 0.5
+    return float(_is_seen(camera, np.stack(np.meshgrid(u, v), axis=-1)).mean())
+
+
+def _first_unseen(camera: Camera) -> FloatArray | None:
+    """The first pixel along the border that sees nothing.
+
+    What a lens sees has no holes: it contains an image whose border it contains.
+    """
+    border = border_pixels(camera.width, camera.height, _PLACES)
+    seen = _is_seen(camera, border)
+    return None if seen.all() else border[np.argmin(seen)]
+
+
+def _is_seen(camera: Camera, pixels: FloatArray) -> BoolArray:
     with np.errstate(over="ignore", invalid="ignore"):
-        seen = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
-    return float(np.isfinite(seen[..., 0]).mean())
+        return np.isfinite(camera.undistort(pixels)[..., 0])
 
 
-def _fold_inside(camera: Camera) -> str:
-    """Where the distortion folds, if it does so inside the image; else nothing."""
-    if any(camera.tangential):
-        return _fold_inside_border(camera)
-    x = max(abs(camera.offset_x), abs(camera.width - 1 - camera.offset_x)) / camera.scale_x
-    y = max(abs(camera.offset_y), abs(camera.height - 1 - camera.offset_y)) / camera.scale_y
-    corner = math.hypot(x, y)
-    seen = largest_distorted_radius(camera.coef, camera.polynomial)
-    if corner < seen:
-        return ""
-    fold = fold_radius(camera.coef, camera.polynomial)
-    k1, k2, k3 = camera.polynomial
-    values = f"with polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g} "
-    return (
-        f"{values if any(camera.polynomial) else ''}it grows only up to r = {fold:.6g}, seen at "
-        f"{seen:.6g}, while the image's corner lies at {corner:.6g}"
-    )
-
-
-def _fold_inside_border(camera: Camera) -> str:
-    """What is one-to-one is so within a circle: its image holds the whole image, or it folds."""
-    pixels = border_pixels(camera.width, camera.height, _PLACES)
-    with np.errstate(over="ignore"):
-        border = (pixels - [camera.offset_x, camera.offset_y]) / [camera.scale_x, camera.scale_y]
-    unseen = first_unseen(border, camera.coef, camera.brown)
-    if unseen < 0:
-        return ""
-    k1, k2, p1, p2, k3 = camera.brown
-    more = f", polynomial k1 = {k1:g}, k2 = {k2:g} and k3 = {k3:g}"
-    more = more if any(camera.polynomial) else ""
-    u, v = pixels[unseen]
-    r_max = one_to_one_radius(camera.coef, camera.brown)
-    return (
-        f"with tangential p1 = {p1:g} and p2 = {p2:g}{more} it is one-to-one only up to "
-        f"r = {r_max:.6g}, which pixel ({u:g}, {v:g}) lies beyond"
-    )
-
-
-def border_pixels(width: int, height: int, places: int) -> NDArray[np.float64]:
+def border_pixels(width: int, height: int, places: int) -> FloatArray:
     """(4 * places, 2) pixels along the border of an image, each side from corner to corner."""
     along = np.linspace(0.0, 1.0, places)
     zero, one = np.zeros(places), np.ones(places)

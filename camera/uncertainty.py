@@ -12,12 +12,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.model import COUNT, cross_matrices, project_points
 from camera.model import PARAMETERS, Camera, Pose
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray
 
 IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 #: A camera without a pose, to be given intrinsics.

@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
-
-FloatArray = NDArray[np.float64]
 
 #: Part of an outline's samples that must lie inside the image.
 MIN_SHARE_INSIDE = 0.5
@@ -107,7 +106,7 @@ class DiscTable:
         return _groups(self.samples, self.pixels, self.floor_xy[..., 0].size)
 
     @cached_property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> BoolArray:
         """(H, W) the centres that are tested."""
         usable = np.zeros(self.floor_xy.shape[:2], np.bool_)
         usable[self.pixels[:, 1], self.pixels[:, 0]] = True
@@ -263,7 +262,7 @@ def _gradient(floor_xy: FloatArray, axis: int) -> FloatArray:
     return np.asarray(np.gradient(floor_xy, axis=axis))
 
 
-def _within_limits(down: FloatArray, shape: DiscShape) -> NDArray[np.bool_]:
+def _within_limits(down: FloatArray, shape: DiscShape) -> BoolArray:
     """Pixels far enough from the border and near enough on the floor."""
     height, width = down.shape
     u, v = np.arange(width), np.arange(height)
@@ -274,7 +273,7 @@ def _within_limits(down: FloatArray, shape: DiscShape) -> NDArray[np.bool_]:
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
 
 
-def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> NDArray[np.int64]:
+def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> IntArray:
     """(H, W) pixels along the row from each centre to the next one that is tested."""
     if shape.least_pairs:
         step = np.ceil(shape.stride_m / down)
@@ -285,7 +284,7 @@ def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> 
     return np.where(step > 1.0, step, 1.0).astype(np.int64)
 
 
-def _strided(columns: NDArray[np.int64], step: NDArray[np.int64]) -> list[int]:
+def _strided(columns: IntArray, step: IntArray) -> list[int]:
     """Which of some columns keep the distance that the one before them asks for.
 
     Where pixels grow fast along a row, in a very wide lens, twice the distance that they themselves
@@ -300,7 +299,7 @@ def _strided(columns: NDArray[np.int64], step: NDArray[np.int64]) -> list[int]:
     return kept
 
 
-def _rows_tested(floor_xy: FloatArray, candidate: NDArray[np.bool_], apart_m: float) -> list[int]:
+def _rows_tested(floor_xy: FloatArray, candidate: BoolArray, apart_m: float) -> list[int]:
     """Rows with candidates, so close that no candidate between them is far from one of them.
 
     How far a row is from its neighbour, as it sees the floor, is the area of a pixel there over its

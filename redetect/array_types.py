@@ -7,4 +7,5 @@ from numpy.typing import NDArray
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
+GreyImage = NDArray[np.uint8]
 IntArray = NDArray[np.int64]

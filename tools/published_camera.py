@@ -1,6 +1,6 @@
 """The published calibration of run e of the DLR Spatial Cognition data set."""
 
-PUBLISHED_CAMERA = """\
+PUBLISHED_CAM = """\
 { SmRadialDistortedCamera
 sensor2Tcp: [ 0.99992, -0.00994383, -0.00778315, -0.0820676 ]
 [ 0.00718218, -0.0591054, 0.998226, 0.142944 ]

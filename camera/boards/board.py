@@ -22,14 +22,12 @@ import numpy as np
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
-from numpy.typing import NDArray
 
 from camera import options
 from camera.errors import CalibrationError
 from camera.options import BoardFlags, BoardKind
+from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

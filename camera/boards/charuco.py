@@ -10,15 +10,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from camera.boards.board import Board, dictionary_of
 from camera.errors import CalibrationError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-GreyImage = NDArray[np.uint8]
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 # Length of the strips along the edges, in squares; farther out, the lens bends the edges.
 _ALONG = 0.4
@@ -117,7 +113,7 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
         result = found
 
 
-def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | None:
+def _homography(grid: FloatArray, present: BoolArray) -> FloatArray | None:
     """(3, 3) from (column, row) to pixels, by all corners; None if they are on a line."""
     places = np.argwhere(present)[:, ::-1].astype(np.float64)
     found: FloatArray | None = cv2.findHomography(places, grid[present])[0]  # type: ignore[assignment]
@@ -125,7 +121,7 @@ def _homography(grid: FloatArray, present: NDArray[np.bool_]) -> FloatArray | No
 
 
 def _expected(
-    homography: FloatArray, grid: FloatArray, present: NDArray[np.bool_], row: int, column: int
+    homography: FloatArray, grid: FloatArray, present: BoolArray, row: int, column: int
 ) -> tuple[FloatArray, FloatArray]:
     """Where a corner is expected, (2,), and the pixels of a square to the right and down, (2, 2).
 

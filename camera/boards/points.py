@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from camera.boards.board import Board
 from camera.boards.charuco import find_charuco
 from camera.errors import CalibrationError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-GreyImage = NDArray[np.uint8]
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 # Half the side of the window round a corner, as a share of its squares in the image.
 _WINDOW = 0.3
@@ -139,12 +136,8 @@ def _spacing(grid: NDArray[np.float32]) -> FloatArray:
     """(rows, columns, 2) extent of a square at each corner along u and v, pixels."""
     extents = []
     for axis in (0, 1):
-        step = np.abs(np.diff(grid, axis=axis)).astype(np.float64)
-        before = [(0, 0)] * 3
-        after = [(0, 0)] * 3
-        before[axis], after[axis] = (1, 0), (0, 1)
-        both = [np.pad(step, pad, constant_values=np.nan) for pad in (before, after)]
-        extents.append(np.fmin(*both))
+        step = np.abs(np.diff(grid, axis=axis, prepend=np.nan, append=np.nan))
+        extents.append(np.fmin(np.delete(step, 0, axis), np.delete(step, -1, axis)))
     # A corner without neighbours gets the smallest windows.
     return np.asarray(np.nan_to_num(np.fmax(*extents)))
 
@@ -275,7 +268,7 @@ def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | No
     return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
 
 
-def _blob(weight: FloatArray, row: int, column: int) -> NDArray[np.bool_] | None:
+def _blob(weight: FloatArray, row: int, column: int) -> BoolArray | None:
     """The blob at a place of the window, if it does not touch the window's edge."""
     mask = (weight > 0.0).astype(np.uint8)
     if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.model import (
     POWERS,
@@ -22,6 +22,7 @@ from camera.calibration.model import (
     project_points,
     rotation_of,
 )
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import (
     Block,
@@ -35,8 +36,6 @@ from redetect.least_squares.solver import (
 from redetect.least_squares.solver import (
     robust as robustified,
 )
-
-FloatArray = NDArray[np.float64]
 
 #: Huber's constant, in standard deviations: beyond it a residual pulls no harder.
 HUBER = 2.0
@@ -54,7 +53,7 @@ _SCALE_ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of boards, where they were seen; all views one after the other.
+    """Points of boards, where they were seen.
 
     Attributes
     ----------
@@ -62,34 +61,31 @@ class Points:
         Points in their board's frame, metres.
     pixels : (N, 2) float64
         Where they were seen.
-    starts : (V,) int64
-        Index of each view's first point; the first is 0, and no view is empty.
+    views : (N,) int64
+        The view of each, counted from 0; no view is empty.
     width, height : int
         Image size.
     """
 
     board: FloatArray
     pixels: FloatArray
-    starts: NDArray[np.int64]
+    views: IntArray
     width: int
     height: int
 
     @property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> IntArray:
         """(V,) number of points of each view."""
-        return np.diff(np.append(self.starts, len(self.board)))
+        return np.bincount(self.views)
 
-    @property
-    def views(self) -> NDArray[np.int64]:
-        """(N,) view of each point."""
-        return np.repeat(np.arange(len(self.starts)), self.counts)
+    def of(self, views: IntArray) -> Points:
+        """The points of some views, ascending, only; these are numbered anew."""
+        return self.where(np.isin(self.views, views))
 
-    def of(self, views: NDArray[np.int64]) -> Points:
-        """The points of some views only."""
-        chosen = [np.arange(self.starts[v], self.starts[v] + self.counts[v]) for v in views]
-        index = np.concatenate(chosen)
-        starts = np.cumsum([0, *(len(c) for c in chosen[:-1])])
-        return replace(self, board=self.board[index], pixels=self.pixels[index], starts=starts)
+    def where(self, chosen: BoolArray) -> Points:
+        """Some of the points only; the views left are numbered anew."""
+        views = np.unique(self.views[chosen], return_inverse=True)[1]
+        return replace(self, board=self.board[chosen], pixels=self.pixels[chosen], views=views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +102,10 @@ class Estimate:
     intrinsics: FloatArray
     rotations: FloatArray
     translations: FloatArray
+
+    def of(self, views: IntArray) -> Estimate:
+        """With the poses of some views only."""
+        return Estimate(self.intrinsics, self.rotations[views], self.translations[views])
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,7 @@ class _Problem:
             Block(error, [(of_pose, by_pose)], shared, self.loss),
             Block(prior, [], (weight[:, None] * self.span)[:, None, :]),
         ]
-        return stack(blocks, 6 * len(self.points.starts), self.span.shape[1])
+        return stack(blocks, 6 * len(self.points.counts), self.span.shape[1])
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         poses = step.reshape(-1, 6)
@@ -175,6 +175,8 @@ class _Problem:
         return (weight * at.intrinsics)[:, None], weight
 
 
+# A step of the adjustment asks for the same projection more than once.
+@lru_cache(maxsize=4)
 def project_estimate(
     estimate: Estimate, points: Points
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -221,7 +223,7 @@ def adjust(
 def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
     """Standard deviation of a coordinate by the median of the residuals, which outliers spare."""
     residuals = points.pixels - project_estimate(estimate, points)[0]
-    unknown = free + 6 * len(points.starts)
+    unknown = free + 6 * len(points.counts)
     share = max(1.0 - unknown / residuals.size, 0.1)
     return max(float(1.4826 * np.median(np.abs(residuals)) / np.sqrt(share)), 1e-9)
 
@@ -235,12 +237,12 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.
     psi = weights * residuals / sigma
-    unknown = span.shape[1] + 6 * len(points.starts)
+    unknown = span.shape[1] + 6 * len(points.counts)
     freedom = max(residuals.size - unknown, 1) / residuals.size
     counted = max(float(np.mean(weights == 1.0)), 0.05)
     spread = 1.0 if sigma_known else float(np.mean(psi**2)) / freedom / counted**2
     plain = normal_equations(replace(problem, loss=Loss()).linear(estimate))
-    (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.starts)))])
+    (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.counts)))])
     return Adjusted(
         estimate=estimate,
         sigma_px=sigma * float(np.sqrt(spread)),

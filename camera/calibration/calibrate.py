@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.boards.board import Board
 from camera.calibration.adjustment import (
@@ -18,14 +17,12 @@ from camera.calibration.adjustment import (
     fit_points,
     project_estimate,
 )
-from camera.calibration.choice import choose_lens, of_views
+from camera.calibration.choice import choose_lens
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg
 from camera.errors import CalibrationError
+from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FEWEST_VIEWS = 3
 # Below this the focal length hangs on the perspective of single views alone.
@@ -69,7 +66,7 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
             "the board flat, are --board, --columns and --rows right, and does the lens see less "
             "than 90 deg off its axis in the image's corners?"
         )
-    views = len(points.starts)
+    views = len(points.counts)
     if views < 10:
         warnings.append(f"only {views} pictures: 15 to 40 make the result firmer")
     if spread_deg < 20.0:
@@ -211,16 +208,15 @@ def calibrate(
     demand_enough(len(views))
     measured = points_of(views, board, size)
     names = tuple(view.name for view in views)
+    radius = 0.5 * board.circle_m
     try:
         start = first_estimate(measured, settings.aspect)
+        start = _staged(start, measured, settings, radius)
     except StartError:
         raise CalibrationError(
             "no camera explains the points found: are --columns, --rows and the kind of --board "
             "right, and do all pictures show the same board by the same camera at the same zoom?"
         ) from None
-    radius = 0.5 * board.circle_m
-    start = _staged(start, measured, settings, radius)
-
     outliers: tuple[tuple[str, float], ...] = ()
     # Outliers are detected with the fullest model: residuals of a simpler one are partly its own.
     most = settings.most
@@ -241,7 +237,7 @@ def calibrate(
         demand_enough(len(kept), f" without {', '.join(name for name, _ in outliers)}")
         names = tuple(names[v] for v in kept)
         measured = measured.of(kept)
-        start = of_views(start, kept)
+        start = start.of(kept)
     measured, wrong = _without_wrong_points(start, measured, first[0].sigma_px, settings, radius)
 
     lens, tried = choose_lens(start, measured, settings, radius)
@@ -297,11 +293,10 @@ def calibrate_freely(
 
 def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> Points:
     """The points of all views, one after the other."""
-    counts = [len(view.indices) for view in views]
     return Points(
         board=np.concatenate([board.points[view.indices] for view in views]),
         pixels=np.concatenate([view.pixels for view in views]).astype(np.float64),
-        starts=np.cumsum([0, *counts[:-1]]).astype(np.int64),
+        views=np.repeat(np.arange(len(views)), [len(view.indices) for view in views]),
         width=size[0],
         height=size[1],
     )
@@ -334,19 +329,11 @@ def _without_wrong_points(
         seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
     residuals = seen - project_estimate(estimate, points)[0]
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
-    counts = np.add.reduceat(right.astype(np.int64), points.starts)
     # A picture with too few points left is unchanged: the robust loss deals with it.
-    right |= np.repeat(counts < _FEWEST_POINTS, points.counts)
-    counts = np.add.reduceat(right.astype(np.int64), points.starts)
-    trimmed = replace(
-        points,
-        board=points.board[right],
-        pixels=points.pixels[right],
-        starts=np.cumsum([0, *counts[:-1]]).astype(np.int64),
-    )
-    return trimmed, int(np.sum(~right))
+    right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
+    return points.where(right), int(np.sum(~right))
 
 
 def _view_rms(fit: Adjusted, points: Points) -> FloatArray:
     squares = np.sum(fit.residuals**2, axis=1)
-    return np.asarray(np.sqrt(np.add.reduceat(squares, points.starts) / points.counts))
+    return np.asarray(np.sqrt(np.bincount(points.views, squares) / points.counts))

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, fit_points
 from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
+from redetect.array_types import IntArray
 from redetect.least_squares.solver import StartError
-
-IntArray = NDArray[np.int64]
 
 _FOLDS = 8
 # An additional coefficient must lower the sum of squared hold-out errors by this many variances.
@@ -142,11 +140,6 @@ def tangential_significance(adjusted: Adjusted) -> float:
     return float(found @ np.linalg.pinv(covariance) @ found)
 
 
-def of_views(estimate: Estimate, views: IntArray) -> Estimate:
-    """An estimate with the poses of some views only."""
-    return Estimate(estimate.intrinsics, estimate.rotations[views], estimate.translations[views])
-
-
 def holdout_error(
     estimate: Estimate,
     points: Points,
@@ -159,7 +152,7 @@ def holdout_error(
     For held-out points only the poses are fitted. Each view is in one of the `folds`, by default
     every `_FOLDS`-th.
     """
-    every = np.arange(len(points.starts))
+    every = np.arange(len(points.counts))
     if folds is None:
         number = min(_FOLDS, len(every))
         folds = [every[every % number == fold] for fold in range(number)]
@@ -167,9 +160,9 @@ def holdout_error(
     span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
     for out in folds:
         used = np.setdiff1d(every, out)
-        fit = adjust(of_views(estimate, used), points.of(used), span, robust=settings.robust)
+        fit = adjust(estimate.of(used), points.of(used), span, robust=settings.robust)
         held = points.of(out)
-        there = replace(of_views(estimate, out), intrinsics=fit.estimate.intrinsics)
+        there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
             test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point lies past this fit's fold

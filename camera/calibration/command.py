@@ -33,7 +33,7 @@ from camera.calibration.floor import (
     write_floor_pictures,
     write_picture,
 )
-from camera.calibration.images import GreyImage, calibration_images
+from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
 from camera.camfile import format_camera
@@ -41,6 +41,7 @@ from camera.errors import CalibrationError, CameraError
 from camera.model import PARAMETERS, Camera
 from camera.options import Calibrate
 from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
+from redetect.array_types import GreyImage
 from redetect.storage import demand_place, write_bytes
 
 #: How many pictures are looked through for the true size of a checkerboard, and how many agree.

@@ -35,11 +35,10 @@ from camera.errors import CalibrationError
 from camera.model import Camera
 from camera.options import Calibrate, Floor
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
+from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_text
 from redetect.storage.messages import excerpt
-
-FloatArray = NDArray[np.float64]
 
 #: Columns of a file of floor points: pixel, and place in the robot frame (m).
 FLOOR_COLUMNS = ("u", "v", "x", "y")
@@ -114,7 +113,8 @@ def place_on_floor(
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor)
-    points = Points(floor, pixels, np.zeros(1, dtype=np.int64), camera.width, camera.height)
+    one_view = np.zeros(len(floor), dtype=np.int64)
+    points = Points(floor, pixels, one_view, camera.width, camera.height)
     intrinsics = intrinsics_of(camera)
     start = board_poses(intrinsics, points)[0]
 
@@ -207,15 +207,11 @@ def floor_points(
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
     """(N, 2) pixels and (N, 2) floor places of a CSV file with the header ``u,v,x,y``."""
+    text = read_text(path, _LARGEST_FILE_BYTES, "file of floor points", CalibrationError)
     try:
-        lines = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig").splitlines()
-        rows = list(csv.reader(lines))
-    except (UnicodeDecodeError, csv.Error):
-        raise CalibrationError(f"{path}: is no text: expected floor points") from None
-    except OSError as error:
-        raise CalibrationError(
-            f"{path}: cannot be read as floor points: {error.strerror}"
-        ) from None
+        rows = list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise CalibrationError(f"{path}: {error}: expected floor points") from None
     header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
     if header != FLOOR_COLUMNS:
         raise CalibrationError(

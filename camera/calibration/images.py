@@ -9,12 +9,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
+from redetect.array_types import GreyImage
 from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded, without_orientation
-
-GreyImage = NDArray[np.uint8]
 
 _LARGEST_FILE_BYTES = 1 << 30
 

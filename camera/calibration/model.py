@@ -11,23 +11,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera.distortion import (
+    RADIUS_LIMIT,
     Brown,
     Coef,
     brown_shift,
     distorted_jacobian,
-    fold_radius,
     one_to_one_radius,
     radial_factor,
 )
 from camera.errors import CalibrationError
 from camera.model_checks import border_pixels
+from redetect.array_types import FloatArray
 from redetect.storage.bounds import ABOVE_0, demand, whole
-
-FloatArray = NDArray[np.float64]
 
 #: Names of the intrinsics, in order.
 INTRINSICS = (
@@ -58,24 +56,18 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
     ("a2", "a3", "b1", "b2", "b3"),
 )
 
-# The image's corner must be seen at a radius that stays below the fold by this share.
+# The image's border must be seen at radii that stay below the fold by this share.
 _FOLD_MARGIN = 0.01
-# Number of directions in which the limit of such a lens is searched, and of places on each side
-# of the border.
-_DIRECTIONS = 128
+# Directions in which a lens's limit is computed, and number of places on each side of the image.
+_ANGLES = np.linspace(-np.pi, np.pi, 128)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _BORDER_PLACES = 9
 
 
-def coefficients(intrinsics: FloatArray) -> Coef:
-    """The distortion's (a2, a3, b1, b2, b3) of an intrinsics vector."""
-    a2, a3, b1, b2, b3 = (float(c) for c in intrinsics[4:9])
-    return a2, a3, b1, b2, b3
-
-
-def brown_terms(intrinsics: FloatArray) -> Brown:
-    """The distortion's (k1, k2, p1, p2, k3) of an intrinsics vector."""
-    p1, p2, k1, k2, k3 = (float(c) for c in intrinsics[9:14])
-    return k1, k2, p1, p2, k3
+def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
+    """The distortion's (a2, a3, b1, b2, b3) and (k1, k2, p1, p2, k3) of an intrinsics vector."""
+    a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = intrinsics[4:].tolist()
+    return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
 
 
 def free_span(
@@ -104,39 +96,26 @@ def project_points(
     2, 14), `by_point` (N, 2, 3).
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
-    coef = a2, a3, b1, b2, b3 = coefficients(intrinsics)
+    coef, brown = lens_of(intrinsics)
+    a2, a3, b1, b2, b3 = coef
     z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
     xy = points_camera[:, :2] / z[:, None]
     r = np.hypot(xy[:, 0], xy[:, 1])
-    brown = brown_terms(intrinsics)
     r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
-    numerator = r * (a2 + r * a3)
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
-    ratio = numerator / denominator
-    factor = 1.0 + ratio
+    ratio = r * (a2 + r * a3) / denominator
+    seen = xy * (1.0 + ratio)[:, None] + brown_shift(xy, brown)
 
-    by_factor = scale * xy
     by_intrinsics = np.zeros((len(r), 2, COUNT))
-    seen = xy * factor[:, None]
-    pixels = by_factor * factor[:, None] + offset
-    if any(brown):
-        shift = brown_shift(xy, brown)
-        seen, pixels = seen + shift, pixels + scale * shift
-    by_intrinsics[:, 0, 0] = seen[:, 0]
-    by_intrinsics[:, 1, 1] = seen[:, 1]
-    by_intrinsics[:, 0, 2] = by_intrinsics[:, 1, 3] = 1.0
-    by_coefficient = np.stack(
-        [r, r**2, -ratio * r, -ratio * r**2, -ratio * r**3], axis=-1
-    ) / denominator[:, None]  # fmt: skip
-    by_intrinsics[:, :, 4:9] = by_factor[:, :, None] * by_coefficient[:, None, :]
-
-    squared, product = r**2, 2.0 * xy[:, 0] * xy[:, 1]
-    by_intrinsics[:, 0, 9] = scale[0] * product
-    by_intrinsics[:, 1, 9] = scale[1] * (squared + 2.0 * xy[:, 1] ** 2)
-    by_intrinsics[:, 0, 10] = scale[0] * (squared + 2.0 * xy[:, 0] ** 2)
-    by_intrinsics[:, 1, 10] = scale[1] * product
-    powers = np.stack([squared, squared**2, squared**3], axis=-1)
-    by_intrinsics[:, :, 11:14] = by_factor[:, :, None] * powers[:, None, :]
+    by_intrinsics[:, [0, 1], [0, 1]] = seen
+    by_intrinsics[:, [0, 1], [2, 3]] = 1.0
+    by_factor = (scale * xy)[:, :, None]
+    by_coefficient = np.stack([r, r**2, -ratio * r, -ratio * r**2, -ratio * r**3], axis=-1)
+    by_intrinsics[:, :, 4:9] = by_factor * (by_coefficient / denominator[:, None])[:, None, :]
+    # By q = (p2, p1).
+    by_q = 2.0 * xy[:, :, None] * xy[:, None, :] + (r**2)[:, None, None] * np.eye(2)
+    by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
+    by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
     by_xy = scale[:, None] * distorted_jacobian(
         np.where(np.isnan(r)[:, None], np.nan, xy), coef, brown
@@ -144,29 +123,16 @@ def project_points(
     by_point = np.empty((len(r), 2, 3))
     by_point[:, :, :2] = by_xy / z[:, None, None]
     by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
-    return pixels, by_intrinsics, by_point
+    return scale * seen + offset, by_intrinsics, by_point
 
 
 def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
-    """Whether scales are positive and the distortion grows beyond the image's border."""
+    """Whether scales are positive, and the image lies within what the lens sees up to its fold."""
     if not np.all(np.isfinite(intrinsics)) or min(intrinsics[:2]) <= 0.0:
         return False
-    coef, brown = coefficients(intrinsics), brown_terms(intrinsics)
-    if any(brown):
-        return _holds_border(intrinsics, coef, brown, width, height)
-    # Without a fold r f(r) grows without end, but towards a limit where f falls as 1 / r.
-    fold = min(fold_radius(coef), 1e6)
-    corner = corner_radius(intrinsics, width, height)
-    return bool(corner * (1.0 + _FOLD_MARGIN) < fold * radial_factor(np.array(fold), coef))
-
-
-def _holds_border(
-    intrinsics: FloatArray, coef: Coef, brown: Brown, width: int, height: int
-) -> bool:
-    """Whether the image lies within what a lens with Brown's terms sees up to where it folds."""
-    r_max = one_to_one_radius(coef, brown)
-    angle = np.linspace(-np.pi, np.pi, _DIRECTIONS)
-    edge = r_max * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    coef, brown = lens_of(intrinsics)
+    r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
+    edge = r_max * _DIRECTIONS
     edge = edge * radial_factor(np.array(r_max), coef) + brown_shift(edge, brown)
     border = border_pixels(width, height, _BORDER_PLACES)
     border = (border - intrinsics[2:4]) / intrinsics[:2]
@@ -210,7 +176,7 @@ class FreeLens(NamedTuple):
     polynomial: int = 0
     """How many of k1, k2, k3 are."""
 
-    def span(self, aspect: float | None) -> NDArray[np.float64]:
+    def span(self, aspect: float | None) -> FloatArray:
         """`free_span` of them."""
         return free_span(
             self.coefficients, aspect, tangential=self.tangential, polynomial=self.polynomial

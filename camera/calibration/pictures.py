@@ -13,13 +13,13 @@ from camera.calibration.adjustment import project_estimate
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
+from redetect.array_types import FloatArray
 from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 _ARROW_SHARE = 0.05
 
@@ -128,16 +128,15 @@ _STEPS = 400
 def drawn_corners(image: Picture, calibration: Calibration, view: int) -> Picture:
     """A board's points where they were found (circles) and where they project (crosses)."""
     points, estimate = calibration.points, calibration.adjusted.estimate
-    first = int(points.starts[view])
-    rows = slice(first, first + int(points.counts[view]))
+    rows = points.views == view
     found = points.pixels[rows]
     projected = project_estimate(estimate, points)[0][rows]
     picture, scale = _enlarged(image)
     for place in found:
-        cv2.circle(picture, _dot(place, scale), 7 * 8, _FOUND, 1, cv2.LINE_AA, 3)
+        cv2.circle(picture, _place(place, scale, 8), 7 * 8, _FOUND, 1, cv2.LINE_AA, 3)
     for place in projected:
         cv2.drawMarker(
-            picture, _whole(place, scale), _PROJECTED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA
+            picture, _place(place, scale), _PROJECTED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA
         )
     rms = float(np.sqrt(np.mean(np.sum((found - projected) ** 2, axis=1))))
     return _captioned(
@@ -194,14 +193,9 @@ def _enlarged(image: Picture) -> tuple[Picture, float]:
     return np.asarray(cv2.cvtColor(large, cv2.COLOR_GRAY2BGR), dtype=np.uint8), scale
 
 
-def _dot(place: FloatArray, scale: float) -> tuple[int, int]:
-    """A place in eighths of the enlarged picture's pixels."""
-    u, v = np.rint(8.0 * ((place + 0.5) * scale - 0.5)).astype(int).tolist()
-    return u, v
-
-
-def _whole(place: FloatArray, scale: float) -> tuple[int, int]:
-    u, v = np.rint((place + 0.5) * scale - 0.5).astype(int).tolist()
+def _place(place: FloatArray, scale: float, parts: int = 1) -> tuple[int, int]:
+    """A place in the enlarged picture's pixels, or in parts of them."""
+    u, v = np.rint(parts * ((place + 0.5) * scale - 0.5)).astype(int).tolist()
     return u, v
 
 
@@ -212,14 +206,16 @@ def _polyline(
     reach = 2.0 * max(picture.shape)
     near = np.isfinite(line).all(axis=1) & (np.abs(np.nan_to_num(line)) < reach).all(axis=1)
     for first, last in zip(line[:-1][near[:-1] & near[1:]], line[1:][near[:-1] & near[1:]]):
-        cv2.line(picture, _dot(first, scale), _dot(last, scale), colour, width, cv2.LINE_AA, 3)
+        cv2.line(
+            picture, _place(first, scale, 8), _place(last, scale, 8), colour, width, cv2.LINE_AA, 3
+        )
 
 
 def _label(
     picture: Picture, place: FloatArray, scale: float, text: str, colour: tuple[int, int, int]
 ) -> None:
     if np.isfinite(place).all() and np.abs(place).max() < 1e4:
-        u, v = _whole(place, scale)
+        u, v = _place(place, scale)
         cv2.putText(picture, text, (u + 4, v - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.adjustment import (
     Adjusted,
@@ -15,11 +14,10 @@ from camera.calibration.adjustment import (
     adjust,
     project_estimate,
 )
-from camera.calibration.model import COUNT, brown_terms, coefficients, free_span, rotation_of
+from camera.calibration.model import COUNT, free_span, lens_of, rotation_of
 from camera.distortion import one_to_one_radius, straightened
+from redetect.array_types import FloatArray
 from redetect.least_squares.solver import StartError
-
-FloatArray = NDArray[np.float64]
 
 # Focal lengths that are tried, in widths of the image: from 130 to 6 degrees across.
 _FOCAL_WIDTHS = (0.25, 0.4, 0.6, 0.9, 1.4, 2.2, 4.0, 8.0)
@@ -33,7 +31,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
 
     `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with).
     """
-    chosen = np.unique(np.linspace(0, len(points.starts) - 1, _FEW_VIEWS).round().astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(points.counts) - 1, _FEW_VIEWS).round().astype(np.int64))
     few = points.of(chosen)
     ratio = 1.0 if aspect is None else aspect
     best: Adjusted | None = None
@@ -62,13 +60,13 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estim
     Infinitesimal plane-based pose estimation, IJCV 109, 2014; OpenCV's solver).
     """
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
-    coef, brown = coefficients(intrinsics), brown_terms(intrinsics)
+    coef, brown = lens_of(intrinsics)
     straight = straightened(normalised, coef, brown, one_to_one_radius(coef, brown))
     # A point past the fold stays where it is: this is but a start.
     straight = np.where(np.isnan(straight), normalised, straight)
     found = []
-    for first, count in zip(points.starts, points.counts):
-        rows = slice(first, first + count)
+    for view in range(len(points.counts)):
+        rows = points.views == view
         _, vectors, places, _ = cv2.solvePnPGeneric(
             points.board[rows], straight[rows], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
         )
@@ -86,7 +84,7 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
     fits = [_poses_alone(candidate, points) for candidate in candidates]
     errors = np.stack([_errors(fit, points) for fit in fits])
     use = np.argmin(errors, axis=0)
-    every = np.arange(len(points.starts))
+    every = np.arange(len(points.counts))
     rotations = np.stack([fit.rotations for fit in fits])[use, every]
     translations = np.stack([fit.translations for fit in fits])[use, every]
     return Estimate(estimate.intrinsics, rotations, translations)
@@ -100,10 +98,10 @@ def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
     except (StartError, np.linalg.LinAlgError):
         pass
     rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
-    for view in range(len(points.starts)):
-        one = Estimate(estimate.intrinsics, rotations[[view]], translations[[view]])
+    for view in range(len(points.counts)):
+        one = np.array([view])
         try:
-            fit = adjust(one, points.of(np.array([view])), nothing, tolerance=_LOOSE).estimate
+            fit = adjust(estimate.of(one), points.of(one), nothing, tolerance=_LOOSE).estimate
         except (StartError, np.linalg.LinAlgError):
             continue
         rotations[view], translations[view] = fit.rotations[0], fit.translations[0]
@@ -114,7 +112,7 @@ def _errors(estimate: Estimate, points: Points) -> FloatArray:
     """(V,) mean absolute residual; infinity where a view is not projected."""
     error = np.abs(points.pixels - project_estimate(estimate, points)[0]).sum(axis=1)
     error = np.where(np.isnan(error), np.inf, error)
-    return np.asarray(np.add.reduceat(error, points.starts) / points.counts)
+    return np.asarray(np.bincount(points.views, error) / points.counts)
 
 
 def normals_spread_deg(rotations: Sequence[FloatArray] | FloatArray) -> float:

@@ -12,33 +12,26 @@ import struct
 import pycolmap
 
 from camera.errors import ConversionError
-from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from camera.formats.yaml_files import foreign, shortest
+from camera.formats.models import ForeignCamera, Model
+from camera.formats.yaml_files import foreign, name_of_one, shortest
 from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
 _DIGITS = frozenset("0123456789")
 
-#: COLMAP's models: its number, ours, number of focal lengths, where its distortion goes in ours.
-_MODELS: dict[str, tuple[int, Model, int, tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": (0, "radtan", 1, ()),
-    "PINHOLE": (1, "radtan", 2, ()),
-    "SIMPLE_RADIAL": (2, "radtan", 1, (0,)),
-    "RADIAL": (3, "radtan", 1, (0, 1)),
-    "OPENCV": (4, "radtan", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0,)),
-    "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1)),
-    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
-}
-#: Names and numbers of parameters, by COLMAP's numbers; also of models that cannot be converted.
-_PARAMETERS = {
-    number: (name, focals + 2 + len(order)) for name, (number, _, focals, order) in _MODELS.items()
-} | {
-    7: ("FOV", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+#: COLMAP's models that have one of ours, and their numbers of focal lengths. Then come two numbers
+#: of the principal point, and the first coefficients of ours.
+_MODELS: dict[str, tuple[Model, int]] = {
+    "SIMPLE_PINHOLE": ("radtan", 1),
+    "PINHOLE": ("radtan", 2),
+    "SIMPLE_RADIAL": ("radtan", 1),
+    "RADIAL": ("radtan", 1),
+    "OPENCV": ("radtan", 2),
+    "FULL_OPENCV": ("rational", 2),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1),
+    "RADIAL_FISHEYE": ("fisheye", 1),
+    "OPENCV_FISHEYE": ("fisheye", 2),
 }
 _WRITTEN: dict[Model, str] = {
     "radtan": "OPENCV",
@@ -63,13 +56,7 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
                     f"after line {rows[fields[0]][0]}: expected different numbers"
                 )
             rows[fields[0]] = (number, fields)
-    held = one_line(", ".join(rows), _LONGEST_LIST)
-    if camera_name and camera_name not in rows:
-        raise ConversionError(f"{name}: no camera {camera_name}: it holds {held}")
-    if not camera_name and len(rows) != 1:
-        there = f"it holds {held}: give --camera-name" if rows else "it holds none"
-        raise ConversionError(f"{name}: expected one camera, {there}")
-    number, fields = rows[camera_name or next(iter(rows))]
+    number, fields = rows[name_of_one(list(rows), camera_name, name)]
     where = f"{name}:{number}"
     try:
         width, height = int(fields[2]), int(fields[3])
@@ -92,17 +79,18 @@ def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
         place = 8
         for camera in range(1, count + 1):
             number, model, width, height = struct.unpack_from("<IiQQ", content, place)
-            if model not in _PARAMETERS:
+            try:
+                kind = pycolmap.CameraModelId(model)
+                length = _parameter_count(kind)
+            except ValueError:
                 raise ConversionError(
                     f"{name}: camera {camera} has COLMAP's model {model}, which is unknown here: "
-                    "expected one of 0 to 11; write it as text (colmap model_converter "
-                    "--output_type TXT)"
-                )
-            label, length = _PARAMETERS[model]
+                    "write it as text (colmap model_converter --output_type TXT)"
+                ) from None
             parameters = struct.unpack_from(f"<{length}d", content, place + 24)
             place += 24 + 8 * length
             values = " ".join(repr(value) for value in parameters)
-            lines.append(f"{number} {label} {width} {height} {values}")
+            lines.append(f"{number} {kind.name} {width} {height} {values}")
     except struct.error:
         raise ConversionError(f"{name}: ends early: expected COLMAP's cameras.bin") from None
     if place != len(content):
@@ -127,18 +115,21 @@ def _from_parameters(
         raise ConversionError(
             f"{where}: model {excerpt(model_name)}: expected {', '.join(_MODELS)}"
         )
-    _, model, focals, order = _MODELS[model_name]
-    count = focals + 2 + len(order)
+    model, focals = _MODELS[model_name]
+    count = _parameter_count(model_name)
     if len(parameters) != count:
         raise ConversionError(
             f"{where}: {len(parameters)} parameters of {model_name}: expected {count}"
         )
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy = (value - _HALF_PIXEL for value in parameters[focals : focals + 2])
-    coefficients = [0.0] * COEFFICIENTS[model]
-    for place, value in zip(order, parameters[focals + 2 :]):
-        coefficients[place] = value
+    coefficients = parameters[focals + 2 :]
     return foreign(where, model, width, height, (fx, fy, cx, cy), coefficients)
+
+
+def _parameter_count(model: pycolmap.CameraModelId | str) -> int:
+    """How many parameters a model has; a ValueError if COLMAP has none of that name or number."""
+    return len(pycolmap.Camera(model=model).params_info.split(","))
 
 
 def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
@@ -149,9 +140,8 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
     if model == "rational" and any(d[8:]):
         raise ConversionError("COLMAP has no thin prism with the rational model")
     name = _WRITTEN[model]
-    order = _MODELS[name][3]
     pinhole = [camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
-    return name, [*pinhole, *(d[place] for place in order)]
+    return name, [*pinhole, *d[: _parameter_count(name) - 4]]
 
 
 def format_colmap(camera: ForeignCamera, camera_name: str = "1") -> str:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from camera.camfile import format_camera, parse_camera, read_camera
+from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
 from camera.formats.colmap import format_colmap, parse_colmap, text_of_binary
 from camera.formats.conversion import (
     AnyCamera,
     Converted,
-    contains,
+    contained,
     convert_to_camera,
     convert_to_foreign,
+    nearer,
 )
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import (
@@ -23,22 +24,19 @@ from camera.formats.yaml_files import (
     parse_opencv,
     parse_ros,
     parse_yaml,
-    read_content,
-    text_of,
 )
 from camera.model import Camera
 from camera.options import Convert, Format
-from redetect.storage import demand_place, write_bytes
+from redetect.storage import bounded, demand_place, write_bytes
 
-#: The models that each format has, the simplest first.
-MODELS: dict[str, tuple[Model, ...]] = {
-    "opencv": ("radtan", "rational", "fisheye"),
-    "ros": ("radtan", "rational", "fisheye"),
-    "kalibr": ("radtan", "fisheye"),
-    "colmap": ("radtan", "rational", "fisheye"),
+#: The models that each format has, the simplest first, and how many of their coefficients: some
+#: formats lack k3, or the rational model's thin prism.
+MODELS: dict[str, dict[Model, int]] = {
+    "opencv": {"radtan": 5, "rational": 12, "fisheye": 4},
+    "ros": {"radtan": 5, "rational": 12, "fisheye": 4},
+    "kalibr": {"radtan": 4, "fisheye": 4},
+    "colmap": {"radtan": 4, "rational": 8, "fisheye": 4},
 }
-# k1 k2 p1 p2, without k3; and the rational model without the thin prism.
-_FREE = {("kalibr", "radtan"): 4, ("colmap", "radtan"): 4, ("colmap", "rational"): 8}
 
 
 def perform(options: Convert) -> int:
@@ -83,10 +81,11 @@ def perform(options: Convert) -> int:
 
 def read_text(path: Path) -> str:
     """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt."""
-    content = read_content(path)
+    kind = "calibration file"
     if path.suffix.lower() == ".bin":
+        content = bounded.read_content(path, LARGEST_FILE_BYTES, kind, ConversionError)
         return text_of_binary(content, str(path))
-    return text_of(content, str(path))
+    return bounded.read_text(path, LARGEST_FILE_BYTES, kind, ConversionError)
 
 
 def _label(camera: Camera) -> str:
@@ -193,22 +192,13 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
             raise ConversionError(
                 f"{to_format} has no {options.model} model: expected {' or '.join(models)}"
             )
-        models = (options.model,)
-
-    def free(model: Model) -> int:
-        return _FREE.get((to_format, model), -1)
-
+        models = {options.model: models[options.model]}
     own = source.model if isinstance(source, ForeignCamera) else None
-    order = sorted(
-        models, key=lambda model: (not contains(model, source, free=free(model)), model != own)
-    )
-    best: Converted | None = None
-    for model in order:
-        converted = convert_to_foreign(source, model, options.rows, free=free(model))
-        if best is None or converted.deviation_px < best.deviation_px:
-            best = converted
-        if best.deviation_px <= options.limit_px:
+    found: list[Converted] = []
+    for model, free in sorted(
+        models.items(), key=lambda item: (contained(source, *item) is None, item[0] != own)
+    ):
+        found.append(convert_to_foreign(source, model, options.rows, free=free))
+        if found[-1].deviation_px <= options.limit_px:
             break
-    if best is None:
-        raise ConversionError(f"{to_format} has no model")
-    return best
+    return nearer(*found)

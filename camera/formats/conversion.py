@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.distortion import NOT_TANGENTIAL, Tangential
@@ -15,18 +16,7 @@ from camera.errors import CameraError, ConversionError
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
 from camera.model import Camera
 from camera.uncertainty import UNPOSED, intrinsics_of, with_intrinsics
-from redetect.least_squares.solver import (
-    Block,
-    Linear,
-    Loss,
-    StartError,
-    minimise,
-    robust_cost,
-    stack,
-)
-
-FloatArray = NDArray[np.float64]
-Projection = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+from redetect.array_types import FloatArray
 
 #: Deviation (px) up to which a conversion counts as exact: rounding only.
 EXACT_PX = 1e-6
@@ -35,67 +25,8 @@ EXACT_PX = 1e-6
 _LAWSON_ROUNDS = 25
 _STEPS = 60
 _LAWSON_STEPS = 5
-
-
-class CameraFit(NamedTuple):
-    """Parameters of a camera that sees rays nearest to pixels; as the solver takes it."""
-
-    project: Projection  # from parameters to the (N, 2) pixels of the rays, and (N, 2, P) Jacobians
-    span: FloatArray  # (P, K) free directions
-    pixels: FloatArray  # (N, 2)
-    possible: Callable[[FloatArray], bool]
-    weights: FloatArray | None = None  # (N,) of the squared distances
-
-    def fitted(self, start: FloatArray, steps: int = _STEPS) -> FloatArray:
-        """(P,) parameters, from a start on; all steps lead to possible ones."""
-        try:
-            return minimise(self, start, tolerance=1e-9, most_steps=steps, damping=1e-4).at
-        except StartError:
-            return start
-
-    def cost(self, at: FloatArray) -> float:
-        if not self.possible(at):
-            return float("inf")
-        return robust_cost([(self._root() * (self.project(at)[0] - self.pixels), Loss())])
-
-    def linear(self, at: FloatArray) -> Linear:
-        found, jacobian = self.project(at)
-        by = self._root()[:, :, None] * (jacobian @ self.span)
-        every = np.zeros(len(found), dtype=np.int64)
-        block = Block(self._root() * (found - self.pixels), [(every, by)])
-        return stack([block], self.span.shape[1], 0)
-
-    def moved(self, at: FloatArray, step: FloatArray, shared: FloatArray) -> FloatArray:
-        return np.asarray(at + self.span @ step)
-
-    def _root(self) -> FloatArray:
-        weights = np.ones(len(self.pixels)) if self.weights is None else self.weights
-        return np.sqrt(weights)[:, None]
-
-
-def smallest_largest(fit: CameraFit, start: FloatArray) -> FloatArray:
-    """Parameters towards the smallest largest distance: weights grow where it is large.
-
-    References
-    ----------
-    Lawson, Contributions to the theory of linear least maximum approximation, 1961.
-    """
-    weights = np.ones(len(fit.pixels))
-    parameters = best = start
-    smallest = float("inf")
-    for _ in range(_LAWSON_ROUNDS):
-        away = np.linalg.norm(fit.project(parameters)[0] - fit.pixels, axis=1)
-        worst = float(away.max())
-        if not np.isfinite(worst):
-            break
-        if worst < smallest:
-            smallest, best = worst, parameters
-        if worst < EXACT_PX:
-            break
-        weights = weights * (0.05 + away / worst)
-        weights /= weights.mean()
-        parameters = fit._replace(weights=weights).fitted(parameters, _LAWSON_STEPS)
-    return best
+# What parameters count as that cannot be or do not see all rays: no step leads there.
+_REFUSED_PX = 1e6
 
 
 AnyCamera = Camera | ForeignCamera
@@ -124,6 +55,91 @@ class Converted:
     at: tuple[float, float]  # the target's pixel where it is largest
 
 
+class CameraFit(NamedTuple):
+    """A camera that is to see rays as near as possible to pixels, by its (P,) parameters."""
+
+    pixels: FloatArray  # (N, 2)
+    #: The (N, 2) pixels at which it sees the rays, and their (N, 2, P) derivatives.
+    project: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    possible: Callable[[FloatArray], bool]
+    measured: Callable[[FloatArray], Converted]
+
+    def fitted(
+        self, start: FloatArray, span: FloatArray, weights: FloatArray | None = None
+    ) -> FloatArray:
+        """(P,) parameters by least squares, which move from a start along a (P, K) span.
+
+        `weights` (N,) are of the squared distances. All steps lead to possible parameters.
+        """
+        root = np.ones((len(self.pixels), 1)) if weights is None else np.sqrt(weights)[:, None]
+
+        def away(moved: FloatArray) -> FloatArray:
+            at = start + span @ moved
+            if self.possible(at):
+                found = np.asarray(root * (self.project(at)[0] - self.pixels)).ravel()
+                if np.all(np.isfinite(found)):
+                    return found
+            return np.full(self.pixels.size, _REFUSED_PX)
+
+        def jacobian(moved: FloatArray) -> FloatArray:
+            by = root[..., None] * (self.project(start + span @ moved)[1] @ span)
+            return np.asarray(by).reshape(-1, span.shape[1])
+
+        begin = np.zeros(span.shape[1])
+        if away(begin)[0] == _REFUSED_PX:
+            return start
+        found = least_squares(
+            away, begin, jacobian, method="lm", x_scale="jac", ftol=1e-9,
+            max_nfev=_STEPS if weights is None else _LAWSON_STEPS,
+        )  # fmt: skip
+        return np.asarray(start + span @ found.x)
+
+
+def _nearest(fit: CameraFit, start: FloatArray, spans: Sequence[FloatArray]) -> Converted:
+    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
+    fits: list[tuple[Converted, FloatArray, FloatArray]] = []
+    parameters = start
+    for span in spans:
+        parameters = fit.fitted(parameters, span)
+        fits.append((fit.measured(parameters), parameters, span))
+        if fits[-1][0].deviation_px < EXACT_PX:
+            break
+    best, parameters, span = min(fits, key=lambda found: found[0].deviation_px)
+    if best.deviation_px < EXACT_PX:
+        return best
+    return nearer(best, fit.measured(smallest_largest(fit, parameters, span)))
+
+
+def nearer(*found: Converted) -> Converted:
+    """The conversion with the smallest deviation, the first of such."""
+    return min(found, key=lambda converted: converted.deviation_px)
+
+
+def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> FloatArray:
+    """Parameters towards the smallest largest distance: weights grow where it is large.
+
+    References
+    ----------
+    Lawson, Contributions to the theory of linear least maximum approximation, 1961.
+    """
+    weights = np.ones(len(fit.pixels))
+    parameters = best = start
+    smallest = float("inf")
+    for _ in range(_LAWSON_ROUNDS):
+        away = np.linalg.norm(fit.project(parameters)[0] - fit.pixels, axis=1)
+        worst = float(away.max())
+        if not np.isfinite(worst):
+            break
+        if worst < smallest:
+            smallest, best = worst, parameters
+        if worst < EXACT_PX:
+            break
+        weights = weights * (0.05 + away / worst)
+        weights /= weights.mean()
+        parameters = fit.fitted(parameters, span, weights)
+    return best
+
+
 def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
     """Width and height of the target's image."""
     if rows == "halve":
@@ -131,13 +147,8 @@ def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
     return source.width, source.height * (2 if rows == "double" else 1)
 
 
-def source_pixels(pixels: FloatArray, rows: Rows) -> FloatArray:
-    """The source's pixels of the target's: line v of the even lines is line 2 v of all."""
-    return np.asarray(pixels / [1.0, _FACTORS[rows]])
-
-
 def convert_to_foreign(
-    source: AnyCamera, model: Model, rows: Rows = "same", *, free: int = -1
+    source: AnyCamera, model: Model, rows: Rows = "same", *, free: int | None = None
 ) -> Converted:
     """Fit one of the other programs' models.
 
@@ -148,9 +159,9 @@ def convert_to_foreign(
         `radtan`, `rational` or `fisheye`.
     rows : str
         `same`, `halve` or `double`.
-    free : int
-        Number of the model's first coefficients that may differ from 0; -1: all. A thin prism's are
-        taken over, but never fitted.
+    free : int, optional
+        Number of the model's first coefficients that may differ from 0; by default all. A thin
+        prism's are taken over, but never fitted.
 
     Returns
     -------
@@ -161,56 +172,43 @@ def convert_to_foreign(
     ConversionError
         If the source does not see all of its image, or the fit fails.
     """
-    number = COEFFICIENTS[model] if free < 0 else free
-    contained = _contained(source, model, number)
-    if model == "rational":
-        number = min(number, _WITHOUT_PRISM)
-    width, height = target_size(source, rows)
+    number = COEFFICIENTS[model] if free is None else free
     factor = _FACTORS[rows]
-    if contained is not None:
-        fy, cy = contained.fy * factor, contained.cy * factor
-        exact = replace(contained, width=width, height=height, fy=fy, cy=cy)
-        return _measured(exact, _check(source, rows))
-    check = _check(source, rows)
-    pixels = _grid(width, height, _FIT_GRID)
-    rays = _rays(source, source_pixels(pixels, rows))
+    width, height = target_size(source, rows)
+    check = _grid(source, rows, _CHECK_GRID)
+    held = contained(source, model, number)
+    if held is not None:
+        fy, cy = held.fy * factor, held.cy * factor
+        return _measured(replace(held, width=width, height=height, fy=fy, cy=cy), check)
+    pixels, rays = _grid(source, rows, _FIT_GRID)
     fx, fy, cx, cy = _pinhole(source)
-    start = np.concatenate([[fx, fy * factor, cx, cy * factor], np.zeros(COEFFICIENTS[model])])
+    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * COEFFICIENTS[model]])
     if model != "fisheye":
         start[4 + P1 : 4 + P1 + 2] = _tangential(source)
 
-    def camera_of(parameters: FloatArray) -> ForeignCamera:
-        fx, fy, cx, cy, *distortion = (float(value) for value in parameters)
-        return ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
+    def seen(parameters: FloatArray) -> FloatArray:
+        with np.errstate(all="ignore"):
+            moved = distorted(model, parameters[4:], rays)
+            return np.asarray(moved * parameters[:2] + parameters[2:4])
 
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        camera = _unchecked(model, parameters)
-        found = camera(rays)
-        jacobian = np.empty((*found.shape, len(parameters)))
-        for k in range(len(parameters)):
-            step = 1e-6 * max(abs(parameters[k]), 1.0)
-            moved = parameters.copy()
-            moved[k] += step
-            ahead = _unchecked(model, moved)(rays)
-            moved[k] -= 2.0 * step
-            jacobian[..., k] = (ahead - _unchecked(model, moved)(rays)) / (2.0 * step)
-        return found, jacobian
+        steps = np.diag(1e-6 * np.maximum(np.abs(parameters), 1.0))
+        differences = [seen(parameters + step) - seen(parameters - step) for step in steps]
+        return seen(parameters), np.stack(differences, axis=-1) / (2.0 * np.diag(steps))
 
     def possible(parameters: FloatArray) -> bool:
         return bool(min(parameters[:2]) > 0.0)
 
-    every = np.eye(len(start))
-    spans = [every[:, : 4 + count] for count in _stages(model, number)]
-    fit = CameraFit(project, every, pixels, possible)
-    best = _nearest(fit, camera_of, start, spans, check)
-    if best is None:
-        raise ConversionError(f"no {model} camera sees what the source sees")
-    return best
+    def measured(parameters: FloatArray) -> Converted:
+        fx, fy, cx, cy, *distortion = parameters.tolist()
+        camera = ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
+        return _measured(camera, check)
 
-
-def contains(model: Model, source: AnyCamera, *, free: int = -1) -> bool:
-    """Whether a model represents a camera exactly; parameters as of `convert_to_foreign`."""
-    return _contained(source, model, COEFFICIENTS[model] if free < 0 else free) is not None
+    # From few coefficients to all: so a fit does not start in a wrong valley.
+    number = min(number, _WITHOUT_PRISM)
+    counts = sorted({min(count, number) for count in (1, 2, 4, 5, 6, 7, 8)})
+    spans = [np.eye(len(start))[:, : 4 + count] for count in counts]
+    return _nearest(CameraFit(pixels, project, possible, measured), start, spans)
 
 
 def convert_to_camera(
@@ -218,9 +216,9 @@ def convert_to_camera(
 ) -> Converted:
     """Convert to the project's model, exactly or by a fit.
 
-    A polynomial and tangential terms without a denominator are copied. Else the
-    rational part is fitted beside the source's tangential terms and, where it comes not near, all
-    of them and a polynomial together.
+    A polynomial and tangential terms without a denominator are copied. Else the rational part is
+    fitted beside the source's tangential terms and, where it comes not near, all of them and a
+    polynomial together.
 
     Parameters
     ----------
@@ -240,118 +238,57 @@ def convert_to_camera(
     ConversionError
         If the source does not see all of its image, or the fit fails.
     """
-    width, height = target_size(source, rows)
-    if pose is None and isinstance(source, Camera):
-        pose = source
     factor = _FACTORS[rows]
-
-    base = pose if pose is not None else UNPOSED
+    width, height = target_size(source, rows)
+    if pose is None:
+        pose = source if isinstance(source, Camera) else UNPOSED
     unknown = source.unknown if isinstance(source, Camera) else ()
+    check = _grid(source, rows, _CHECK_GRID)
 
-    def camera_of(intrinsics: FloatArray) -> Camera:
-        return with_intrinsics(
-            base, intrinsics, width=width, height=height, unknown=unknown, covariance=None
-        )
+    def measured(intrinsics: FloatArray) -> Converted:
+        size = {"width": width, "height": height}
+        camera = with_intrinsics(pose, intrinsics, **size, unknown=unknown, covariance=None)
+        return _measured(camera, check)
 
     fx, fy, cx, cy = _pinhole(source)
-    start = np.array(
-        [fx, fy * factor, cx, cy * factor, *[0.0] * 5, *_tangential(source), *[0.0] * 3]
-    )
-    check = _check(source, rows)
+    tangential = _tangential(source)
+    start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5, *tangential, *[0.0] * 3])
     if isinstance(source, Camera):
         start[4:9], start[11:14] = source.coef, source.polynomial
-        return _measured(camera_of(start), check)
-    plumb_bob = _contained(source, "radtan", COEFFICIENTS["radtan"])
+        return measured(start)
+    plumb_bob = contained(source, "radtan", COEFFICIENTS["radtan"])
     if plumb_bob is not None:
         k1, k2, _, _, k3 = plumb_bob.distortion
-        try:
-            return _measured(camera_of(np.array([*start[:11], k1, k2, k3])), check)
-        except CameraError:
-            # One-to-one over its image, but not over a circle around it, as cameras here are.
-            pass
-    pixels = _grid(width, height, _FIT_GRID)
-    rays = _rays(source, source_pixels(pixels, rows))
+        # One-to-one over its image, but perhaps not over a circle around it, as cameras here are.
+        with suppress(CameraError):
+            return measured(np.array([*start[:11], k1, k2, k3]))
+    pixels, rays = _grid(source, rows, _FIT_GRID)
     points = np.column_stack([rays, np.ones(len(rays))])
 
-    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found, by_intrinsics, _ = project_points(parameters, points)
-        return found, by_intrinsics
+    def project(intrinsics: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return project_points(intrinsics, points)[:2]
 
-    def possible(p: FloatArray) -> bool:
-        return is_possible(p, width, height)
+    def possible(intrinsics: FloatArray) -> bool:
+        return is_possible(intrinsics, width, height)
 
     if not possible(start):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
+    decentred = any(tangential)
     spans = [free_span(count, None) for count in range(6)]
-    if any(_tangential(source)):
+    if decentred:
         # Finally, the copied terms may compensate for what the radial part cannot follow.
         spans.append(free_span(5, None, tangential=True))
-    together = free_span(5, None, tangential=any(_tangential(source)), polynomial=3)
-    fit = CameraFit(project, together, pixels, possible)
-    best = _nearest(fit, camera_of, start, spans, check)
-    if best is None or best.deviation_px > _NEAR_PX:
-        nearest = start if best is None else _intrinsics(best)
-        fuller = _nearest(fit, camera_of, nearest, [together], check)
-        if best is None or (fuller is not None and fuller.deviation_px < best.deviation_px):
-            best = fuller
-    if best is None:
-        raise ConversionError("no camera of the project's model sees what the source sees")
-    return best
+    fit = CameraFit(pixels, project, possible, measured)
+    best = _nearest(fit, start, spans)
+    if best.deviation_px <= _NEAR_PX:
+        return best
+    assert isinstance(best.camera, Camera)
+    together = free_span(5, None, tangential=decentred, polynomial=3)
+    return nearer(best, _nearest(fit, intrinsics_of(best.camera), [together]))
 
 
-def _intrinsics(found: Converted) -> FloatArray:
-    assert isinstance(found.camera, Camera)
-    return intrinsics_of(found.camera)
-
-
-def _nearest(
-    fit: CameraFit,
-    camera_of: Callable[[FloatArray], AnyCamera],
-    start: FloatArray,
-    spans: list[FloatArray],
-    check: tuple[FloatArray, FloatArray],
-) -> Converted | None:
-    """The fit with the smallest largest deviation, each span fitted from where the last ended."""
-    best: Converted | None = None
-    nearest = parameters = start
-
-    def keep(candidate: FloatArray) -> bool:
-        nonlocal best
-        try:
-            converted = _measured(camera_of(candidate), check)
-        except CameraError:
-            return False
-        if best is None or converted.deviation_px < best.deviation_px:
-            best = converted
-            return True
-        return False
-
-    span = spans[0]
-    for wider in spans:
-        parameters = fit._replace(span=wider).fitted(parameters)
-        if keep(parameters):
-            nearest, span = parameters, wider
-        if best is not None and best.deviation_px < EXACT_PX:
-            return best
-    keep(smallest_largest(fit._replace(span=span), nearest))
-    return best
-
-
-def _unchecked(model: Model, p: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    def project(rays: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):
-            return np.asarray(distorted(model, p[4:], rays) * p[:2] + p[2:4])
-
-    return project
-
-
-def _stages(model: Model, number: int) -> list[int]:
-    """Numbers of free coefficients, from few to all: so a fit does not start in a wrong valley."""
-    return sorted({min(n, number) for n in (1, 2, 4, 5, 6, 7, 8, number)}) if number else [0]
-
-
-def _contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
-    """The source itself in the target's model, where that holds it."""
+def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
+    """The source itself in a model of which `number` coefficients are free, if that holds it."""
     if isinstance(source, Camera):
         if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None
@@ -384,27 +321,23 @@ def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:
     return source.fx, source.fy, source.cx, source.cy
 
 
-def _grid(width: int, height: int, size: tuple[int, int]) -> FloatArray:
-    """(N, 2) pixels from corner to corner, denser towards the border, where models part."""
+def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """(N, 2) pixels of the target, denser towards the border, where models part; and their rays.
+
+    Rays are undistorted normalised coordinates of what the source sees there.
+    """
     bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
     axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
+    width, height = target_size(source, rows)
     u, v = np.meshgrid(axes[0] * (width - 1), axes[1] * (height - 1))
-    return np.asarray(np.stack([u, v], axis=-1).reshape(-1, 2))
-
-
-def _rays(source: AnyCamera, pixels: FloatArray) -> FloatArray:
-    """(N, 2) undistorted normalised coordinates of the source's pixels."""
-    rays = source.undistort(pixels)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+    # Line v of the even lines is line 2 v of all.
+    in_source = pixels / [1.0, _FACTORS[rows]]
+    rays = source.undistort(in_source)
     if not np.all(np.isfinite(rays)):
-        u, v = pixels[int(np.argmax(~np.isfinite(rays[:, 0])))]
+        u, v = in_source[int(np.argmax(~np.isfinite(rays[:, 0])))]
         raise ConversionError(f"the source sees nothing at pixel ({u:.6g}, {v:.6g})")
-    return rays
-
-
-def _check(source: AnyCamera, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """The target's pixels at which the deviation is evaluated, and their rays."""
-    pixels = _grid(*target_size(source, rows), _CHECK_GRID)
-    return pixels, _rays(source, source_pixels(pixels, rows))
+    return pixels, rays
 
 
 def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Converted:

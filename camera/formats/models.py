@@ -23,13 +23,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.errors import ConversionError
 from camera.model import inverse_2x2
+from redetect.array_types import FloatArray
 from redetect.storage.messages import excerpt
 
-FloatArray = NDArray[np.float64]
 Model = Literal["radtan", "rational", "fisheye"]
 
 #: Number of coefficients that `ForeignCamera.distortion` holds for each model.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,31 +15,9 @@ import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import excerpt, one_line
 
-_LARGEST_FILE_BYTES = 1 << 20
 _MOST_CAMERAS = 1000
-
-
-def read_content(path: Path) -> bytes:
-    """The content of a calibration file."""
-    try:
-        return read_bounded(path, _LARGEST_FILE_BYTES)
-    except FileNotFoundError:
-        raise ConversionError(f"{path}: no such calibration file") from None
-    except OSError as error:
-        raise ConversionError(
-            f"{path}: cannot be read as a calibration: {error.strerror}"
-        ) from None
-
-
-def text_of(content: bytes, name: str) -> str:
-    """The content of a calibration file as text."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConversionError(f"{name}: is no text: expected a calibration") from None
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
@@ -125,6 +102,21 @@ def whole(value: Any, key: str, name: str) -> int:
     return value
 
 
+def image_size(content: dict[str, Any], name: str) -> tuple[int, int]:
+    """Width and height of the images, as OpenCV or ROS name them."""
+    sides = []
+    for side in ("width", "height"):
+        key = f"image_{side}"
+        found = [content[k] for k in (key, f"image_{side.title()}", side) if k in content]
+        if not found:
+            # OpenCV itself does not require the size; its stereo sample writes none.
+            raise ConversionError(
+                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
+            )
+        sides.append(whole(found[0], key, name))
+    return sides[0], sides[1]
+
+
 def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a 3 x 3 camera matrix without skew."""
     m = numbers(value, key, name)
@@ -160,15 +152,7 @@ _FISHEYE = ("1", "true", "fisheye", "equidistant")
 def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of an OpenCV YAML file."""
     content = parse_yaml(text, name)
-    sides = []
-    for key, other in (("image_width", "image_Width"), ("image_height", "image_Height")):
-        if key not in content and other not in content:
-            # OpenCV itself does not require the size; its stereo sample writes none.
-            raise ConversionError(
-                f"{name}: lacks {key}: add the images' size, a line such as '{key}: 640'"
-            )
-        sides.append(whole(first_of(content, (key, other), name), key, name))
-    width, height = sides
+    width, height = image_size(content, name)
     fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
     d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
     kind = content.get("fisheye_model", content.get("distortion_model", 0))
@@ -195,6 +179,17 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
             f"{name}: a tilted sensor (tau {excerpt(coefficients[_TILT:])}) can't be converted"
         )
     return "radtan" if count <= 5 else "rational"
+
+
+def name_of_one(held: Sequence[str], camera_name: str, name: str, what: str = "camera") -> str:
+    """The name of the camera that is asked for of those that a file holds, or of the only one."""
+    listed = one_line(", ".join(held), _LONGEST_LIST) or "none"
+    if camera_name and camera_name not in held:
+        raise ConversionError(f"{name}: no camera {camera_name}: it holds {listed}")
+    if not camera_name and len(held) != 1:
+        advice = ": give --camera-name" if held else ""
+        raise ConversionError(f"{name}: expected one {what}: it holds {listed}{advice}")
+    return camera_name or held[0]
 
 
 def foreign(
@@ -267,20 +262,15 @@ def camera_from_message(
             f"{', '.join(_ROS_MODELS)}"
         )
     model = _ROS_MODELS[label]
-    allowed = {"radtan": (0, 4, 5), "rational": (8, 12, 14), "fisheye": (4,)}[model]
-    if len(d) not in allowed or any(d[12:]):
-        raise ConversionError(
-            f"{name}: {len(d)} coefficients of {label}: expected "
-            f"{' or '.join(str(count) for count in allowed)}, without tilt"
-        )
+    if opencv_model(d, fisheye=model == "fisheye", name=name) != model:
+        raise ConversionError(f"{name}: {len(d)} coefficients, which are not of {label}")
     return foreign(name, model, width, height, pinhole, d)
 
 
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of a camera_info YAML file, or of an echoed message."""
     content = parse_yaml(text, name)
-    width = whole(first_of(content, ("image_width", "width"), name), "image_width", name)
-    height = whole(first_of(content, ("image_height", "height"), name), "image_height", name)
+    width, height = image_size(content, name)
     for key in ("binning_x", "binning_y"):
         binning = content.get(key)
         if isinstance(binning, int) and binning > 1:
@@ -348,15 +338,7 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     content = parse_yaml(text, name)
     cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
     cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
-    held = one_line(", ".join(cameras), _LONGEST_LIST)
-    if camera_name:
-        if camera_name not in cameras:
-            raise ConversionError(f"{name}: no {camera_name}: it holds {held}")
-    elif len(cameras) != 1:
-        there = f"it holds {held}: give --camera-name" if cameras else "it holds none"
-        raise ConversionError(f"{name}: expected one camera (cam0 with intrinsics), {there}")
-    else:
-        camera_name = next(iter(cameras))
+    camera_name = name_of_one(list(cameras), camera_name, name, "camera (cam0 with intrinsics)")
     entry: dict[str, Any] = cameras[camera_name]
     where = f"{name}: {one_line(camera_name, _LONGEST_LIST)}"
     if entry.get("camera_model", "pinhole") != "pinhole":

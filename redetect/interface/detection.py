@@ -25,11 +25,11 @@ from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from detect.viewing_options import CompareOptions
+from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.slam.formats.text import MEANING, Axes, covariance_from_dataset, from_dataset
 
-FloatArray = NDArray[np.float64]
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
 

@@ -61,6 +61,28 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool 
     return content
 
 
+def read_content(
+    path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
+) -> bytes:
+    """The content of a file of a kind; what `read_bounded` refuses becomes an `error`."""
+    try:
+        return read_bounded(path, largest_bytes)
+    except FileNotFoundError:
+        raise error(f"{path}: no such {kind}") from None
+    except OSError as why:
+        raise error(f"{path}: cannot be read as a {kind}: {why.strerror}") from None
+
+
+def read_text(
+    path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
+) -> str:
+    """The text of a file (UTF-8, perhaps with a byte order mark); errors as in `read_content`."""
+    try:
+        return read_content(path, largest_bytes, kind, error).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(f"{path}: cannot be read as a {kind}: it is no text") from None
+
+
 def writable_by_others(state: os.stat_result) -> str | None:
     """Why another user may have written to a file or folder; None if none can have."""
     if state.st_uid != os.geteuid():

@@ -13,12 +13,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera, CameraError
-from camera.distortion import Coef, fold_radius, largest_distorted_radius
+from camera.distortion import Coef, fold_radius, inverse_table
 from camera.model import Pose
 from camera.model_checks import border_pixels
 
 #: No camera of these tests looks farther to the side than this (80 deg off the axis).
 WIDEST = math.tan(math.radians(80.0))
+
+
+def largest_distorted_radius(coef: Coef) -> float:
+    """Largest distorted radius at which a ray is seen."""
+    return float(inverse_table(coef)[0][-1])
 
 
 def coefficients() -> st.SearchStrategy[Coef]:

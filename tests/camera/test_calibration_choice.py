@@ -15,7 +15,7 @@ from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings, Fre
 COUNTED = 756
 START = Estimate(np.zeros(COUNT), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 POINTS = Points(
-    np.zeros((COUNTED, 3)), np.zeros((COUNTED, 2)), np.zeros(1, dtype=np.int64), 640, 480
+    np.zeros((COUNTED, 3)), np.zeros((COUNTED, 2)), np.zeros(COUNTED, dtype=np.int64), 640, 480
 )
 
 # Hold-out errors (px), by the number of rational coefficients and of the polynomial's, without

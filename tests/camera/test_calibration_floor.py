@@ -20,7 +20,9 @@ def test_circles_on_the_floor_are_seen_through_perspective(published_camera: Cam
     centres = camera.project_floor(floor[:, :2])
     R = camera.camera_from_robot
     truth = Estimate(intrinsics_of(camera), R[None], (-R @ camera.centre)[None])
-    points = Points(floor, centres, np.zeros(1, dtype=np.int64), camera.width, camera.height)
+    points = Points(
+        floor, centres, np.zeros(len(floor), dtype=np.int64), camera.width, camera.height
+    )
     seen = centres + circle_shifts(truth, points, 0.06)
     naive = place_on_floor(camera, seen, floor[:, :2])
     found = place_on_floor(camera, seen, floor[:, :2], radius_m=0.06)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from camera import Camera, CameraError, format_camera, parse_camera, read_camera, write_camera
 from redetect.storage import OutputExistsError
 from tests.camera.strategies import cameras
-from tests.conftest import PUBLISHED_CAM
+from tools.published_camera import PUBLISHED_CAM
 
 NUMBERS = {
     "sensor2Tcp": "0.99992 -0.00994383 -0.00778315 -0.0820676 0.00718218 -0.0591054 0.998226 "
@@ -178,12 +178,12 @@ def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.cam"
     path.write_bytes(b"\xff\xd8\xff\xe0 not a calibration")
-    with pytest.raises(CameraError, match=r"cannot be read as a \.cam file"):
+    with pytest.raises(CameraError, match=r"cannot be read as a calibration file"):
         read_camera(path)
     path.write_bytes(b" " * (1 << 20) + b"{")
     with pytest.raises(CameraError, match="larger than 1048576 bytes"):
         read_camera(path)
-    with pytest.raises(CameraError, match=r"cannot be read as a \.cam file"):
+    with pytest.raises(CameraError, match=r"cannot be read as a calibration file"):
         read_camera(tmp_path)
 
 

@@ -11,9 +11,9 @@ from camera.boards.board import Board
 from camera.boards.charuco import find_charuco
 from camera.calibration.model import rotation_of
 from camera.errors import CalibrationError
+from redetect.array_types import FloatArray
 from tools.evaluation.boards import rays_of, render_board
 
-FloatArray = NDArray[np.float64]
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 BOARD = Board("charuco", 7, 6, 0.05, marker_m=0.038)
 T = np.array([0.01, 0.0, 0.42])

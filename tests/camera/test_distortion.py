@@ -13,12 +13,11 @@ from camera.distortion import (
     RADIUS_LIMIT,
     Coef,
     fold_radius,
-    largest_distorted_radius,
     radial_factor,
     radial_factor_derivative,
     undistorted_radius,
 )
-from tests.camera.strategies import coefficients
+from tests.camera.strategies import coefficients, largest_distorted_radius
 
 PUBLISHED: Coef = (-0.0620672, -0.324903, 0.314764, 1.52524, -0.480806)
 NONE: Coef = (0.0, 0.0, 0.0, 0.0, 0.0)

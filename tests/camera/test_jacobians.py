@@ -6,12 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 from hypothesis import given
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from tests.camera.strategies import cameras, pixel_grid
-
-FloatArray = NDArray[np.float64]
 
 
 def differences(
@@ -81,7 +79,7 @@ def test_published_jacobian_is_that_of_a_rigid_pose(published_camera: Camera) ->
     """The projection turns by the transpose, not by the inverse of a rotation in few digits."""
     camera = published_camera
 
-    def projected(floor_xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def projected(floor_xy: FloatArray) -> FloatArray:
         point = np.concatenate([floor_xy, np.zeros_like(floor_xy[:, :1])], axis=-1)
         return camera.project((point - camera.centre) @ camera.rotation)
 

@@ -13,7 +13,7 @@ from detect.circles import CircleDetections
 from detect.levelling import level_discs, levelled
 from detect.seen import level_seen
 from redetect.landmarks import FrameTilt
-from tests.conftest import PUBLISHED_CAM
+from tools.published_camera import PUBLISHED_CAM
 
 CAMERA = parse_camera(PUBLISHED_CAM)
 TRUE_XY = np.array([[0.0, -1.0], [1.1, -2.0], [-1.4, -3.2], [0.3, -4.5]])

@@ -23,7 +23,7 @@ from detect.levelling import levelled
 from detect.settings import CircleSettings
 from lut import DiscShape, cached_disc_table, cached_vertical_table
 from redetect.landmarks import FrameTilt
-from tests.conftest import PUBLISHED_CAM
+from tools.published_camera import PUBLISHED_CAM
 
 FLOOR_XY = np.array([[0.0, -1.0], [1.1, -2.0]])
 COVARIANCE = np.stack([1e-4 * np.eye(2)] * 2)

@@ -158,7 +158,7 @@ NASTY = [
     ("camera info", b"!!python/object/apply:os.system ['true']\n", "expected YAML"),
     ("kalibr", b"a: {intrinsics: 1}\n" + b"b" * 900 + b": {intrinsics: 1}\n", "it holds a, bbb"),
     ("floor points", b"u,v,x,y\n\"" + b"1" * 200_000, "expected floor points"),
-    ("floor points", b"\xff\n", "expected floor points"),
+    ("floor points", b"\xff\n", "floor points: it is no text"),
     ("settings", b"# settings refine_steps_px=((1-2,3))\n", "expected pairs of numbers"),
     ("settings", b"# settings blurred_widths=(2,1-2)\n", "expected numbers"),
     ("settings", b"# settings polarity=" + b"x" * 60_000, "expected one of"),

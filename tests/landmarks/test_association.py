@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import (
     Association,
     associate,
@@ -19,11 +19,9 @@ from redetect.landmarks import (
     wrap_angle,
 )
 
-FloatArray = NDArray[np.float64]
-
 
 @st.composite
-def problems(draw: st.DrawFn) -> tuple[FloatArray, NDArray[np.bool_]]:
+def problems(draw: st.DrawFn) -> tuple[FloatArray, BoolArray]:
     """Costs and gates of up to 5 x 5 rows, ties and wide ranges among them."""
     shape = draw(st.integers(0, 5)), draw(st.integers(0, 5))
     seed = draw(st.integers(0, 2**32 - 1))
@@ -38,7 +36,7 @@ def problems(draw: st.DrawFn) -> tuple[FloatArray, NDArray[np.bool_]]:
     return costs, allowed
 
 
-def best_by_trying_all(costs: FloatArray, allowed: NDArray[np.bool_]) -> tuple[int, float]:
+def best_by_trying_all(costs: FloatArray, allowed: BoolArray) -> tuple[int, float]:
     """Largest number of pairs, and the least total cost that many can have."""
     n_first, n_second = costs.shape
     for count in range(min(n_first, n_second), 0, -1):
@@ -60,7 +58,7 @@ def total(found: Association, costs: FloatArray) -> float:
 @settings(deadline=None)
 @given(problems())
 def test_pairs_are_allowed_one_to_one_and_nothing_is_lost(
-    problem: tuple[FloatArray, NDArray[np.bool_]],
+    problem: tuple[FloatArray, BoolArray],
 ) -> None:
     costs, allowed = problem
     found = associate(costs, allowed)
@@ -73,7 +71,7 @@ def test_pairs_are_allowed_one_to_one_and_nothing_is_lost(
 @settings(deadline=None, max_examples=50)
 @given(problems())
 def test_no_association_has_more_pairs_or_less_cost(
-    problem: tuple[FloatArray, NDArray[np.bool_]],
+    problem: tuple[FloatArray, BoolArray],
 ) -> None:
     costs, allowed = problem
     found = associate(costs, allowed)
@@ -86,7 +84,7 @@ def test_no_association_has_more_pairs_or_less_cost(
 @settings(deadline=None)
 @given(problems(), st.integers(0, 2**32 - 1))
 def test_the_order_of_the_rows_does_not_matter(
-    problem: tuple[FloatArray, NDArray[np.bool_]], seed: int
+    problem: tuple[FloatArray, BoolArray], seed: int
 ) -> None:
     costs, allowed = problem
     rng = np.random.default_rng(seed)

@@ -20,17 +20,7 @@ import pytest
 import lut.cache
 from camera import Camera, write_camera
 from lut import DiscShape, DiscTable, TableError, build_disc_table, cache_folder, cached_disc_table
-
-SHAPE = DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2)
-
-
-@pytest.fixture
-def camera(published_camera: Camera) -> Camera:
-    """The published camera at an eighth of its size: tables in milliseconds."""
-    return dataclasses.replace(
-        published_camera, width=96, height=36, scale_x=464.762 / 8, scale_y=232.381 / 8,
-        offset_x=48.0, offset_y=18.0,
-    )  # fmt: skip
+from tests.lut.conftest import SHAPE
 
 
 @pytest.fixture

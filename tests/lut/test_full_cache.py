@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera
-from lut import DiscShape, build_disc_table, build_vertical_table
+from lut import build_disc_table, build_vertical_table
 from lut.cache import cached_disc_table, cached_vertical_table
+from tests.lut.conftest import SHAPE
 from tests.storage.own_disks import fill, on_small_disk
-
-SHAPE = DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2)
 
 
 class Said(logging.Handler):
@@ -55,11 +54,7 @@ def costs_time_only(place: Path, camera: Camera) -> None:
     assert said.lines == []
 
 
-def test_no_room_for_tables_costs_time_only(tmp_path: Path, published_camera: Camera) -> None:
-    camera = dataclasses.replace(
-        published_camera, width=96, height=36, scale_x=464.762 / 8, scale_y=232.381 / 8,
-        offset_x=48.0, offset_y=18.0,
-    )  # fmt: skip
+def test_no_room_for_tables_costs_time_only(tmp_path: Path, camera: Camera) -> None:
     place = tmp_path / "disk"
     place.mkdir()
     on_small_disk(place, 1 << 20, costs_time_only, place, camera)

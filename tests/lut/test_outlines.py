@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from camera import Camera
-from camera.distortion import largest_distorted_radius
 from lut import (
     GROUP_COLUMNS,
     GROUP_SAMPLES,
@@ -26,11 +24,9 @@ from lut import (
     ring,
 )
 from lut.outlines import floor_positions
+from redetect.array_types import BoolArray, IntArray
 from redetect.landmarks import read_frames
-from tests.camera.strategies import cameras
-
-IntArray = NDArray[np.int64]
-
+from tests.camera.strategies import cameras, largest_distorted_radius
 
 # -- the reference --------------------------------------------------------------------------------
 
@@ -44,8 +40,8 @@ class Outlines:
 
     column: IntArray
     row: IntArray
-    inside: NDArray[np.bool_]
-    usable: NDArray[np.bool_]
+    inside: BoolArray
+    usable: BoolArray
     doubtful: bool
 
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.settings import Polarity
 from lut import DiscShape, ring
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import BoolArray, FloatArray, IntArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +32,12 @@ class PlainOutlines:
     """
 
     shape: tuple[int, int]
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-    index: NDArray[np.int64]
+    rows: IntArray
+    columns: IntArray
+    index: IntArray
 
 
-def plain_outlines(camera: Camera, shape: DiscShape, usable: NDArray[np.bool_]) -> PlainOutlines:
+def plain_outlines(camera: Camera, shape: DiscShape, usable: BoolArray) -> PlainOutlines:
     """Project the outlines of the usable centres, some thousands at a time."""
     height, width = camera.height, camera.width
     rings = np.concatenate(
@@ -112,7 +111,7 @@ def plain_maxima(quality: FloatArray, threshold: float) -> list[tuple[int, int]]
 
 def plain_best_centres(
     image: NDArray[np.uint8], outlines: PlainOutlines, threshold: float, polarity: Polarity = "any"
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
+) -> tuple[IntArray, FloatArray, NDArray[np.float32]]:
     """The plain maxima, of one polarity."""
     quality, contrast = plain_quality(image, outlines)
     if polarity != "any":

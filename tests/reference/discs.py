@@ -15,8 +15,7 @@ from scipy.special import chndtr, ndtr
 
 from detect.discs.model import BEND, T_LIMIT, Z_LIMIT
 from detect.discs.patch import Candidate, FitSettings
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray, IntArray
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -115,7 +114,7 @@ def chord_share(
 
 def pixels_within_reach(
     floor_xy: NDArray[np.float32], candidate: Candidate, settings: FitSettings
-) -> NDArray[np.int64]:
+) -> IntArray:
     """(N,) flat indices of all pixels to which a disc at the candidate is fitted."""
     floor = floor_xy.astype(float)
     u, v = candidate.u, candidate.v

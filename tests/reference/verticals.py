@@ -15,9 +15,7 @@ from scipy.special import logsumexp, softmax
 from detect.line_settings import LineSettings
 from detect.verticals.tilt import TiltEstimate, level_matrix
 from lut.verticals import VerticalTable
-
-FloatArray = NDArray[np.float64]
-
+from redetect.array_types import FloatArray, IntArray
 
 # -- response --------------------------------------------------------------------------------------
 
@@ -192,7 +190,7 @@ def tilt_error(
     normal: FloatArray,
     variance: FloatArray,
     weight: FloatArray,
-    edge: NDArray[np.int64],
+    edge: IntArray,
     tilt: tuple[float, float],
     prior: float,
     stray_share: float,
@@ -203,7 +201,7 @@ def tilt_error(
     """
     from detect.verticals.tilt import SCATTER_RAD, SCATTER_SHARE, STRAY_RAD, TOGETHER_RAD
 
-    def merged(label: NDArray[np.int64]) -> list[tuple[FloatArray, float]]:
+    def merged(label: IntArray) -> list[tuple[FloatArray, float]]:
         found = []
         for one in np.unique(label):
             own = label == one
@@ -330,7 +328,7 @@ def _wrapped(angle: FloatArray) -> FloatArray:
     return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-def close_groups(alpha_rad: ArrayLike, distance_rad: ArrayLike) -> NDArray[np.int64]:
+def close_groups(alpha_rad: ArrayLike, distance_rad: ArrayLike) -> IntArray:
     """Number groups of bearings from the left; neighbours closer than both distances are of one."""
     alpha, distance = np.asarray(alpha_rad), np.asarray(distance_rad)
     order = np.argsort(-alpha, kind="stable")

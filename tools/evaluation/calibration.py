@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,14 +139,15 @@ def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -
     """RMS error (px) in photographs left out, whose poses alone are fitted, by OpenCV's model."""
     import cv2
 
-    every = np.arange(len(points.starts))
+    every = np.arange(len(points.counts))
     flags = cv2.CALIB_RATIONAL_MODEL | (0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST)
     squares = 0.0
     size = (points.width, points.height)
     for out in folds:
         used = points.of(np.setdiff1d(every, out))
-        board = [used.board[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
-        seen = [used.pixels[s : s + n].astype(np.float32) for s, n in zip(used.starts, used.counts)]
+        rows = [used.views == view for view in range(len(used.counts))]
+        board = [used.board[chosen].astype(np.float32) for chosen in rows]
+        seen = [used.pixels[chosen].astype(np.float32) for chosen in rows]
         _, K, d, _, _ = cv2.calibrateCamera(board, seen, size, np.eye(3), np.zeros(8), flags=flags)
         for view in out:
             held = points.of(np.array([view]))
@@ -168,8 +170,19 @@ class Comparison:
     same without p1 and p2 (`radial`)."""
 
 
-def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = False) -> Comparison:
-    """Hold out photographs of a camera, by each of `splits`."""
+#: OpenCV's models, by their names in `Comparison.errors`: with p1 and p2, or without.
+OPENCV = {"rational": True, "radial": False}
+
+
+def compare(
+    folder: Path,
+    group: str,
+    *,
+    free_aspect: bool,
+    polynomial: bool = False,
+    peers: Sequence[str] = tuple(OPENCV),
+) -> Comparison:
+    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
@@ -182,12 +195,11 @@ def compare(folder: Path, group: str, *, free_aspect: bool, polynomial: bool = F
     errors = {
         name: {
             "ours": holdout_error(estimate, points, settings, lens, folds),
-            "rational": opencv_holdout(points, folds, tangential=True),
-            "radial": opencv_holdout(points, folds, tangential=False),
+            **{peer: opencv_holdout(points, folds, tangential=OPENCV[peer]) for peer in peers},
         }
-        for name, folds in splits(len(points.starts)).items()
+        for name, folds in splits(len(points.counts)).items()
     }
-    return Comparison(len(points.starts), len(points.board), lens, errors)
+    return Comparison(len(points.counts), len(points.board), lens, errors)
 
 
 _TYPES = ("checkerboard", "charuco", "asymmetric-circles")

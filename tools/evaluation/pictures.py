@@ -50,15 +50,17 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     panels = figure.subplots(3, 1)
     titles = (
         "quality of the outlines round every pixel: between-class over total variance",
-        f"candidates: {len(loose)} local maxima above {settings.threshold:g}, one per 0.14 m",
+        f"candidates: {len(loose)} local maxima above {settings.threshold:g}, one per "
+        f"{settings.separation_m:g} m",
         f"fitted through the lens, and weighed: {len(found)} discs (edge, and the two outlines)",
     )
     for axes, title in zip(panels, titles, strict=True):
         _image(axes, image, title)
     panels[0].imshow(np.where(quality > 0.0, quality, np.nan), cmap="magma", vmin=0, vmax=1)
     panels[1].plot(*loose.pixels.T, "+", color=_RINGS, markersize=7)
+    radii = settings.radius_m, settings.inner_radius_m, settings.outer_radius_m
     for centre in found.floor_xy:
-        for radius, colour in ((0.1, _EDGE), (0.06, _RINGS), (0.14, _RINGS)):
+        for radius, colour in zip(radii, (_EDGE, _RINGS, _RINGS)):
             outline = camera.project_floor(circle_on_floor(centre, radius))
             panels[2].plot(*outline.T, color=colour, lw=0.9)
 
@@ -94,17 +96,20 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
 def draw_tables(figure: Any, run: Path) -> None:
     """What is known of every pixel before the first image."""
     camera, image = _frame(run, 0)
-    table = cached_disc_table(camera, disc_shape(CircleSettings(rows_apart=0.0)))
+    settings = CircleSettings(rows_apart=0.0)
+    radii = settings.inner_radius_m, settings.outer_radius_m
+    table = cached_disc_table(camera, disc_shape(settings))
     verticals = cached_vertical_table(camera)
     panels = figure.subplots(2, 1)
-    _image(panels[0], image, "the two outlines (radius 0.06 and 0.14 m) about some pixels")
+    said = " and ".join(f"{radius:.3g}" for radius in radii)
+    _image(panels[0], image, f"the two outlines (radius {said} m) about some pixels")
     _image(panels[1], image, "horizon, and the verticals through some of its columns")
     panels[0].imshow(np.where(table.usable, np.nan, 0.35), cmap="gray", vmin=0, vmax=1, alpha=0.5)
     for u in range(60, camera.width, 108):
         for v in (140, 180, 225, 265):
             if table.usable[v, u]:
                 centre = table.floor_xy[v, u].astype(np.float64)
-                for radius in (0.06, 0.14):
+                for radius in radii:
                     outline = camera.project_floor(circle_on_floor(centre, radius))
                     panels[0].plot(*outline.T, color=_RINGS, lw=1)
                 panels[0].plot(u, v, ".", color=_EDGE, markersize=4)
@@ -121,7 +126,8 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
     from detect.settings import MarkerSettings
 
     camera, image = _frame(run, frame)
-    found = detect_markers(image, MarkerSettings(), camera)
+    settings = MarkerSettings()
+    found = detect_markers(image, settings, camera)
     panels = figure.subplots(1, 3)
     middles = found.corners.mean(axis=1)
     low, high = middles.min(axis=0) - 70, middles.max(axis=0) + 70
@@ -139,7 +145,7 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
             xlim=(max(low[0], 0), min(high[0], camera.width)),
             ylim=(min(high[1], camera.height), max(low[1], 0)),
         )
-    dark = dark_pixels(image, closing(image, 12), 0.5, 0.0)
+    dark = dark_pixels(image, closing(image, 12), settings.thresholds[0], 0.0)
     panels[0].imshow(np.where(dark > 0, 1.0, np.nan), cmap="autumn", vmin=0, vmax=1, alpha=0.6)
     for candidate in found.candidates:
         _polygon(panels[1], candidate.outline, "#3498db")

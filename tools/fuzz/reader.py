@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tools.published_camera import PUBLISHED_CAMERA
+from tools.published_camera import PUBLISHED_CAM
 
 #: Numbers and signs that readers of text may stumble over.
 NUMBERS = (b"nan", b"inf", b"1e308", b"-1e-320", b"1_0", b"0x1", b",", b"#", b"\\", b"\x1b[2J")
@@ -19,7 +19,7 @@ JSON_WORDS = (b"[", b"]", b"{", b"}", b'"', b":", b"null", b"true", b"1e999", b"
 
 NPZ_WORDS = (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", b"\xff\xff\xff\xff")
 
-CAMERA_TEXT = PUBLISHED_CAMERA.encode()
+CAMERA_TEXT = PUBLISHED_CAM.encode()
 
 #: Characters of a message beside the file's name.
 LONGEST_MESSAGE = 500

@@ -13,7 +13,7 @@ from camera import Camera, parse_camera, write_camera
 from camera.uncertainty import exact
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from tools.published_camera import PUBLISHED_CAMERA
+from tools.published_camera import PUBLISHED_CAM
 from tools.simulator.building import EXTENT
 from tools.simulator.driving import (
     DriveStyle,
@@ -54,7 +54,7 @@ class RunSettings:
     visits: float = 0.6  # Probability that a room with an open door is visited in passing.
     skip: int = 0  # Steps of the drive that go by before the first frame.
     unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
-    camera_text: str = PUBLISHED_CAMERA
+    camera_text: str = PUBLISHED_CAM
     """Text of the calibration (.cam) through which the run is seen."""
     style: DriveStyle = field(default_factory=DriveStyle)
     sensor: Sensor = field(default_factory=Sensor)

@@ -16,8 +16,8 @@ from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.camera.strategies import cameras
-from tests.conftest import PUBLISHED_CAM
 from tests.detect.painted_floor import LIGHT, PaintedFloor
+from tools.published_camera import PUBLISHED_CAM
 
 CAMERA = parse_camera(PUBLISHED_CAM)
 DEFAULT = CircleSettings()

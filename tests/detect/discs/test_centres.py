@@ -28,13 +28,13 @@ from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table
 from tests.camera.strategies import cameras
-from tests.conftest import PUBLISHED_CAM
 from tests.reference.centres import (
     PlainOutlines,
     plain_best_centres,
     plain_outlines,
     plain_quality,
 )
+from tools.published_camera import PUBLISHED_CAM
 
 GreyImage = NDArray[np.uint8]
 

@@ -16,7 +16,7 @@ from camera import Camera, parse_camera
 from detect.discs.candidates import suppress_neighbours
 from detect.discs.quality import Limits, centres_of, quality_of_centres
 from lut import DiscShape, build_disc_table, ring
-from tests.conftest import PUBLISHED_CAM
+from tools.published_camera import PUBLISHED_CAM
 
 # The first example of a property waits for the compiler: hence no deadlines.
 
