@@ -10,7 +10,6 @@ too.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from detect.comparison.floor import floor_bins, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
+    Comparison,
     DiscComparison,
     DistanceBin,
     FrameMatch,
@@ -61,39 +61,35 @@ _EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
 LEAST_SIGMA_RAD = 1e-12
 
 
-def rows_beside(
-    reference: str | os.PathLike[str], name: str, path: Path | None = None
-) -> list[Frame] | None:
-    """Rows of a file, by default that of a name beside a reference file; None without one."""
-    usual = Path(reference).parent / name
-    return list(read_frames(path or usual)) if path or usual.is_file() else None
-
-
-def compare_runs(
-    run: str | os.PathLike[str],
-    *,
-    reference: str | os.PathLike[str] | None = None,
-    detected: str | os.PathLike[str] | None = None,
+def compare_with_file(
+    kind: Kind,
+    reference: Path,
+    detected: Iterable[Frame],
     options: CompareOptions | None = None,
+    *,
     sight: Sight | None = None,
     unlisted: Path | None = None,
     lookalikes: Path | None = None,
-) -> DiscComparison:
-    """Compare the discs of two files, by default ``detected`` and ``map.circles`` in a run folder.
+    names: tuple[str, str] | None = None,
+) -> Comparison:
+    """Compare discs, or lines, with those of a reference file.
 
-    The rest as in `compare_frames`; unlisted discs and look-alikes are by default those in the
+    The rest as in `compare_frames`; unlisted ones and look-alikes are by default those in the
     reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
-    reference = Path(run) / "map.circles" if reference is None else reference
-    detected = Path(run) / "detected.circles" if detected is None else detected
+    names = names or (str(reference), "detected")
+    wanted = read_frames(reference)
+
+    def rows(name: str, path: Path | None) -> list[Frame] | None:
+        usual = reference.parent / f"{name}.{kind}"
+        return list(read_frames(path or usual)) if path or usual.is_file() else None
+
+    uncounted = rows("unlisted", unlisted)
+    if kind == "lines":
+        return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
+    alike = rows("lookalikes", lookalikes)
     return compare_frames(
-        read_frames(reference),
-        read_frames(detected),
-        options,
-        sight=sight,
-        unlisted=rows_beside(reference, "unlisted.circles", unlisted),
-        lookalikes=rows_beside(reference, "lookalikes.circles", lookalikes),
-        names=(os.fspath(reference), os.fspath(detected)),
+        wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, read_camera
-from detect.comparison.compare import compare_line_frames, compare_runs, rows_beside
+from detect.comparison.compare import compare_with_file
 from detect.comparison.result import (
     WORST_FRAMES,
     CommonLean,
@@ -20,6 +20,7 @@ from detect.comparison.result import (
     DiscComparison,
     DistanceBin,
     FloorBin,
+    Kind,
     Levelling,
     LineComparison,
     NormalisedError,
@@ -56,7 +57,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     """The comparison that a command asks for; with a camera, if it isn't named by its file."""
     if command.lines and command.lookalikes:
         raise DetectError("--lookalikes are of discs: expected none with --lines")
-    kind = "lines" if command.lines else "circles"
+    kind: Kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
     for path, advice in (
@@ -65,28 +66,22 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     ):
         if not path.exists():
             raise DetectError(f"{path}: no such landmark file: {advice}")
-    if command.lines:
-        return compare_line_frames(
-            read_frames(reference),
-            read_frames(detected),
-            command.matching,
-            unlisted=rows_beside(reference, "unlisted.lines", command.unlisted),
-            names=(str(reference), str(detected)),
-        )
-    if camera is None:
-        camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
     sight = None
-    if camera is not None:
+    if not command.lines:
+        if camera is None:
+            at = command.camera
+            camera = camera_in(command.run) if at is None else read_camera(at)
         radius_m = read_head(detected).circle_settings.radius_m
-        sight = Sight(camera, radius_m, read_head(reference).level)
-    return compare_runs(
-        command.run,
-        reference=reference,
-        detected=detected,
-        options=command.matching,
+        sight = None if camera is None else Sight(camera, radius_m, read_head(reference).level)
+    return compare_with_file(
+        kind,
+        reference,
+        read_frames(detected),
+        command.matching,
         sight=sight,
         unlisted=command.unlisted,
         lookalikes=command.lookalikes,
+        names=(str(reference), str(detected)),
     )
 
 

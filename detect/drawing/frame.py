@@ -370,21 +370,6 @@ def draw_disc_candidates(
     return with_legend(canvas, words, 190, 0.38)
 
 
-def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:
-    """Draw a response (`detect.verticals.response.line_response`, (H, W)) as a picture (H, W, 3).
-
-    Edges that are brighter on the right are red, on the left blue; the horizon is green.
-    """
-    strength = np.clip(np.abs(response) / (2.0 / np.pi), 0.0, 1.0)
-    shade = (255.0 * np.sqrt(strength)).astype(np.uint8)
-    canvas = np.zeros((*response.shape, 3), np.uint8)
-    canvas[..., 0] = np.where(response < 0.0, shade, 0)
-    canvas[..., 2] = np.where(response > 0.0, shade, 0)
-    columns = np.flatnonzero(table.usable)
-    canvas[np.rint(table.anchor_row[columns]).astype(np.intp), columns, 1] = 160
-    return canvas
-
-
 def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray:
     """(P, 2) image positions u, v of a track's points."""
     part = slice(tracks.bounds[t], tracks.bounds[t + 1])

@@ -370,21 +370,14 @@ class RateCurve(NamedTuple):
     kept: NDArray[np.int64]
 
 
-def disc_rates(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality."""
-    return _rates(comparison, "quality", np.asarray(qualities, np.float64), 1.0)
+def rates_over(comparison: DiscComparison | LineComparison, thresholds: ArrayLike) -> RateCurve:
+    """Recall and precision of discs of at least each quality, or of lines of at most each sigma.
 
-
-def line_rates(comparison: LineComparison, sigmas_rad: ArrayLike) -> RateCurve:
-    """Recall and precision of lines of at most each sigma."""
-    curve = _rates(comparison, "sigma", np.asarray(sigmas_rad, np.float64), -1.0)
-    return curve._replace(threshold=np.degrees(curve.threshold))
-
-
-def _rates(
-    comparison: DiscComparison | LineComparison, score: str, levels: FloatArray, sign: float
-) -> RateCurve:
-    """Rates at each threshold; rows are paired anew whenever fewer pass."""
+    Sigmas in radians. Rows are paired anew whenever fewer pass.
+    """
+    levels = np.asarray(thresholds, np.float64)
+    lines = isinstance(comparison, LineComparison)
+    score, sign = ("sigma", -1.0) if lines else ("quality", 1.0)
     found, right, kept = np.zeros((3, len(levels)), np.int64)
     for match in comparison.frames:
         passed = match.frame.detected
@@ -398,7 +391,7 @@ def _rates(
             kept[k] += len(match.matched) + len(match.extra)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), right / kept
-    return RateCurve(levels, recall, precision, kept)
+    return RateCurve(np.degrees(levels) if lines else levels, recall, precision, kept)
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

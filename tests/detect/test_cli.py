@@ -99,12 +99,6 @@ def test_flags_override_the_preset(small_run: Path, first: bool) -> None:
     assert counts == [2, 1, 0]
 
 
-def test_verification_can_be_turned_off(small_run: Path) -> None:
-    assert main(["circles", str(small_run), "--no-verify", "--no-refine"]) == 0
-    written = settings_of(small_run / "detected.circles")
-    assert (written["verify"], written["refine"]) == ("False", "False")
-
-
 def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
     drawings, as_json = tmp_path / "new" / "drawings", tmp_path / "rows.json"
     arguments = ["circles", str(small_run), "--draw", str(drawings), "--json", str(as_json)]
@@ -126,21 +120,6 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
             assert marked[v - 40 : v + 41, u - 60 : u + 61].sum() > 100
             marked[v - 40 : v + 41, u - 60 : u + 61] = False
         assert not marked.any()
-
-
-def test_bad_image_costs_its_frame_only(small_run: Path, capsys: Captured) -> None:
-    bad = small_run / "images" / "s.0001.png"
-    bad.write_bytes(b"no image")
-    assert main(["circles", str(small_run)]) == 3
-    shown = capsys.readouterr()
-    assert "2 discs in 3 frames" in shown.out
-    lines = shown.err.splitlines()
-    listed = lines.index("1 frames could not be worked on:")
-    assert lines[listed + 1] == f"  {bad}: cannot be decoded: expected an image"
-    assert len(lines) == listed + 2
-    frames = list(read_frames(small_run / "detected.circles"))
-    assert [frame.step.prefix for frame in frames] == list(SMALL_RUN_DISCS)
-    assert [len(frame.circles) for frame in frames] == [2, 0, 0]
 
 
 def test_image_of_another_size_is_listed(small_run: Path, capsys: Captured) -> None:

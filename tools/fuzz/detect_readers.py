@@ -126,8 +126,7 @@ def _message(encoding: str, step: int, bytes_there: int, big: int = 0) -> bytes:
 
 
 def _head(path: Path) -> object:
-    head = read_head(path)
-    return head.circle_settings, head.line_settings
+    return read_head(path).circle_settings
 
 
 def _journal(path: Path) -> object:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 
 from detect.cli import main
 from detect.sources.opening import open_run
+from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import StopAfter, forked_runs
 from tools.benchmark.material import repeated_run
 from tools.soak.short_runs import repeat_short_runs
@@ -30,13 +30,8 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source, run = project_root / "images" / "e", tmp_path_factory.mktemp("run") / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(FRAMES):
-        image = source / "images" / f"e.{number % 8:04d}.jpg"
-        shutil.copy(image, run / "images" / f"e.{number:04d}.jpg")
-    return run
+    run = tmp_path_factory.mktemp("run") / "e"
+    return demo_frames(project_root, run, [place % 8 for place in range(FRAMES)])
 
 
 @pytest.fixture(scope="module")

@@ -177,13 +177,6 @@ def test_strict_stops_at_the_first_bad_frame(small_run: Path, capsys: Captured, 
     assert sorted(path.name for path in small_run.rglob("*")) == before
 
 
-def test_strict_leaves_a_good_run_as_it_is(small_run: Path) -> None:
-    assert main(["circles", str(small_run)]) == 0
-    rows = (small_run / "detected.circles").read_bytes()
-    assert main(["circles", str(small_run), "--strict", "--force"]) == 0
-    assert (small_run / "detected.circles").read_bytes() == rows
-
-
 # -- what belongs to others -------------------------------------------------------------------
 
 

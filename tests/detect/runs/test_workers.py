@@ -34,6 +34,7 @@ from detect.runs.workers import (
 )
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
+from tests.detect.demo_frames import demo_frames
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48
@@ -46,17 +47,7 @@ PATIENCE_S = 600.0
 @pytest.fixture
 def run_folder(project_root: Path, tmp_path: Path) -> Path:
     """Long enough to be disturbed: frames of the demo run, over and over."""
-    source, run = project_root / "images" / "e", tmp_path / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    # Links that lead out of a run are refused.
-    (run / "few").mkdir()
-    for number in range(8):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "few")
-    for number in range(FRAMES):
-        image = run / "few" / f"e.{number % 8:04d}.jpg"
-        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
-    return run
+    return demo_frames(project_root, tmp_path / "e", [place % 8 for place in range(FRAMES)])
 
 
 def detected(
@@ -143,11 +134,12 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
 
 
 def make_long(run: Path) -> None:
+    """One image over and over; links that lead out of a run are refused."""
+    image = (run / "images" / "e.0000.jpg").rename(run / "image.jpg")
     shutil.rmtree(run / "images")
     (run / "images").mkdir()
     for number in range(MANY_FRAMES):
-        image = run / "images" / f"e.{number:04d}.jpg"
-        image.symlink_to(run / "few" / "e.0000.jpg")
+        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
 
 
 @contextmanager

@@ -256,12 +256,6 @@ def test_refusals_tell_what_to_do(
     assert told in line
 
 
-def test_a_wrong_size_tells_what_to_do(small_run: Path, capsys: Captured) -> None:
-    cv2.imwrite(str(small_run / "images" / "s.0001.png"), np.zeros((48, 64), np.uint8))
-    assert main(["circles", str(small_run)]) == 3
-    assert "is 64x48 px: expected 768x288, the calibration's size: name" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("command", ["circles", "lines", "markers", "all"])
 def test_help_shows_an_example(command: str, capsys: Captured) -> None:
     with pytest.raises(SystemExit):

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.cli import main
-from detect.comparison.compare import compare_runs
+from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.report.figures import f1_score, knee, pareto_front
@@ -115,8 +115,8 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
         (CircleSettings, "radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
         (CircleSettings, "least_rows", "1", "no parameter of CircleSettings"),
         (LineSettings, "radius_m", "1", "no parameter of LineSettings"),
-        (LineSettings, "refine_steps_px", "1", "cannot be varied"),
-        (LineSettings, "blurred_widths", "2", "cannot be varied"),
+        (LineSettings, "refine_steps_px", "1", "a list of numbers"),
+        (LineSettings, "blurred_widths", "2", "a list of numbers"),
         (CircleSettings, "threshold", "0.3:0.7", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.3:0.7:0", "FROM:TO:STEP"),
@@ -149,12 +149,13 @@ def test_all_combinations_are_tried() -> None:
 
 def test_records_mark_front_and_knee() -> None:
     grid = [{"threshold": k / 10} for k in range(len(CURVE))]
-    trials = [Trial(10, 9, 8, r, p, 0.0123456789, None) for r, p in CURVE]
-    records = trial_records(grid, trials, "m")
+    trials = [
+        Trial({"recall": r, "precision": p, "error_median_m": 0.0123456789}) for r, p in CURVE
+    ]
+    records = trial_records(grid, trials)
     assert [r["front"] for r in records] == [True] * 4 + [False] * 3
     assert [r["knee"] for r in records] == [False, True] + [False] * 5
     assert records[0]["error_median_m"] == 0.0123457
-    assert records[0]["normalised_error"] is None
     picture = curve_picture(grid, trials, "by hand")
     assert picture == curve_picture(grid, trials, "by hand")
     shown = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
@@ -191,7 +192,10 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     for row in rows:
         flags = ["--threshold", row["threshold"], "--samples", row["samples"]]
         assert main(["circles", str(small_run), *flags, "--force"]) == 0
-        expected = compare_runs(small_run)
+        reference, found = (
+            read_frames(small_run / f"{name}.circles") for name in ("map", "detected")
+        )
+        expected = compare_frames(reference, found)
         counts = (expected.reference, expected.detected, expected.matched)
         assert tuple(int(row[n]) for n in ("reference", "detected", "matched")) == counts
         assert row["recall"] == f"{expected.recall:.6g}"
