@@ -352,14 +352,6 @@ def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: 
     assert "<title>in</title>" in shown
 
 
-@pytest.mark.long
-def test_browser_has_nothing_to_complain_of(judged_run: Path, tmp_path: Path) -> None:
-    reported(judged_run, tmp_path / "r.html")
-    shown, said = in_browser(tmp_path / "r.html", tmp_path / "profile")
-    assert "Effective configuration" in shown
-    assert "CONSOLE" not in said
-
-
 def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:
     run, page = str(judged_run), tmp_path / "r.html"
     report = ["report", run, "-o", str(page)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,11 +13,13 @@ import pytest
 from detect.cli import main
 from detect.sources.opening import open_run
 from tests.detect.demo_frames import demo_frames
-from tests.detect.forked_runs import StopAfter, forked_runs
+from tests.detect.forked_runs import StopAfter, forked_runs, started
+from tests.detect.test_cli import files_in
 from tools.benchmark.material import repeated_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
+DETECT = ("-m", "detect")
 FRAMES = 16
 LONG_FRAMES = 80
 
@@ -41,25 +42,9 @@ def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return repeated_run(open_run(project_root / "images" / "e"), folder, LONG_FRAMES, 0)
 
 
-def started(arguments: list[str], **environment: str) -> subprocess.Popen[str]:
-    root = Path(__file__).resolve().parents[3]
-    return subprocess.Popen(
-        [sys.executable, "-m", "detect", *arguments],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root), **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
     _, said = process.communicate(timeout=PATIENCE_S)
     return process.returncode, said
-
-
-def results(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 def folder_of(path: Path) -> Path:
@@ -84,13 +69,13 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
         assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 0
     cold = {"REDETECT_CACHE": str(tmp_path / "tables")}
     processes = [
-        started([kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
+        started([*DETECT, kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
         for kind in kinds
     ]
     for process in processes:
         code, said = ended(process)
         assert code == 0, said
-    assert results(together) == results(alone)
+    assert files_in(together) == files_in(alone)
     tables = [path.name for path in (tmp_path / "tables").iterdir()]
     assert len(tables) == 2
     assert all(name.endswith(".table") for name in tables)
@@ -104,7 +89,7 @@ def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> 
         runs.started(arguments, StopAfter(FRAMES // 2)) as first,
     ):
         first.wait_until_stopped()
-        others = [started(arguments), started([*arguments, "--resume"])]
+        others = [started([*DETECT, *arguments, *flags]) for flags in ([], ["--resume"])]
         for code, said in map(ended, others):
             assert code == 1, said
             *_, line = said.splitlines()
@@ -113,7 +98,7 @@ def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> 
         first.go_on()
         assert first.wait() == 0, first.said()
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 5
+    assert len(files_in(output)) == 5
 
 
 def test_of_two_runs_that_may_overwrite_one_is_the_last(
@@ -127,10 +112,8 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
         runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first,
     ):
         first.wait_until_stopped()
-        others = [
-            started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
-            for _ in range(2)
-        ]
+        flags = ["--circles.threshold", "0.5", "--lines.alpha", "published"]
+        others = [started([*DETECT, *arguments, *flags]) for _ in range(2)]
         for process in others:  # at work, and neither resumes
             assert process.stderr is not None
             assert "another run is writing" in process.stderr.readline()
@@ -140,7 +123,7 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
             code, said = ended(process)
             assert code == 0, said
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 5  # and nothing that is hidden
+    assert len(files_in(output)) == 5  # and nothing that is hidden
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")

@@ -7,13 +7,10 @@ Whatever happens, the previous files are there or the new ones are, never a mixt
 from __future__ import annotations
 
 import multiprocessing
-import os
 import random
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +28,7 @@ from tests.detect.forked_runs import (
     Room,
     StopAfter,
     forked_runs,
+    started,
     wait_until_stopped,
 )
 from tests.detect.interrupted_runs import (
@@ -60,19 +58,6 @@ def lay_previous(folder: Path) -> dict[str, bytes]:
     for kind in KINDS:
         (folder / f"detected.{kind}").write_bytes(PREVIOUS)
     return results(folder)
-
-
-def started(arguments: list[str]) -> subprocess.Popen[str]:
-    root = Path(__file__).resolve().parents[3]
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
 
 
 def killed(runs: ForkedRuns, run: Path, output: Path, frames: int, *flags: str) -> int:

@@ -19,6 +19,7 @@ from detect.sources.interface import Frames, RunFrame
 from detect.sources.opening import open_run
 from redetect.landmarks import read_frames, read_tilts
 from tests.detect.demo_frames import demo_frames
+from tests.detect.test_cli import files_in
 
 LIGHT = CircleSettings(polarity="light")
 FRAMES = 7
@@ -62,14 +63,6 @@ def in_one_pass(run: Path, output: Path, jobs: int) -> None:
     assert (summary.frames, summary.failed) == (FRAMES, 2)
     assert summary.found["tilts"] >= 4
     assert summary.found["discs"] >= 5
-
-
-def files_in(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def folder_of(path: Path) -> Path:
