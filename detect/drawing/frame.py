@@ -24,7 +24,7 @@ from detect.drawing.inputs import SeenRows
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
-from detect.seen import Sight, circle_on_floor
+from detect.seen import Sight, circle_on_floor, ellipses
 from detect.settings import CircleSettings
 from detect.verticals.tracking import LineTracks
 from detect.viewing_options import CompareOptions
@@ -167,10 +167,9 @@ def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) ->
     for row in found:
         corners = np.array([(c.u, c.v) for c in row.corners])
         draw_curve(canvas, corners, LINE_COLOUR, closed=True)
-        for c in row.corners:
-            values, vectors = np.linalg.eigh([[c.cuu, c.cuv], [c.cuv, c.cvv]])
-            ellipse = _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-            draw_curve(canvas, ellipse + np.array([c.u, c.v]), LINE_COLOUR, closed=True)
+        spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
+        for ellipse in ellipses(corners, spreads, _SIGMAS, _POINTS):
+            draw_curve(canvas, ellipse, LINE_COLOUR, closed=True)
         draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
         draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 

@@ -18,7 +18,7 @@ from detect.comparison.result import (
     LinePairs,
 )
 from detect.drawing.inputs import SeenRows
-from detect.seen import circle_on_floor, summed_steps
+from detect.seen import ellipses, summed_steps
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
@@ -348,10 +348,7 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
 def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(N, 2) centres of a frame's discs and (N, P, 2) outlines of their ellipses, from a pose."""
     discs = circle_arrays(frame.circles)
-    values, vectors = np.linalg.eigh(discs.covariance)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    circle = circle_on_floor((0.0, 0.0), _SIGMAS, 32)
-    outlines = discs.xy[:, None, :] + np.einsum("nij,kj->nki", roots, circle)
+    outlines = ellipses(discs.xy, discs.covariance, _SIGMAS, 32)
     sine, cosine = np.sin(pose[2]), np.cos(pose[2])
     turn = np.array([[cosine, sine], [-sine, cosine]])
     closed = np.concatenate([outlines, outlines[:, :1]], axis=1)
