@@ -134,7 +134,7 @@ def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> 
     (small_run / "s.txt").unlink()
     for number in range(14):
         (small_run / "images" / f"z{number}.png").touch()
-    assert main(["circles", str(small_run)]) == 3
+    assert main(["markers", str(small_run)]) == 3
     lines = capsys.readouterr().err.splitlines()
     assert "14 frames could not be worked on:" in lines
     assert sum("is empty" in line for line in lines) == 10
@@ -366,16 +366,6 @@ def test_demands_decide_the_exit_code(
     assert len(lines) == unmet
     assert all("recall" in line for line in lines)
     assert "0.75" in shown.out or "75" in shown.out
-
-
-def test_unmet_precision(compared_run: Path, capsys: Captured) -> None:
-    extra = "LANDMARK_C -1 -2 0.9 0.002 0 0.003 -1\n"
-    rows = (compared_run / "detected.circles").read_text()
-    (compared_run / "detected.circles").write_text(rows + extra)
-    assert main(["compare", str(compared_run), "--min-precision", "0.76"]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "precision" in line
-    assert main(["compare", str(compared_run), "--min-precision", "0.75"]) == 0
 
 
 def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detect.cli import main, parsed
@@ -18,6 +18,7 @@ from detect.settings import PRESETS, CircleSettings, MarkerSettings
 from detect.settings_files import read_settings, settings_text
 
 
+@settings(max_examples=25)
 @given(
     st.sampled_from(list(PRESETS.values())),
     st.sampled_from(list(LINE_PRESETS.values())),

@@ -97,15 +97,6 @@ def test_head_tells_how_rows_were_made(small_run: Path) -> None:
     assert "768x288 px" in text
 
 
-def test_without_odometry_steps_are_zeros(small_run: Path) -> None:
-    (small_run / "s.txt").unlink()
-    output = small_run / "out.circles"
-    detected(open_run(small_run), CircleSettings(), output)
-    assert "the steps are zeros" in output.read_text()
-    for frame, prefix in zip(read_frames(output), SMALL_RUN_DISCS, strict=True):
-        assert dataclasses.astuple(frame.step) == (prefix, *[0.0] * 9)
-
-
 def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> None:
     (small_run / "images" / "s.0001.png").write_bytes(b"no image")
     (small_run / "images" / "s.0002.png").unlink()
