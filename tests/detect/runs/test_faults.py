@@ -163,12 +163,11 @@ def test_a_log_is_replaced_but_nothing_else(small_run: Path, capsys: Captured) -
     assert not output.exists()
 
 
-@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_strict_stops_at_the_first_bad_frame(small_run: Path, capsys: Captured, jobs: str) -> None:
+def test_strict_stops_at_the_first_bad_frame(small_run: Path, capsys: Captured) -> None:
     (small_run / "images" / "s.0001.png").write_bytes(b"no image")
     (small_run / "images" / "s.0002.png").unlink()
     before = sorted(path.name for path in small_run.rglob("*"))
-    assert main(["all", str(small_run), "--strict", "--jobs", jobs]) == 1
+    assert main(["all", str(small_run), "--strict"]) == 1
     shown = capsys.readouterr()
     assert shown.out == ""
     *_, line = shown.err.splitlines()

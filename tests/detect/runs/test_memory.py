@@ -31,8 +31,9 @@ from pathlib import Path
 from detect.cli import main
 
 if __name__ == "__main__":
-    for run in sys.argv[1:]:
-        assert main(["all", run, "--jobs", "2", "--force"]) == 0
+    jobs, *runs = sys.argv[1:]
+    for run in runs:
+        assert main(["all", run, "--jobs", jobs, "--force"]) == 0
         (own,) = re.findall(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())
         largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
         print("MiB:", int(own) / 1024, largest / 1024)
@@ -70,12 +71,15 @@ def in_a_bag(folder: Path, images: Images, count: int) -> Path:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="counts memory in Linux's units")
-@pytest.mark.parametrize("record", [in_a_folder, as_a_video, in_a_bag])
+@pytest.mark.parametrize(
+    ("record", "jobs"), [(in_a_folder, "1"), (as_a_video, "2"), (in_a_bag, "1")]
+)
 def test_memory_is_flat(
     project_root: Path,
     published_camera: Camera,
     tmp_path: Path,
     record: Callable[[Path, Images, int], Path],
+    jobs: str,
 ) -> None:
     k, full = _REDUCED, published_camera
     small = replace(
@@ -94,14 +98,14 @@ def test_memory_is_flat(
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     for _ in range(3):
-        with started([str(program), *runs]) as process:
+        with started([str(program), jobs, *runs]) as process:
             said, errors = process.communicate()
         assert process.returncode == 0, errors
         if "compiling kernels" not in errors:
             break  # it takes more memory than any run
     peaks = [line.split()[1:] for line in said.splitlines() if line.startswith("MiB:")]
     (own, worker), (own_long, worker_long) = np.array(peaks, float)
-    assert 50.0 < worker_long < 300.0
+    assert jobs == "1" or 50.0 < worker_long < 300.0
     # 1900 frames that left 3 kB each, less than their rows or images, would be seen.
     assert own_long - own < 6.0
     assert worker_long - worker < 6.0

@@ -92,10 +92,9 @@ def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None
 
 def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
     """Every kind of file: rows, tilts, IDs carried over, JSON, drawings."""
-    pictures = {kind: folder_of(output / kind) for kind in ("discs", "lines", "tracks")}
+    pictures = {kind: folder_of(output / kind) for kind in ("discs", "tracks")}
     plain = {"lines": output / "plain.lines", "tilt": output / "plain.tilt"}
-    places = {**plain, "pictures": pictures["lines"]}
-    detect(run, places, jobs, lines=LineSettings(), drawing="lines")
+    detect(run, plain, lines=LineSettings())
     reference = output / "reference.lines"
     numbered = (
         row[:-2] + f"{number}" if row.startswith("LANDMARK_L") else row
@@ -125,7 +124,7 @@ def test_drawings_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_
     two = all_there_is(run_folder, folder_of(tmp_path / "two"), 2)
     assert one == two
     drawn = [name for name in one if name.endswith(".png")]
-    assert len(drawn) == 3 * (FRAMES - 2)
+    assert len(drawn) == 2 * (FRAMES - 2)
     known = [line for f in read_frames(tmp_path / "one" / "known.lines") for line in f.lines]
     assert sum(line.ids != (-1,) for line in known) > 0.5 * len(known) > 20
 

@@ -101,7 +101,7 @@ def test_workers_write_the_same_bytes(project_root: Path, tmp_path: Path, kind: 
     source = project_root / "images" / "e"
     images = [
         np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((source / "images").glob("*.jpg"))[:40]
+        for path in sorted((source / "images").glob("*.jpg"))[:20]
     ]
     if kind == "video":
         path = write_video(tmp_path / "e.avi", images)
