@@ -264,7 +264,7 @@ def _message(
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
     row_type, frame_type = (types[name] for name in _message_types(table))
     content = [row_type(*map(_ros_value, row)) for row in rows]
-    return time_ns, frame_type(header, number, _ros_value(image), content)
+    return time_ns, frame_type(header, _ros_value(number), _ros_value(image), content)
 
 
 def _message_types(table: TableName) -> tuple[str, str]:

@@ -74,7 +74,7 @@ def ellipses(
     centres: ArrayLike, covariance: ArrayLike, sigmas: float, points: int = _POINTS
 ) -> FloatArray:
     """(..., points, 2) outlines of `sigmas` standard deviations round centres (..., 2)."""
-    values, axes = np.linalg.eigh(covariance)
+    values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     roots = axes * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     circle = circle_on_floor((0.0, 0.0), sigmas, points)
     return np.asarray(np.asarray(centres)[..., None, :] + circle @ roots.swapaxes(-1, -2))

@@ -18,8 +18,6 @@ from detect.comparison.result import (
     CommonLean,
     Comparison,
     DiscComparison,
-    DistanceBin,
-    FloorBin,
     Kind,
     Levelling,
     LineComparison,
@@ -241,7 +239,7 @@ def _over_distance(c: DiscComparison) -> FigureTable:
             )  # fmt: skip
             recall, precision, *medians = (number(value, 3) for value in figures)
             counts = [str(n) for n in (part.reference, part.missed, part.detected, part.extra)]
-            rows.append((range_text(part), *counts[:2], recall, *counts[2:], precision, *medians))
+            rows.append((str(part), *counts[:2], recall, *counts[2:], precision, *medians))
     caption = "By forward distance (position error and quality: medians)"
     return FigureTable(caption, head, tuple(rows))
 
@@ -253,7 +251,7 @@ def floor_table(c: DiscComparison) -> FigureTable:
         if part.before.pairs and part.after is not None:
             figures = [*astuple(part.before)[1:], *astuple(part.after)[1:]]
             shown = (number(value, 3) for value in figures)
-            rows.append((range_text(part), str(part.before.pairs), *shown))
+            rows.append((str(part), str(part.before.pairs), *shown))
     caption = (
         "On the floor, m: detected minus reference; the same after the common lean\n"
         "(along: farther away, across: to the left; medians)"
@@ -274,13 +272,6 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     )
     head = ("image", *c.counts, f"largest error {c.unit}")
     return FigureTable("Worst frames", head, rows)
-
-
-def range_text(part: DistanceBin | FloorBin) -> str:
-    """The range of forward distances of a bin (m), open at an end that is None."""
-    if part.from_m is None:
-        return f"< {part.to_m:g}"
-    return f">= {part.from_m:g}" if part.to_m is None else f"{part.from_m:g}-{part.to_m:g}"
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
-from detect.comparison.report import range_text
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
@@ -187,7 +186,7 @@ def distance_figure(bins: Sequence[DistanceBin]) -> Part:
             rates.plot(at, share, mark, color=colour, lw=1.2, ms=4, label=key)
         rates.set_ylim(0.0, 1.05)
         for axes, name in ((rows, "rows"), (rates, "share")):
-            axes.set_xticks(at, [range_text(part) for part in shown], fontsize=7)
+            axes.set_xticks(at, [str(part) for part in shown], fontsize=7)
             _finish(axes, "forward distance / m", name)
             axes.legend(fontsize=8)
     words = "Rows, recall and precision by forward distance, each side's rows by their own."

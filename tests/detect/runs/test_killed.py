@@ -103,7 +103,7 @@ def test_a_killed_run_is_resumed(
     assert process.returncode == -signal.SIGKILL
     assert journalled(output) == 14
     assert results(output) == before
-    assert resumed(run_folder, output, capsys, "--jobs", jobs) == 14
+    assert resumed(run_folder, output, capsys) == 14
     assert results(output) == undisturbed
     assert hidden(output) == set()
 
@@ -155,7 +155,7 @@ def test_killed_at_any_moment(
     moments = random.Random(5)
     outcomes = {"previous": 0, "new": 0, "between": 0}
     whole_s = processor_s_of(command(run_folder, output))
-    for trial in range(20):
+    for trial in range(12):
         jobs = "2" if trial % 5 == 4 else "1"
         before = lay_previous(output)
         arguments = command(run_folder, output, "--jobs", jobs)
@@ -177,7 +177,7 @@ def test_killed_at_any_moment(
         resumed(run_folder, output, capsys, "--jobs", "2" if trial == 4 else "1")
         assert results(output) == undisturbed
         assert hidden(output) == set()
-    assert outcomes["previous"] > 8
+    assert outcomes["previous"] > 4
     # They take them by four calls in a row: hardly any kill falls between those.
     assert outcomes["between"] <= 1
 
