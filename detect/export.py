@@ -11,13 +11,10 @@ from __future__ import annotations
 import codecs
 import csv
 import math
-import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
-from itertools import groupby, islice
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -61,13 +58,11 @@ def perform(command: Export) -> int:
         raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
     if to == "parquet":
         required_pyarrow()
-    rows = partial(table_rows, file, _times(command), rate_hz)
-    named = [_TABLES[file.suffix]] if file.suffix in _TABLES else []
-    tables = list(dict.fromkeys([*named, *sorted({row.table for row in rows()})]))
+    tables = read_tables(file, _times(command), rate_hz)
     if not tables:
         raise DetectError(f"{file}: no rows in it: expected STEP, LANDMARK or TILT rows")
     output = command.output or file.with_name(f"{file.name}.{to}")
-    places = {tables[0]: output} if to == "mcap" else _table_files(output, tables)
+    places = {next(iter(tables)): output} if to == "mcap" else _table_files(output, [*tables])
     for path in places.values():
         if path.exists() and path.samefile(file):
             raise DetectError(f"{path}: is the file to export: expected another output")
@@ -75,12 +70,13 @@ def perform(command: Export) -> int:
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
             if to == "mcap":
-                count = write_mcap(stream, tables, rows(), str(file))
-            elif to == "csv":
-                count = write_csv(stream, table, rows())
+                print(f"{path}: {write_mcap(stream, tables, str(file))} messages")
+                continue
+            if to == "csv":
+                write_csv(stream, table, tables[table])
             else:
-                count = write_parquet(stream, table, rows(), file.name)
-        print(f"{path}: {count} {'messages' if to == 'mcap' else 'rows'}")
+                write_parquet(stream, table, tables[table], file.name)
+        print(f"{path}: {len(tables[table])} rows")
     return 0
 
 
@@ -106,7 +102,6 @@ def _times(command: Export) -> dict[str, float] | None:
 #: The robot frame of the data set, X left and Y backward: not ROS's base_link.
 FRAME_ID = "robot_left_backward"
 
-_ROWS_AT_ONCE = 20_000
 _PACKAGE = "redetect_msgs/msg"
 _TYPES = {
     "text": "string",
@@ -116,28 +111,19 @@ _TYPES = {
 }
 
 
-class TableRow(NamedTuple):
-    """A row of a table: the number of its frame, the frame's prefix and time, and what follows."""
-
-    table: TableName
-    frame: int
-    image: str
-    time_s: float | None
-    values: tuple[Value, ...]
-
-    @property
-    def all_values(self) -> tuple[Value, ...]:
-        """The values of all columns."""
-        return (self.frame, self.image, self.time_s, *self.values)
+#: The values of all columns of a table: number, prefix and time of the frame, and what follows.
+Row = tuple[Value, ...]
 
 
-def table_rows(
+def read_tables(
     path: Path, times: Mapping[str, float] | None, rate_hz: float | None
-) -> Iterator[TableRow]:
-    """The rows of a landmark or tilt file.
+) -> dict[TableName, list[Row]]:
+    """The tables of a landmark or tilt file: first the one that its name says, even without rows.
 
     The times of frames are `times`, by their prefix, or follow from the frame rate, if known.
     """
+    named = _TABLES.get(path.suffix)
+    tables: dict[TableName, list[Row]] = {} if named is None else {named: []}
     image, time_s = "", None
     for frame, record in _records(path):
         if isinstance(record, Step | FrameTilt):
@@ -146,7 +132,9 @@ def table_rows(
                 time_s = times.get(image)
             elif rate_hz is not None:
                 time_s = frame / rate_hz
-        yield TableRow(table_of(record), frame, image, time_s, values_of(record))
+        row = (frame, image, time_s, *values_of(record))
+        tables.setdefault(table_of(record), []).append(row)
+    return dict(sorted(tables.items(), key=lambda table: (table[0] != named, table[0])))
 
 
 def _records(path: Path) -> Iterator[tuple[int, Step | Landmark | FrameTilt]]:
@@ -161,20 +149,15 @@ def _records(path: Path) -> Iterator[tuple[int, Step | Landmark | FrameTilt]]:
             yield frame, row.record
 
 
-def write_csv(stream: BinaryIO, table: TableName, rows: Iterable[TableRow]) -> int:
-    """Write a table; rows of other tables are passed over. Returns how many rows were written."""
+def write_csv(stream: BinaryIO, table: TableName, rows: Sequence[Row]) -> None:
+    """Write a table."""
     text = codecs.getwriter("utf-8")(stream, "surrogateescape")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(column.name for column in TABLES[table])
-    count = 0
-    for row in rows:
-        if row.table == table:
-            writer.writerow(
-                " ".join(map(str, value)) if isinstance(value, tuple) else value
-                for value in row.all_values
-            )
-            count += 1
-    return count
+    writer.writerows(
+        [" ".join(map(str, value)) if isinstance(value, tuple) else value for value in row]
+        for row in rows
+    )
 
 
 def required_pyarrow() -> Any:
@@ -189,7 +172,7 @@ def required_pyarrow() -> Any:
     return pyarrow
 
 
-def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], source: str) -> int:
+def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], source: str) -> None:
     """Write a table as `write_csv`; `source` is for the file's own description."""
     pa = required_pyarrow()
     types: dict[str, Any] = {
@@ -203,21 +186,14 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Iterable[TableRow], 
         for c in TABLES[table]
     ]
     schema = pa.schema(fields, metadata={"table": table, "source": source})
-    own = (row.all_values for row in rows if row.table == table)
-    count = 0
-    with pa.parquet.ParquetWriter(stream, schema) as writer:
-        while part := list(islice(own, _ROWS_AT_ONCE)):
-            try:
-                arrays = [pa.array(c, f.type) for c, f in zip(zip(*part), fields)]
-            except UnicodeEncodeError:
-                raise DetectError(
-                    f"{source}: the name of an image is no Unicode: Parquet cannot hold it"
-                ) from None
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-            count += len(part)
-        if not count:
-            writer.write_table(schema.empty_table())
-    return count
+    columns = list(zip(*rows)) or [()] * len(fields)
+    try:
+        arrays = [pa.array(column, field.type) for column, field in zip(columns, fields)]
+    except UnicodeEncodeError:
+        raise DetectError(
+            f"{source}: the name of an image is no Unicode: Parquet cannot hold it"
+        ) from None
+    pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), stream)
 
 
 def message_definitions(table: TableName) -> dict[str, str]:
@@ -243,14 +219,15 @@ def topic_of(table: TableName) -> str:
     return f"/redetect/{table}"
 
 
-def write_mcap(
-    stream: BinaryIO, tables: list[TableName], rows: Iterable[TableRow], source: str
-) -> int:
-    """Write rows, those of a frame consecutive, as messages; returns how many."""
+def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
+    """Write a message for each frame and table, also where there are no rows; returns how many."""
     store = _typestore()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    count = 0
+    frames = {row[:3]: dict[TableName, list[Row]]() for rows in tables.values() for row in rows}
+    for table, rows in tables.items():
+        for row in rows:
+            frames[row[:3]].setdefault(table, []).append(row[3:])
     with tempfile.TemporaryDirectory(prefix="redetect-") as folder:
         bag = Path(folder) / "detections"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -260,37 +237,34 @@ def write_mcap(
                 )
                 for table in tables
             }
-            for table, time_ns, message in _messages(rows, tables, store, source):
-                content = store.serialize_cdr(message, message.__msgtype__)
-                writer.write(connections[table], time_ns, content)
-                count += 1
-        with (bag / "detections.mcap").open("rb") as written:
-            shutil.copyfileobj(written, stream)
-    return count
+            for frame, found in sorted(frames.items()):
+                for table, connection in connections.items():
+                    time_ns, message = _message(store, table, frame, found.get(table, []), source)
+                    content = store.serialize_cdr(message, message.__msgtype__)
+                    writer.write(connection, time_ns, content)
+        stream.write((bag / "detections.mcap").read_bytes())
+    return len(frames) * len(tables)
 
 
-def _messages(
-    rows: Iterable[TableRow], tables: list[TableName], store: Typestore, source: str
-) -> Iterator[tuple[TableName, int, Any]]:
-    """A message for each frame and table, also where a frame has no rows of it."""
+def _message(
+    store: Typestore, table: TableName, frame: Row, rows: Sequence[Row], source: str
+) -> tuple[int, Any]:
+    """The time (ns) and the message of a frame: its number, image and time."""
     types = store.types
-    for frame, of_frame in groupby(rows, key=lambda row: row.frame):
-        found = list(of_frame)
-        image, time_s = found[0].image, found[0].time_s
-        if time_s is None:
-            raise DetectError(
-                f"{source}: no time of {image}: messages need one: name a file of rows "
-                "'prefix seconds' by --times, or give --rate-hz"
-            )
-        time_ns = round(time_s * 1e9)
-        if not 0 <= time_ns < 2**31 * 10**9:
-            raise DetectError(f"{source}: {image} is from {time_s:g} s: expected 0 to 2^31 s")
-        stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
-        for table in tables:
-            row_type, frame_type = (types[name] for name in _message_types(table))
-            content = [row_type(*map(_ros_value, r.values)) for r in found if r.table == table]
-            yield table, time_ns, frame_type(header, frame, _ros_value(image), content)
+    number, image, time_s = frame
+    if not isinstance(time_s, float):
+        raise DetectError(
+            f"{source}: no time of {image}: messages need one: name a file of rows "
+            "'prefix seconds' by --times, or give --rate-hz"
+        )
+    time_ns = round(time_s * 1e9)
+    if not 0 <= time_ns < 2**31 * 10**9:
+        raise DetectError(f"{source}: {image} is from {time_s:g} s: expected 0 to 2^31 s")
+    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
+    row_type, frame_type = (types[name] for name in _message_types(table))
+    content = [row_type(*map(_ros_value, row)) for row in rows]
+    return time_ns, frame_type(header, _ros_value(number), _ros_value(image), content)
 
 
 def _message_types(table: TableName) -> tuple[str, str]:

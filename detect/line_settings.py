@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Literal, NamedTuple, get_type_hints
 
 from detect.errors import DetectError
 from redetect.storage.bounds import (
@@ -137,63 +138,30 @@ class LineSettings:
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
 
 
-class TrackingNumbers(NamedTuple):
-    """What tracking reads of settings; see `LineSettings`."""
+DEFAULT = LineSettings()
 
-    threshold: float
-    border_rows: int
-    gap_rows: int
-    guided_pull: float
-    guided_reach_px: float
-
-
-class JudgementNumbers(NamedTuple):
-    """What the judgement of tracks by themselves reads of settings, for rows of some height."""
-
-    least_points: int
-    least_evidence: float
-    least_sharpness: float
-    soft_evidence: float
-    largest_horizon_gap_px: float
-    largest_scatter_px: float
-    largest_shift_px: float
-    largest_noise_px: float
-    bend_px: float
-    lean_noise: float
-    building_deg: float
-    largest_lean_deg: float
-    largest_lean_sigmas: float
-    largest_lean_px: float
-    weight_limit: float
-    same_edge_px: float
-
-
-class TiltNumbers(NamedTuple):
-    """What the consensus about the tilt reads of settings."""
-
-    largest_tilt_deg: float
-    tilt_prior_deg: float
-    proposers: int
-    least_lines: int
-    stray_share: float
-
-
-class JoiningNumbers(NamedTuple):
-    """What joining reads of settings."""
-
-    building_deg: float
-    same_edge_px: float
-    join_px: float
-    join_share: float
-    joined_equally: bool
-    shoulder_px: float
-    shoulder_share: float
-    sigma_px: float
-    level: bool
+# What compiled code reads of settings, stage by stage: a field takes time at each call.
+TrackingNumbers = namedtuple(
+    "TrackingNumbers", "threshold border_rows gap_rows guided_pull guided_reach_px"
+)
+JudgementNumbers = namedtuple(
+    "JudgementNumbers",
+    "least_points least_evidence least_sharpness soft_evidence largest_horizon_gap_px "
+    "largest_scatter_px largest_shift_px largest_noise_px bend_px lean_noise building_deg "
+    "largest_lean_deg largest_lean_sigmas largest_lean_px weight_limit same_edge_px",
+)
+TiltNumbers = namedtuple(
+    "TiltNumbers", "largest_tilt_deg tilt_prior_deg proposers least_lines stray_share"
+)
+JoiningNumbers = namedtuple(
+    "JoiningNumbers",
+    "building_deg same_edge_px join_px join_share joined_equally shoulder_px shoulder_share "
+    "sigma_px level",
+)
 
 
 class LineNumbers(NamedTuple):
-    """What compiled code reads of settings, stage by stage: a field takes time at each call."""
+    """The numbers of some settings for compiled code: fields of `LineSettings`."""
 
     tracking: TrackingNumbers
     judgement: JudgementNumbers
@@ -203,8 +171,11 @@ class LineNumbers(NamedTuple):
     @classmethod
     def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
         """Those of some settings, for rows of some height in widths of a pixel."""
-        given: dict[str, Any] = {
-            **vars(settings),
+        # Compiled code distinguishes 1 from 1.0: each number is of its default's type.
+        given = {
+            name: type(usual)(getattr(settings, name)) for name, usual in vars(DEFAULT).items()
+        }
+        given |= {
             "least_points": settings.least_points(row_aspect),
             "joined_equally": settings.joined == "equal",
             "level": settings.alpha == "level",
@@ -212,12 +183,8 @@ class LineNumbers(NamedTuple):
         if not settings.guided:
             # Any curve, and not only lines.
             given |= {"guided_pull": 1.0, "guided_reach_px": 1.0}
-        stages = (
-            # Compiled code distinguishes 1 from 1.0.
-            stage(**{name: kind(given[name]) for name, kind in get_type_hints(stage).items()})
-            for stage in get_type_hints(cls).values()
-        )
-        return cls(*stages)
+        stages = get_type_hints(cls).values()
+        return cls(*(stage(**{name: given[name] for name in stage._fields}) for stage in stages))
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).
@@ -265,7 +232,5 @@ REPORT = replace(
     joined="evidence",
     sigma_px=1.0,
 )
-
-DEFAULT = LineSettings()
 
 PRESETS = {"default": DEFAULT, "published": PUBLISHED, "report": REPORT}

@@ -121,7 +121,6 @@ def mounting_of_run(
     run = tilt_of_run(verticals)
     if run is None:
         return None
-    pitch, roll = run.axes
     known = np.isfinite(outline_pitch_rad).all(axis=1) & np.isfinite(verticals.tilt[:, 0])
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
@@ -138,11 +137,12 @@ def mounting_of_run(
         statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
         raised_m = share * height_m
         sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
+    (pitch, roll), (pitch_sigma, roll_sigma) = run.lean.tolist(), run.lean_sigma.tolist()
     return Mounting(
-        pitch_rad=pitch.lean,
-        roll_rad=roll.lean,
-        pitch_sigma_rad=pitch.lean_sigma,
-        roll_sigma_rad=roll.lean_sigma,
+        pitch_rad=pitch,
+        roll_rad=roll,
+        pitch_sigma_rad=pitch_sigma,
+        roll_sigma_rad=roll_sigma,
         raised_m=raised_m,
         raised_sigma_m=sigma_m,
         frames=int(np.count_nonzero(np.isfinite(verticals.tilt[:, 0]))),

@@ -188,7 +188,6 @@ class Lines(DetectorFlags):
     #: Folder for images with the lines and their standard deviations drawn in.
     draw: MaybePath = None
     rejected: bool = False  #: Draw all tracks instead, the rejected ones with the reason.
-    response: bool = False  #: Draw the filter's response as well, into files of their own.
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 

@@ -75,20 +75,12 @@ def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
 
 
 @dataclass(frozen=True, eq=False)
-class AxisModel:
-    """Estimated model of one axis."""
-
-    lean: float  # the constant (rad)
-    lean_sigma: float  # its standard deviation (rad)
-    spread: float  # standard deviation of true tilts about it (rad)
-
-
-@dataclass(frozen=True, eq=False)
 class RunTilt:
-    """The tilt of all frames of a run."""
+    """The tilt of all frames of a run: pitch and roll (rad)."""
 
-    axes: tuple[AxisModel, AxisModel]  # pitch and roll
-    tilt: FloatArray  # (N, 2) pitch and roll of each frame (rad)
+    lean: FloatArray  # (2,) the constants
+    lean_sigma: FloatArray  # (2,) their standard deviations
+    tilt: FloatArray  # (N, 2) of each frame
     #: (N, 2) of them (rad^2), the constant's included; the axes are assumed to be independent
     variance: FloatArray
     #: Of the camera's height, as a share of it, where its calibration does not state it.
@@ -97,8 +89,8 @@ class RunTilt:
     def sentence(self) -> str:
         """The constant lean, and that it was used."""
         pitch, roll = (
-            f"{math.degrees(axis.lean):.2f} +- {math.degrees(axis.lean_sigma):.2f}"
-            for axis in self.axes
+            f"{math.degrees(lean):.2f} +- {math.degrees(sigma):.2f}"
+            for lean, sigma in zip(self.lean, self.lean_sigma)
         )
         return (
             f"the camera leans {pitch} (pitch) and {roll} degrees (roll) from its calibration: "
@@ -129,24 +121,29 @@ def tilt_of_run(
     exact = _share_exact(apart)
     # Of a calibration that states its covariance, verticals and height are as good as it says.
     between = np.nan_to_num(apart) if common_variance is None else np.zeros(2)
-    axes, tilts, variances = [], [], []
-    for k, (axis, one) in enumerate(zip(series, found)):
-        tilt, of_deviation = axis.tilt(one)
-        # How far a frame's tilt follows the constant: where it is well measured, not at all.
-        shifted = axis.tilt(one._replace(lean=one.lean + _UNIT_RAD))[0]
-        share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
-        if common_variance is None:
-            common = COMMON_RAD**2 + between[k] ** 2 / 12.0  # the latter: uniform between them
-            common = exact * _EXACT_RAD**2 + (1.0 - exact) * common
-        else:
-            common = float(common_variance[k])
-        lean = one.lean + 0.5 * between[k]
-        axes.append(AxisModel(lean, math.sqrt(one.lean_variance + common), one.spread))
-        tilts.append(tilt + 0.5 * between[k])
-        variances.append(of_deviation + share**2 * one.lean_variance + common)
+    lean, lean_variance = np.array([(one.lean, one.lean_variance) for one in found]).T
+    tilt, of_deviation = _tilts(series, found)
+    # How far a frame's tilt follows the constant: where it is well measured, not at all.
+    shifted, _ = _tilts(series, [one._replace(lean=one.lean + _UNIT_RAD) for one in found])
+    share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
+    if common_variance is None:
+        common_variance = COMMON_RAD**2 + between**2 / 12.0  # the latter: uniform between them
+        common_variance = exact * _EXACT_RAD**2 + (1.0 - exact) * common_variance
     pitch_sigma = math.sqrt((1.0 - exact) * between[0] ** 2 / 12.0)
-    height_sigma = pitch_sigma / OUTLINE_PITCH_PER_HEIGHT
-    return RunTilt((axes[0], axes[1]), np.stack(tilts, -1), np.stack(variances, -1), height_sigma)
+    return RunTilt(
+        lean + 0.5 * between,
+        np.sqrt(lean_variance + common_variance),
+        tilt + 0.5 * between,
+        of_deviation + share**2 * lean_variance + common_variance,
+        pitch_sigma / OUTLINE_PITCH_PER_HEIGHT,
+    )
+
+
+def _tilts(series: Sequence[_Series], found: Sequence[_Axis]) -> tuple[FloatArray, FloatArray]:
+    """(N, 2) tilts of the frames, and their variances if the constants are right."""
+    smoothed = [axis.smoothed(one) for axis, one in zip(series, found)]
+    tilt = np.stack([one.lean + each[1] for one, each in zip(found, smoothed)], axis=-1)
+    return tilt, np.stack([each[2] for each in smoothed], axis=-1)
 
 
 def _are_enough(outlines: FrameTilts, verticals: FrameTilts) -> bool:
@@ -201,11 +198,6 @@ class _Series(NamedTuple):
             deviation,
             of_deviation,
         )
-
-    def tilt(self, axis: _Axis) -> tuple[FloatArray, FloatArray]:
-        """The tilt of each frame, and its variance if the constant is right."""
-        _, deviation, variance = self.smoothed(axis)
-        return axis.lean + deviation, variance
 
 
 def _log_density(difference: FloatArray, variance: FloatArray) -> float:

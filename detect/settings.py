@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from detect.errors import DetectError
 from redetect.storage.bounds import (
@@ -21,7 +21,6 @@ from redetect.storage.bounds import (
     from_to,
     whole,
 )
-from redetect.storage.messages import excerpt
 
 #: Tilt by which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
@@ -148,35 +147,6 @@ REPORT = CircleSettings(
 )
 
 PRESETS = {"default": CircleSettings(), "published": PUBLISHED, "report": REPORT}
-
-
-def parameter_value(kind: type, name: str, text: str) -> Any:
-    """Convert a word to the value of a field of a dataclass of parameters.
-
-    Raises DetectError if there is no such field, it is no single value, or this is none of its.
-    """
-    known = {field.name for field in fields(kind)}
-    if name not in known:
-        raise DetectError(
-            f"{name} is no parameter of {kind.__name__}: expected one of {', '.join(sorted(known))}"
-        )
-    wanted = get_type_hints(kind)[name]
-    if wanted in (int, float):
-        try:
-            return wanted(text)
-        except ValueError:
-            expected = "a whole number" if wanted is int else "a number"
-    elif wanted is bool:
-        if text.lower() in ("true", "false"):
-            return text.lower() == "true"
-        expected = "True or False"
-    elif get_origin(wanted) is Literal:
-        if text in get_args(wanted):
-            return text
-        expected = f"one of {', '.join(get_args(wanted))}"
-    else:
-        raise DetectError(f"{name} is no single number or word: it cannot be varied")
-    raise DetectError(f"{name} is {excerpt(text)}: expected {expected}")
 
 
 _LEAST_WIDTH = Bounds("4 or more", 4.0, below=True)

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
+from redetect.storage.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
 Kind = TypeVar("Kind", CircleSettings, LineSettings, MarkerSettings)
@@ -62,26 +64,54 @@ def checked_settings(name: str, values: Any, kind: type[Kind]) -> Kind:
     """Settings from values of JSON; a DetectError if one is unknown, or cannot be."""
     if not isinstance(values, Mapping):
         raise DetectError(f"settings of {name}: expected names and values")
-    for unknown in sorted(values.keys() - {each.name for each in fields(kind)}):
-        raise DetectError(f"{name} have no setting {unknown!r}")
-    default = kind()
-    for key, value in values.items():
-        if not _is_like(value, getattr(default, key)):
-            raise DetectError(f"{key} of {name} is {value!r}: expected another type")
-    return kind(**{key: _tuples(value) for key, value in values.items()})
+    return kind(**{key: setting_value(kind, key, value) for key, value in values.items()})
 
 
-def _is_like(value: Any, usual: Any) -> bool:
-    """Whether a value of JSON is of the type of a setting."""
-    if isinstance(usual, bool) or isinstance(value, bool):
-        return isinstance(value, bool) and isinstance(usual, bool)
-    if isinstance(usual, float):
-        return isinstance(value, int | float)
-    return isinstance(value, list if isinstance(usual, tuple) else type(usual))
+def setting_value(kind: type, name: str, value: Any) -> Any:
+    """A value of JSON as that of a setting: a field of a dataclass.
+
+    Raises DetectError if there is no such field, or the value is of another type.
+    """
+    hints = get_type_hints(kind)
+    if name not in hints:
+        raise DetectError(
+            f"{name} is no parameter of {kind.__name__}: expected one of {', '.join(sorted(hints))}"
+        )
+    try:
+        return _of_type(hints[name], value)
+    except (TypeError, OverflowError):
+        kinds = {bool: "True or False", int: "a whole number", float: "a number"}
+        words = ", ".join(map(str, get_args(hints[name])))
+        expected = kinds.get(hints[name], f"one of {words}")
+        if get_origin(hints[name]) is tuple:
+            expected = "a list of numbers, or of pairs of them"
+        raise DetectError(f"{name} is {excerpt(value)}: expected {expected}") from None
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
+def _of_type(hint: Any, value: Any) -> Any:
+    """A value of JSON as one of a type; a TypeError if it is of another."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        inner = get_args(hint)
+        each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
+        if len(each) == len(value):
+            return tuple(_of_type(kind, one) for kind, one in zip(each, value))
+    if hint is float and type(value) in (int, float):
+        return float(value)
+    if type(value) is hint or (get_origin(hint) is Literal and value in get_args(hint)):
+        return value
+    raise TypeError
+
+
+def word_value(kind: type, name: str, word: str) -> Any:
+    """A word of a command line or of a file's head as the value of a setting.
+
+    Raises DetectError if it is none, or there is no such setting.
+    """
+    value: Any = {"true": True, "false": False}.get(word.lower(), word)
+    for number in (float, int):  # whole numbers are both
+        with suppress(ValueError):
+            value = number(word)
+    return setting_value(kind, name, value)
 
 
 def settings_text(**settings: CircleSettings | LineSettings | MarkerSettings) -> str:

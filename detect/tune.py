@@ -9,10 +9,10 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from decimal import Decimal, InvalidOperation
 from itertools import chain, islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,8 @@ from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
 from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
-from detect.settings import PUBLISHED, CircleSettings, parameter_value
-from detect.settings_files import read_settings
+from detect.settings import PUBLISHED, CircleSettings
+from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
@@ -80,10 +80,9 @@ def perform(options: Tune) -> int:
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     tilts = None if options.tilt is None else read_tilts(options.tilt)
     with progress_bar("trials", count) as advance:
-        trials = list(
-            tune_run(run, frames, settings, gates, workers, tilts=tilts, on_progress=advance)
-        )
-    records = trial_records(grid, trials, "deg" if options.verticals else "m")
+        tuned = tune_run(run, frames, settings, gates, workers, tilts=tilts, on_progress=advance)
+        trials = list(tuned)
+    records = trial_records(grid, trials)
     head = {
         "version": __version__,
         "run": run.name,
@@ -160,7 +159,7 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
     """The values of a parameter that are to be tried, each once.
 
     `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
-    of `parameter_value`.
+    of `word_value`.
     """
     words = text.split(",")
     if ":" in text:
@@ -173,7 +172,7 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
             words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
         except (InvalidOperation, ValueError):
             raise DetectError(expected) from None
-    return tuple(dict.fromkeys(parameter_value(kind, name, word.strip()) for word in words))
+    return tuple(dict.fromkeys(word_value(kind, name, word.strip()) for word in words))
 
 
 def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
@@ -200,22 +199,13 @@ FloatArray = NDArray[np.float64]
 _MOST_NAMED = 12
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Result of one setting, as in `detect.comparison.result.Comparison`.
+class Trial(NamedTuple):
+    """Figures of one setting, as in tables, and why frames could not be worked on.
 
-    `matched` are the reference rows that were found. The median error is in metres (discs) or
-    degrees (verticals), the normalised one squared per degree of freedom. Frames in `failures`
-    could not be worked on: they count as frames without detections.
+    Those count as frames without detections.
     """
 
-    reference: int
-    detected: int
-    matched: int
-    recall: float | None
-    precision: float | None
-    error_median: float | None
-    normalised_error: float | None
+    figures: dict[str, Any]
     failures: tuple[str, ...] = ()
 
 
@@ -227,7 +217,7 @@ def tune_run(
     workers: Workers,
     *,
     tilts: ByPrefix[FrameTilt] | None = None,
-    on_progress: Callable[[], None] | None = None,
+    on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[Trial]:
     """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
 
@@ -239,7 +229,6 @@ def tune_run(
     plans = [FramePlan(run.camera, **change) for change in changes]
     known = Known(tilts=tilts)
     tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
-    reference = [rows for _, rows in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(detect_chunks(work, plans[0], workers)) as chunks:
         done = chain.from_iterable(chunks)
@@ -251,44 +240,45 @@ def tune_run(
                     parse_rows(io.BytesIO(each.rows[kind].encode("utf-8", "surrogateescape")))
                 )
                 failures += [] if each.error is None else [each.error]
-                if on_progress is not None:
-                    on_progress()
-            result: DiscComparison | LineComparison
-            if kind == "circles":
-                discs = compare_frames(reference, found, options)
-                result, error_median = discs, discs.error_median_m
-            else:
-                lines = compare_line_frames(reference, found, options)
-                result, error_median = lines, lines.bearing_median_deg
-            yield Trial(
-                result.reference, result.detected, result.found, result.recall, result.precision,
-                error_median, result.normalised_error.per_dof, tuple(failures),
-            )  # fmt: skip
+                on_progress()
+            compare = compare_frames if kind == "circles" else compare_line_frames
+            result = compare([rows for _, rows in frames], found, options)
+            yield Trial(figures_of(result), tuple(failures))
+
+
+def figures_of(result: DiscComparison | LineComparison) -> dict[str, Any]:
+    """What a table has of a comparison; `matched` are the reference rows that were found."""
+    recall, precision = result.recall, result.precision
+    median = (
+        result.error_median_m if isinstance(result, DiscComparison) else result.bearing_median_deg
+    )
+    return {
+        "reference": result.reference,
+        "detected": result.detected,
+        "matched": result.found,
+        "recall": recall,
+        "precision": precision,
+        "f1": None if recall is None or precision is None else float(f1_score(recall, precision)),
+        f"error_median_{result.unit}": median,
+        "normalised_error": result.normalised_error.per_dof,
+    }
 
 
 def trial_records(
-    combinations: Sequence[Combination], trials: Sequence[Trial], unit: str
+    combinations: Sequence[Combination], trials: Sequence[Trial]
 ) -> list[dict[str, Any]]:
-    """One record for each trial: the parameters, then the figures; `unit` is that of the errors."""
+    """One record for each trial: the parameters, then the figures, front and knee."""
     recall, precision = _rates(trials)
-    f1 = f1_score(recall, precision)
     front, best = pareto_front(recall, precision), knee(recall, precision)
-    return [
-        {
-            **combination,
-            "reference": trial.reference,
-            "detected": trial.detected,
-            "matched": trial.matched,
-            "recall": _rounded(trial.recall),
-            "precision": _rounded(trial.precision),
-            "f1": _rounded(float(f1[k]) if np.isfinite(f1[k]) else None),
-            f"error_median_{unit}": _rounded(trial.error_median),
-            "normalised_error": _rounded(trial.normalised_error),
-            "front": k in front,
-            "knee": k == best,
+    records = []
+    for k, (combination, trial) in enumerate(zip(combinations, trials)):
+        # Six significant digits, as in the files of rows.
+        figures = {
+            name: float(f"{value:.6g}") if isinstance(value, float) else value
+            for name, value in trial.figures.items()
         }
-        for k, (combination, trial) in enumerate(zip(combinations, trials))
-    ]
+        records.append({**combination, **figures, "front": k in front, "knee": k == best})
+    return records
 
 
 def curve_picture(
@@ -307,10 +297,6 @@ def curve_picture(
 
 def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
     """(N,) recall and precision, NaN where there is none."""
-    rates = np.array([(t.recall, t.precision) for t in trials], np.float64).reshape(-1, 2)
-    return rates[:, 0], rates[:, 1]
-
-
-def _rounded(value: float | None) -> float | None:
-    """Six significant digits, as in the files of rows."""
-    return None if value is None else float(f"{value:.6g}")
+    rates = [(trial.figures["recall"], trial.figures["precision"]) for trial in trials]
+    recall, precision = np.array(rates, np.float64).reshape(-1, 2).T
+    return recall, precision

@@ -31,7 +31,7 @@ from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
 from detect.levelling import with_common
-from detect.seen import circle_on_floor
+from detect.seen import circle_on_floor, ellipses
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
@@ -97,7 +97,7 @@ class TuningSession:
                 "quality": float(quality),
                 "evidence": _finite(evidence),
                 "outline": self._outline(xy, settings.radius_m),
-                "ellipse": _ellipse(xy, c),
+                "ellipse": ellipses(xy, c, _SIGMAS, _OUTLINE).tolist(),
             }
             for xy, c, quality, evidence in zip(
                 found.floor_xy, found.covariance, found.quality, found.evidence, strict=True
@@ -156,14 +156,6 @@ def _label(values: Mapping[str, Any]) -> CircleLandmark:
 
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _ellipse(centre_xy: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[list[float]]:
-    """Where the disc is within three standard deviations, on the floor."""
-    values, axes = np.linalg.eigh(covariance)
-    half = _SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    points = circle_on_floor((0.0, 0.0), 1.0, _OUTLINE) * half @ axes.T + centre_xy
-    return [[float(x), float(y)] for x, y in points]
 
 
 class TuningServer(ThreadingHTTPServer):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,7 +23,7 @@ from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.storage import demand_place, write_whole
+from redetect.storage import demand_place, write_bytes
 
 FloatArray = NDArray[np.float64]
 
@@ -79,11 +78,7 @@ def perform(options: View) -> int:
         recording.flush()
         recording.disconnect()
         if options.output is not None:
-            with (
-                write_whole(options.output, overwrite=options.force) as stream,
-                raw.open("rb") as content,
-            ):
-                shutil.copyfileobj(content, stream)
+            write_bytes(options.output, raw.read_bytes(), overwrite=options.force)
             print(f"{options.output}: open it by: rerun {options.output}")
     print_failures(len(failures), failures)
     return EXIT_FRAMES_FAILED if failures else 0

@@ -10,12 +10,10 @@ too.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from math import inf, isfinite
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -23,10 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.comparison.floor import floor_bins, floor_pairs, normalised_error, quantile
+from detect.comparison.floor import floor_bin, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
+    Comparison,
     DiscComparison,
     DistanceBin,
+    ForwardRange,
     FrameMatch,
     FramePair,
     Kind,
@@ -56,44 +56,40 @@ from redetect.landmarks import (
 FloatArray = NDArray[np.float64]
 
 # The forward distances for which the data set's own qualities are known.
-_EDGES_M = (-inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, inf)
+_EDGES_M = (None, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, None)
 # Files hold six digits: a smaller sigma is no statement about a bearing.
 LEAST_SIGMA_RAD = 1e-12
 
 
-def rows_beside(
-    reference: str | os.PathLike[str], name: str, path: Path | None = None
-) -> list[Frame] | None:
-    """Rows of a file, by default that of a name beside a reference file; None without one."""
-    usual = Path(reference).parent / name
-    return list(read_frames(path or usual)) if path or usual.is_file() else None
-
-
-def compare_runs(
-    run: str | os.PathLike[str],
-    *,
-    reference: str | os.PathLike[str] | None = None,
-    detected: str | os.PathLike[str] | None = None,
+def compare_with_file(
+    kind: Kind,
+    reference: Path,
+    detected: Iterable[Frame],
     options: CompareOptions | None = None,
+    *,
     sight: Sight | None = None,
     unlisted: Path | None = None,
     lookalikes: Path | None = None,
-) -> DiscComparison:
-    """Compare the discs of two files, by default ``detected`` and ``map.circles`` in a run folder.
+    names: tuple[str, str] | None = None,
+) -> Comparison:
+    """Compare discs, or lines, with those of a reference file.
 
-    The rest as in `compare_frames`; unlisted discs and look-alikes are by default those in the
+    The rest as in `compare_frames`; unlisted ones and look-alikes are by default those in the
     reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
-    reference = Path(run) / "map.circles" if reference is None else reference
-    detected = Path(run) / "detected.circles" if detected is None else detected
+    names = names or (str(reference), "detected")
+    wanted = read_frames(reference)
+
+    def rows(name: str, path: Path | None) -> list[Frame] | None:
+        usual = reference.parent / f"{name}.{kind}"
+        return list(read_frames(path or usual)) if path or usual.is_file() else None
+
+    uncounted = rows("unlisted", unlisted)
+    if kind == "lines":
+        return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
+    alike = rows("lookalikes", lookalikes)
     return compare_frames(
-        read_frames(reference),
-        read_frames(detected),
-        options,
-        sight=sight,
-        unlisted=rows_beside(reference, "unlisted.circles", unlisted),
-        lookalikes=rows_beside(reference, "lookalikes.circles", lookalikes),
-        names=(os.fspath(reference), os.fspath(detected)),
+        wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
 
 
@@ -157,7 +153,7 @@ def compare_frames(
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
     true = sight is not None and sight.reference_level
-    ranges = list(pairwise(_EDGES_M))
+    ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
     return DiscComparison(
         **common,
         on_lookalikes=_on_lookalikes(matches, lookalikes, options),
@@ -168,13 +164,13 @@ def compare_frames(
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
-        bins=tuple(_distance_bin(ends, sides, error_m) for ends in ranges),
+        bins=tuple(_distance_bin(part, sides, error_m) for part in ranges),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
         reference_levelling=_levelling(matches, wanted, true=true),
         detected_levelling=_levelling(matches, found),
-        floor=floor_bins(pairs, lean, ranges),
+        floor=tuple(floor_bin(pairs, lean, part) for part in ranges),
         lean=lean,
         pairs=pairs,
     )
@@ -217,18 +213,17 @@ def compare_line_frames(
 
 
 def _distance_bin(
-    range_m: tuple[float, float], sides: tuple[CircleArrays, ...], error_m: FloatArray
+    part: ForwardRange, sides: tuple[CircleArrays, ...], error_m: FloatArray
 ) -> DistanceBin:
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
-    from_m, to_m = range_m
-    inside = [(from_m <= -side.xy[:, 1]) & (-side.xy[:, 1] < to_m) for side in sides]
+    inside = [part.holds(side.xy) for side in sides]
     first, second, missed, extra = (int(mask.sum()) for mask in inside)
     qualities = [side.quality[mask] for side, mask in zip(sides, inside)]
     wanted = quantile(np.concatenate([qualities[0], qualities[2]]))
     found = quantile(np.concatenate([qualities[1], qualities[3]]))
     return DistanceBin(
-        from_m=from_m if isfinite(from_m) else None,
-        to_m=to_m if isfinite(to_m) else None,
+        from_m=part.from_m,
+        to_m=part.to_m,
         reference=first + missed,
         missed=missed,
         detected=second + extra,

@@ -6,9 +6,6 @@ None where there is nothing to compute them from.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import isfinite
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
@@ -20,6 +17,7 @@ from detect.comparison.result import (
     DiscPairs,
     FloorBin,
     FloorDifference,
+    ForwardRange,
     NormalisedError,
 )
 from detect.seen import image_positions, level_seen
@@ -134,23 +132,12 @@ def floor_pairs(
     return common, DiscPairs(reference_xy, offset, left, covariance, away)
 
 
-def floor_bins(
-    pairs: DiscPairs, lean: CommonLean | None, ranges_m: Sequence[tuple[float, float]]
-) -> tuple[FloorBin, ...]:
-    """Differences at ranges of forward distances, before and after the lean."""
-    forward = -pairs.reference_xy[:, 1]
-    bins = []
-    for from_m, to_m in ranges_m:
-        here = (from_m <= forward) & (forward < to_m)
-        bins.append(
-            FloorBin(
-                from_m if isfinite(from_m) else None,
-                to_m if isfinite(to_m) else None,
-                _difference(pairs.offset[here], pairs.away[here]),
-                None if lean is None else _difference(pairs.left[here], pairs.away[here]),
-            )
-        )
-    return tuple(bins)
+def floor_bin(pairs: DiscPairs, lean: CommonLean | None, part: ForwardRange) -> FloorBin:
+    """Differences at a range of forward distances, before and after the lean."""
+    here = part.holds(pairs.reference_xy)
+    before = _difference(pairs.offset[here], pairs.away[here])
+    after = None if lean is None else _difference(pairs.left[here], pairs.away[here])
+    return FloorBin(part.from_m, part.to_m, before, after)
 
 
 def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:

@@ -12,14 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, read_camera
-from detect.comparison.compare import compare_line_frames, compare_runs, rows_beside
+from detect.comparison.compare import compare_with_file
 from detect.comparison.result import (
     WORST_FRAMES,
     CommonLean,
     Comparison,
     DiscComparison,
-    DistanceBin,
-    FloorBin,
+    Kind,
     Levelling,
     LineComparison,
     NormalisedError,
@@ -56,7 +55,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     """The comparison that a command asks for; with a camera, if it isn't named by its file."""
     if command.lines and command.lookalikes:
         raise DetectError("--lookalikes are of discs: expected none with --lines")
-    kind = "lines" if command.lines else "circles"
+    kind: Kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
     for path, advice in (
@@ -65,28 +64,22 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     ):
         if not path.exists():
             raise DetectError(f"{path}: no such landmark file: {advice}")
-    if command.lines:
-        return compare_line_frames(
-            read_frames(reference),
-            read_frames(detected),
-            command.matching,
-            unlisted=rows_beside(reference, "unlisted.lines", command.unlisted),
-            names=(str(reference), str(detected)),
-        )
-    if camera is None:
-        camera = camera_in(command.run) if command.camera is None else read_camera(command.camera)
     sight = None
-    if camera is not None:
+    if not command.lines:
+        if camera is None:
+            at = command.camera
+            camera = camera_in(command.run) if at is None else read_camera(at)
         radius_m = read_head(detected).circle_settings.radius_m
-        sight = Sight(camera, radius_m, read_head(reference).level)
-    return compare_runs(
-        command.run,
-        reference=reference,
-        detected=detected,
-        options=command.matching,
+        sight = None if camera is None else Sight(camera, radius_m, read_head(reference).level)
+    return compare_with_file(
+        kind,
+        reference,
+        read_frames(detected),
+        command.matching,
         sight=sight,
         unlisted=command.unlisted,
         lookalikes=command.lookalikes,
+        names=(str(reference), str(detected)),
     )
 
 
@@ -246,7 +239,7 @@ def _over_distance(c: DiscComparison) -> FigureTable:
             )  # fmt: skip
             recall, precision, *medians = (number(value, 3) for value in figures)
             counts = [str(n) for n in (part.reference, part.missed, part.detected, part.extra)]
-            rows.append((range_text(part), *counts[:2], recall, *counts[2:], precision, *medians))
+            rows.append((str(part), *counts[:2], recall, *counts[2:], precision, *medians))
     caption = "By forward distance (position error and quality: medians)"
     return FigureTable(caption, head, tuple(rows))
 
@@ -258,7 +251,7 @@ def floor_table(c: DiscComparison) -> FigureTable:
         if part.before.pairs and part.after is not None:
             figures = [*astuple(part.before)[1:], *astuple(part.after)[1:]]
             shown = (number(value, 3) for value in figures)
-            rows.append((range_text(part), str(part.before.pairs), *shown))
+            rows.append((str(part), str(part.before.pairs), *shown))
     caption = (
         "On the floor, m: detected minus reference; the same after the common lean\n"
         "(along: farther away, across: to the left; medians)"
@@ -279,13 +272,6 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     )
     head = ("image", *c.counts, f"largest error {c.unit}")
     return FigureTable("Worst frames", head, rows)
-
-
-def range_text(part: DistanceBin | FloorBin) -> str:
-    """The range of forward distances of a bin (m), open at an end that is None."""
-    if part.from_m is None:
-        return f"< {part.to_m:g}"
-    return f">= {part.from_m:g}" if part.to_m is None else f"{part.from_m:g}-{part.to_m:g}"
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -72,11 +72,28 @@ class NormalisedError:
 
 
 @dataclass(frozen=True)
-class DistanceBin:
-    """Discs at a range of forward distances; qualities and errors are medians."""
+class ForwardRange:
+    """A range of forward distances (m), open at an end that is None."""
 
     from_m: float | None
     to_m: float | None
+
+    def holds(self, floor_xy: FloatArray) -> NDArray[np.bool_]:
+        """(N,) which of some positions are in it."""
+        low = -np.inf if self.from_m is None else self.from_m
+        high = np.inf if self.to_m is None else self.to_m
+        return np.asarray((low <= -floor_xy[:, 1]) & (-floor_xy[:, 1] < high))
+
+    def __str__(self) -> str:
+        if self.from_m is None:
+            return f"< {self.to_m:g}"
+        return f">= {self.from_m:g}" if self.to_m is None else f"{self.from_m:g}-{self.to_m:g}"
+
+
+@dataclass(frozen=True)
+class DistanceBin(ForwardRange):
+    """Discs at a range of forward distances; qualities and errors are medians."""
+
     reference: int
     missed: int
     detected: int
@@ -112,11 +129,9 @@ class FloorDifference:
 
 
 @dataclass(frozen=True)
-class FloorBin:
+class FloorBin(ForwardRange):
     """Floor differences at a range of forward distances, before and after the common lean."""
 
-    from_m: float | None
-    to_m: float | None
     before: FloorDifference
     after: FloorDifference | None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,7 +19,7 @@ from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Draw
-from redetect.storage import demand_place, write_bytes, write_whole
+from redetect.storage import demand_place, write_bytes
 
 
 def perform(options: Draw) -> int:
@@ -110,5 +109,4 @@ def mp4(
             writer.release()
         if size is None:
             raise DetectError(f"{path}: no picture: expected one at least for a video")
-        with write_whole(path, overwrite=overwrite) as stream, raw.open("rb") as content:
-            shutil.copyfileobj(content, stream)
+        write_bytes(path, raw.read_bytes(), overwrite=overwrite)

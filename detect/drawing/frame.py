@@ -24,7 +24,7 @@ from detect.drawing.inputs import SeenRows
 from detect.lines import ACCEPTED, JOINED, LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
-from detect.seen import Sight, circle_on_floor
+from detect.seen import Sight, circle_on_floor, ellipses
 from detect.settings import CircleSettings
 from detect.verticals.tracking import LineTracks
 from detect.viewing_options import CompareOptions
@@ -167,10 +167,9 @@ def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) ->
     for row in found:
         corners = np.array([(c.u, c.v) for c in row.corners])
         draw_curve(canvas, corners, LINE_COLOUR, closed=True)
-        for c in row.corners:
-            values, vectors = np.linalg.eigh([[c.cuu, c.cuv], [c.cuv, c.cvv]])
-            ellipse = _SIGMAS * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-            draw_curve(canvas, ellipse + np.array([c.u, c.v]), LINE_COLOUR, closed=True)
+        spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
+        for ellipse in ellipses(corners, spreads, _SIGMAS, _POINTS):
+            draw_curve(canvas, ellipse, LINE_COLOUR, closed=True)
         draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
         draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
@@ -368,21 +367,6 @@ def draw_disc_candidates(
     counts = Counter(candidate.stage for candidate in candidates)
     words = [(f"{stage}: {count}", _STAGE_COLOURS[stage]) for stage, count in counts.items()]
     return with_legend(canvas, words, 190, 0.38)
-
-
-def draw_response(response: NDArray[np.float32], table: VerticalTable) -> NDArray[np.uint8]:
-    """Draw a response (`detect.verticals.response.line_response`, (H, W)) as a picture (H, W, 3).
-
-    Edges that are brighter on the right are red, on the left blue; the horizon is green.
-    """
-    strength = np.clip(np.abs(response) / (2.0 / np.pi), 0.0, 1.0)
-    shade = (255.0 * np.sqrt(strength)).astype(np.uint8)
-    canvas = np.zeros((*response.shape, 3), np.uint8)
-    canvas[..., 0] = np.where(response < 0.0, shade, 0)
-    canvas[..., 2] = np.where(response > 0.0, shade, 0)
-    columns = np.flatnonzero(table.usable)
-    canvas[np.rint(table.anchor_row[columns]).astype(np.intp), columns, 1] = 160
-    return canvas
 
 
 def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray:

@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar, get_origin, get_type_hints
 
 from camera import Camera
 from detect.errors import DetectError
-from detect.line_settings import LineSettings
 from detect.runs.outputs import LEVEL, LEVELLED
 from detect.runs.plan import FramesByImage
 from detect.seen import Sight
-from detect.settings import CircleSettings, parameter_value
+from detect.settings import CircleSettings
+from detect.settings_files import word_value
 from detect.sources.image_files import image_name
 from detect.sources.interface import Frames, ImageRun, RunFrame
 from detect.viewing_options import RowFiles
 from redetect.landmarks import Frame, FrameTilt, read_tilts
-from redetect.storage.messages import excerpt
 
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is what precedes the first row; real ones are much shorter.
 _LONGEST_BYTES = 1 << 16
-_NUMBERS = re.compile(r"[^(),]+")
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
-SettingsType = TypeVar("SettingsType", CircleSettings, LineSettings)
 
 
 # -- heads ------------------------------------------------------------------------------------
@@ -50,36 +46,13 @@ class FileHead:
     @property
     def circle_settings(self) -> CircleSettings:
         """The settings of discs."""
-        return self._settings(CircleSettings)
-
-    @property
-    def line_settings(self) -> LineSettings:
-        """The settings of verticals."""
-        return self._settings(LineSettings)
-
-    def _settings(self, kind: type[SettingsType]) -> SettingsType:
-        hints = get_type_hints(kind)
-        values: dict[str, Any] = {}
+        known = {each.name for each in fields(CircleSettings)}
         try:
-            for name, text in self.settings:
-                if get_origin(hints.get(name)) is tuple:
-                    in_pairs = hints[name] == tuple[tuple[float, float], ...]
-                    values[name] = _numbers(name, text, in_pairs=in_pairs)
-                elif name in hints:
-                    values[name] = parameter_value(kind, name, text)
-            return kind(**values)
+            words = {name: word for name, word in self.settings if name in known}
+            values = {name: word_value(CircleSettings, name, word) for name, word in words.items()}
+            return CircleSettings(**values)
         except DetectError as error:
             raise DetectError(f"{self.name}: {error}") from None
-
-
-def _numbers(name: str, text: str, *, in_pairs: bool) -> tuple[Any, ...]:
-    """Several numbers, or pairs of them, as heads have them."""
-    try:
-        numbers = tuple(float(word) for word in _NUMBERS.findall(text))
-        return tuple(zip(numbers[::2], numbers[1::2], strict=True)) if in_pairs else numbers
-    except ValueError:
-        expected = "pairs of numbers" if in_pairs else "numbers"
-        raise DetectError(f"{name} is {excerpt(text)}: expected {expected}") from None
 
 
 def read_head(path: Path) -> FileHead:

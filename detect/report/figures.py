@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
-from detect.comparison.report import range_text
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
@@ -18,7 +17,7 @@ from detect.comparison.result import (
     LinePairs,
 )
 from detect.drawing.inputs import SeenRows
-from detect.seen import circle_on_floor, summed_steps
+from detect.seen import ellipses, summed_steps
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
@@ -187,7 +186,7 @@ def distance_figure(bins: Sequence[DistanceBin]) -> Part:
             rates.plot(at, share, mark, color=colour, lw=1.2, ms=4, label=key)
         rates.set_ylim(0.0, 1.05)
         for axes, name in ((rows, "rows"), (rates, "share")):
-            axes.set_xticks(at, [range_text(part) for part in shown], fontsize=7)
+            axes.set_xticks(at, [str(part) for part in shown], fontsize=7)
             _finish(axes, "forward distance / m", name)
             axes.legend(fontsize=8)
     words = "Rows, recall and precision by forward distance, each side's rows by their own."
@@ -348,10 +347,7 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
 def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(N, 2) centres of a frame's discs and (N, P, 2) outlines of their ellipses, from a pose."""
     discs = circle_arrays(frame.circles)
-    values, vectors = np.linalg.eigh(discs.covariance)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    circle = circle_on_floor((0.0, 0.0), _SIGMAS, 32)
-    outlines = discs.xy[:, None, :] + np.einsum("nij,kj->nki", roots, circle)
+    outlines = ellipses(discs.xy, discs.covariance, _SIGMAS, 32)
     sine, cosine = np.sin(pose[2]), np.cos(pose[2])
     turn = np.array([[cosine, sine], [-sine, cosine]])
     closed = np.concatenate([outlines, outlines[:, :1]], axis=1)
@@ -370,21 +366,14 @@ class RateCurve(NamedTuple):
     kept: NDArray[np.int64]
 
 
-def disc_rates(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality."""
-    return _rates(comparison, "quality", np.asarray(qualities, np.float64), 1.0)
+def rates_over(comparison: DiscComparison | LineComparison, thresholds: ArrayLike) -> RateCurve:
+    """Recall and precision of discs of at least each quality, or of lines of at most each sigma.
 
-
-def line_rates(comparison: LineComparison, sigmas_rad: ArrayLike) -> RateCurve:
-    """Recall and precision of lines of at most each sigma."""
-    curve = _rates(comparison, "sigma", np.asarray(sigmas_rad, np.float64), -1.0)
-    return curve._replace(threshold=np.degrees(curve.threshold))
-
-
-def _rates(
-    comparison: DiscComparison | LineComparison, score: str, levels: FloatArray, sign: float
-) -> RateCurve:
-    """Rates at each threshold; rows are paired anew whenever fewer pass."""
+    Sigmas in radians. Rows are paired anew whenever fewer pass.
+    """
+    levels = np.asarray(thresholds, np.float64)
+    lines = isinstance(comparison, LineComparison)
+    score, sign = ("sigma", -1.0) if lines else ("quality", 1.0)
     found, right, kept = np.zeros((3, len(levels)), np.int64)
     for match in comparison.frames:
         passed = match.frame.detected
@@ -398,7 +387,7 @@ def _rates(
             kept[k] += len(match.matched) + len(match.extra)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), right / kept
-    return RateCurve(levels, recall, precision, kept)
+    return RateCurve(np.degrees(levels) if lines else levels, recall, precision, kept)
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

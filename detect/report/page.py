@@ -9,13 +9,9 @@ import cv2
 import numpy as np
 
 from detect import __version__
-from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
-from detect.comparison.report import (
-    floor_table,
-    summary_rows,
-    worst_frames_table,
-)
-from detect.comparison.result import Comparison, DiscComparison, LineComparison, number
+from detect.comparison.compare import compare_with_file
+from detect.comparison.report import floor_table, summary_rows, worst_frames_table
+from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison, number
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
@@ -24,13 +20,12 @@ from detect.report.figures import (
     RateCurve,
     bearings_figure,
     counts_figure,
-    disc_rates,
     distance_figure,
     floor_figure,
     floor_map,
     knee,
-    line_rates,
     rates_figure,
+    rates_over,
     tilt_figure,
     whitened,
     whitened_figure,
@@ -74,26 +69,24 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
     rows = tuple(files.of(name) for name in names)
     compare = CompareOptions(**vars(gates))
     sight = files.sight(run.camera) if isinstance(run, Run) else None
-    discs, lines = None, None
-    if both := [seen for seen in rows if seen.circles and seen.reference_circles]:
-        path = files.reference["circles"]
-        discs = compare_frames(
-            [seen.reference_circles for seen in both if seen.reference_circles],
-            [seen.circles for seen in both if seen.circles],
+
+    def compared(kind: Kind) -> Comparison | None:
+        both = [(getattr(seen, kind), getattr(seen, f"reference_{kind}")) for seen in rows]
+        if not any(detected and reference for detected, reference in both):
+            return None
+        reference = files.reference[kind]
+        return compare_with_file(
+            kind,
+            reference,
+            [detected for detected, _ in both if detected],
             compare,
             sight=sight,
-            unlisted=rows_beside(path, "unlisted.circles"),
-            lookalikes=rows_beside(path, "lookalikes.circles"),
-            names=(path.name, files.detected["circles"].name),
+            names=(reference.name, files.detected[kind].name),
         )
-    if both := [seen for seen in rows if seen.lines and seen.reference_lines]:
-        lines = compare_line_frames(
-            [seen.reference_lines for seen in both if seen.reference_lines],
-            [seen.lines for seen in both if seen.lines],
-            compare,
-            unlisted=rows_beside(files.reference["lines"], "unlisted.lines"),
-            names=(files.reference["lines"].name, files.detected["lines"].name),
-        )
+
+    discs, lines = compared("circles"), compared("lines")
+    assert isinstance(discs, DiscComparison | None)
+    assert isinstance(lines, LineComparison | None)
     return ReportInputs(run, files, names, rows, compare, sight, discs, lines)
 
 
@@ -195,7 +188,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
         parts.append(distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
-    parts += _rates(disc_rates(result, np.unique(levels)), "least quality", "quality")
+    parts += _rates(rates_over(result, np.unique(levels)), "least quality", "quality")
     if result.matched:
         parts.append(floor_figure(result.pairs, lean=result.lean is not None))
     what = "two components for each matched disc"
@@ -213,7 +206,7 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     sigma = [row.sigma for match in result.frames for row in match.frame.detected]
     levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
     # Quantiles between rows may round below the greatest.
-    curve = line_rates(result, np.nextafter(np.unique(levels), np.inf))
+    curve = rates_over(result, np.nextafter(np.unique(levels), np.inf))
     return [
         _summary_of(result),
         *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),

@@ -85,7 +85,7 @@ def _lines(command: Lines, run: Run) -> Job:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
     drawing: Drawing = "tracks" if command.rejected else "lines"
-    plan = FramePlan(run.camera, lines=settings, drawing=drawing, draw_response=command.response)
+    plan = FramePlan(run.camera, lines=settings, drawing=drawing)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     known = Known(lines=_frames(command.ids_from))
     return Job(run, plan, places, known, command.draw)

@@ -24,7 +24,7 @@ from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
-from detect.drawing.frame import draw_candidates, draw_response, draw_rows, draw_tracks, png_of
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.levelling import (
@@ -52,7 +52,6 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
-from detect.verticals.response import line_response
 from detect.viewing_options import CompareOptions
 from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
 from redetect.landmarks import (
@@ -191,7 +190,7 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRow
     rows: list[FrameRows] = []
     for own, group in groupby(tasks, lambda task: task.plan or plan):
         alike, camera, at_once = list(group), own.camera, 1
-        if camera is not None and own.drawing is None and not own.draw_response:
+        if camera is not None and own.drawing is None:
             at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
         for first in range(0, len(alike), at_once):
             batch = alike[first : first + at_once]
@@ -205,6 +204,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
         return rows_of_failure(task, found.error)
     try:
         rows = _rows_by_kind(task, found, plan)
+        picture = _drawn(rows, found, plan)
         return FrameRows(
             task.frame.step.prefix,
             rows,
@@ -215,10 +215,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                 "markers": len(found.markers or ()),
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
-            pictures=tuple(
-                (f"{Path(task.frame.step.prefix).name}{ending}", png_of(picture))
-                for ending, picture in _drawn(rows, found, plan)
-            ),
+            picture=None if picture is None else png_of(picture),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
@@ -294,28 +291,22 @@ def _disc_records(
 
 def _drawn(
     rows: Mapping[str, str], found: FrameDetections, plan: FramePlan
-) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """The pictures of a plan, by the endings of their names."""
-    image = found.image
-    if image is None or (plan.drawing is None and not plan.draw_response):
-        return
-    table = tables_of(plan).verticals
+) -> NDArray[np.uint8] | None:
+    """The picture of a plan."""
+    image, table = found.image, tables_of(plan).verticals
+    if image is None or plan.drawing is None:
+        return None
+    if plan.drawing == "tracks" and found.lines is not None and table:
+        return draw_tracks(image, table, found.lines)
     kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
     frame = _frame_of(rows[kind])
-    if plan.drawing == "tracks" and found.lines is not None and table:
-        yield ".png", draw_tracks(image, table, found.lines)
-    elif plan.drawing is not None:
-        settings = plan.circles or CircleSettings()
-        sight = Sight(plan.camera, settings.radius_m) if plan.camera else None
-        frames: dict[str, Any] = {kind: frame}
-        seen = SeenRows(**frames, tilt=found.tilt)
-        name = Path(frame.step.prefix).name
-        picture = draw_rows(image, sight, seen, settings, CompareOptions(), name)
-        if found.markers is not None:
-            picture = draw_candidates(picture, found.markers)
-        yield ".png", picture
-    if plan.draw_response and found.lines is not None and plan.lines and table:
-        yield ".response.png", draw_response(line_response(image, table, plan.lines), table)
+    settings = plan.circles or CircleSettings()
+    sight = Sight(plan.camera, settings.radius_m) if plan.camera else None
+    frames: dict[str, Any] = {kind: frame}
+    seen = SeenRows(**frames, tilt=found.tilt)
+    name = Path(frame.step.prefix).name
+    picture = draw_rows(image, sight, seen, settings, CompareOptions(), name)
+    return picture if found.markers is None else draw_candidates(picture, found.markers)
 
 
 def level_run(

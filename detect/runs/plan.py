@@ -161,7 +161,6 @@ class FramePlan:
     #: What is drawn into the image, if pictures have a place: "tracks" are all of the lines', with
     #: why some are no lines.
     drawing: Drawing | None = None
-    draw_response: bool = False  # of the lines' filter
     #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
     #: done, of the run.
     levelling: Levelling = "frame"
@@ -218,7 +217,7 @@ class FrameRows(NamedTuple):
     found: Mapping[str, int] = {}  # how many "discs", "lines", "tilts" and "markers"
     rejected: Mapping[str, int] = {}  # how many candidates for markers, by cause
     error: str | None = None  # why there are no landmarks
-    pictures: tuple[tuple[str, bytes], ...] = ()  # names and PNG files
+    picture: bytes | None = None  # a PNG file
 
 
 @dataclass

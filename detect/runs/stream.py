@@ -184,7 +184,7 @@ def detect_run(
     """
     plan = replace(job.plan, json="json" in job.places)
     if job.pictures is None:
-        plan = replace(plan, drawing=None, draw_response=False)
+        plan = replace(plan, drawing=None)
     else:
         make_folder(job.pictures)
     job = replace(job, plan=plan)
@@ -200,8 +200,10 @@ def detect_run(
         files = stack.enter_context(RunFiles(job))
         tasks = files.take_over(stack.enter_context(closing(_tasks(job))), count)
         for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            if job.pictures is not None:
-                _write_pictures(frames, job.pictures, overwrite=files.may_replace_pictures)
+            for _, rows in frames:
+                if job.pictures is not None and rows.picture is not None:
+                    path = job.pictures / f"{Path(rows.prefix).name}.png"
+                    write_bytes(path, rows.picture, overwrite=files.may_replace_pictures)
             files.add(frames)
             for _, rows in frames:
                 count(rows)
@@ -229,14 +231,6 @@ def _tasks(job: Job) -> Generator[FrameTask, None, None]:
     with closing(iter(job.run.frames)) as frames:
         for frame in frames:
             yield FrameTask(frame, job.known.of(frame.step.prefix))
-
-
-def _write_pictures(
-    frames: Sequence[tuple[FrameTask, FrameRows]], folder: Path, *, overwrite: bool
-) -> None:
-    for _, rows in frames:
-        for name, picture in rows.pictures:
-            write_bytes(folder / name, picture, overwrite=overwrite)
 
 
 class RunFiles:

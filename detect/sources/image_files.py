@@ -58,8 +58,10 @@ class ImageNames:
                 if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
             )
         self._names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
-        self._places = {name: place for place, name in enumerate(self._names)}
-        self._suffixes = sorted({name[name.rindex(".") :] for name in names})
+        self._places: dict[str, int] = {}
+        for place, name in enumerate(self._names):
+            for called in (name, name[: name.rindex(".")]):
+                self._places.setdefault(called, place)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -70,8 +72,7 @@ class ImageNames:
 
     def find(self, name: str) -> int | None:
         """The place of the image of a name, with or without its ending; the first of several."""
-        named = [name + suffix for suffix in ("", *self._suffixes)]
-        return min((self._places[each] for each in named if each in self._places), default=None)
+        return self._places.get(name)
 
     def place_of(self, prefix: str) -> int | None:
         """The place of a step's image, by its name alone; None if there is none.

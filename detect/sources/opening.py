@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from camera import read_camera
@@ -86,14 +85,15 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
         camera = camera_in(name) if camera_path is None else read_camera(camera_path)
         images = images_of_folder(name)
         frames: Frames = RunFrames(images, own, options.bits or bits_of_images(images))
-        run = _shortened(ImageRun(name, frames, own, name / "detected"), options.frames)
+        frames = FirstFrames(frames, options.frames) if options.frames else frames
+        run = ImageRun(name, frames, own, name / "detected")
         return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames, odometry = _frames(source, options)
+    frames = FirstFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=source.has_times)
-    run = _shortened(run, options.frames)
     if camera is None:
         return run
     if source.size is not None and source.size != (camera.width, camera.height):
@@ -164,12 +164,6 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             "name a file of rows 'prefix seconds' by --times"
         )
     return frames_along_poses(source, poses), poses.path
-
-
-def _shortened(run: ImageRun, count: int) -> ImageRun:
-    if not count:
-        return run
-    return replace(run, frames=FirstFrames(run.frames, count))
 
 
 def _is_ros2_bag(name: Path) -> bool:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.comparison.compare import compare_frames, compare_line_frames, rows_beside
+from detect.comparison.compare import compare_with_file
 from detect.comparison.report import comparison_of
-from detect.comparison.result import Comparison
+from detect.comparison.result import Comparison, Kind
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
@@ -26,7 +26,7 @@ from detect.sources.interface import Run, RunFrame, read_image
 from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
-from redetect.landmarks import Step, read_frames
+from redetect.landmarks import Step
 from redetect.slam.formats.text import Axes
 
 PathLike = str | os.PathLike[str]
@@ -189,20 +189,17 @@ def compare(
         )  # fmt: skip
         return comparison_of(command, camera if isinstance(camera, Camera) else None)
     found = list(detected)
-    in_file = in_file or Path(run) / ("map.lines" if lines else "map.circles")
+    kind: Kind = "lines" if lines else "circles"
+    in_file = in_file or Path(run) / f"map.{kind}"
     if not found or not in_file.is_file():
         raise DetectError(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
-    frames, names = [one.frame for one in found], (str(in_file), "detections")
-    if lines:
-        unlisted = rows_beside(in_file, "unlisted.lines")
-        return compare_line_frames(
-            read_frames(in_file), frames, options, unlisted=unlisted, names=names
-        )
-    sight = Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level)
-    return compare_frames(
-        read_frames(in_file), frames, options, sight=sight,
-        unlisted=rows_beside(in_file, "unlisted.circles"),
-        lookalikes=rows_beside(in_file, "lookalikes.circles"), names=names,
-    )  # fmt: skip
+    return compare_with_file(
+        kind,
+        in_file,
+        [one.frame for one in found],
+        options,
+        sight=Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level),
+        names=(str(in_file), "detections"),
+    )

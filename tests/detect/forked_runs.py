@@ -12,6 +12,7 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -141,6 +142,20 @@ class ForkedRun:
         """What stands on its standard error once it has ended."""
         self.wait()
         return self._said
+
+
+def started(arguments: Sequence[str], **environment: str) -> subprocess.Popen[str]:
+    """Python with some arguments, in a group of processes of its own, as a shell starts it."""
+    root = Path(__file__).resolve().parents[2]
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
 def wait_until_stopped(pid: int, runs: Callable[[], bool]) -> None:

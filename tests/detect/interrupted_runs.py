@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 
 from detect.cli import main
+from tests.detect.demo_frames import demo_frames
 
 Captured = pytest.CaptureFixture[str]
 
@@ -17,12 +17,7 @@ PREVIOUS = b"what was there before\n"
 
 
 def a_run(project_root: Path, run: Path) -> Path:
-    source = project_root / "images" / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(FRAMES):
-        image = source / "images" / f"e.{number % 8:04d}.jpg"
-        shutil.copy(image, run / "images" / f"e.{number:04d}.jpg")
+    demo_frames(project_root, run, [place % 8 for place in range(FRAMES)])
     (run / "images" / "e.0011.jpg").write_bytes(b"no image")  # a bad frame is resumed as well
     return run
 

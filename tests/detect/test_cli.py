@@ -99,12 +99,6 @@ def test_flags_override_the_preset(small_run: Path, first: bool) -> None:
     assert counts == [2, 1, 0]
 
 
-def test_verification_can_be_turned_off(small_run: Path) -> None:
-    assert main(["circles", str(small_run), "--no-verify", "--no-refine"]) == 0
-    written = settings_of(small_run / "detected.circles")
-    assert (written["verify"], written["refine"]) == ("False", "False")
-
-
 def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
     drawings, as_json = tmp_path / "new" / "drawings", tmp_path / "rows.json"
     arguments = ["circles", str(small_run), "--draw", str(drawings), "--json", str(as_json)]
@@ -128,21 +122,6 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
         assert not marked.any()
 
 
-def test_bad_image_costs_its_frame_only(small_run: Path, capsys: Captured) -> None:
-    bad = small_run / "images" / "s.0001.png"
-    bad.write_bytes(b"no image")
-    assert main(["circles", str(small_run)]) == 3
-    shown = capsys.readouterr()
-    assert "2 discs in 3 frames" in shown.out
-    lines = shown.err.splitlines()
-    listed = lines.index("1 frames could not be worked on:")
-    assert lines[listed + 1] == f"  {bad}: cannot be decoded: expected an image"
-    assert len(lines) == listed + 2
-    frames = list(read_frames(small_run / "detected.circles"))
-    assert [frame.step.prefix for frame in frames] == list(SMALL_RUN_DISCS)
-    assert [len(frame.circles) for frame in frames] == [2, 0, 0]
-
-
 def test_image_of_another_size_is_listed(small_run: Path, capsys: Captured) -> None:
     bad = small_run / "images" / "s.0000.png"
     assert cv2.imwrite(str(bad), np.zeros((576, 768), np.uint8))
@@ -155,7 +134,7 @@ def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> 
     (small_run / "s.txt").unlink()
     for number in range(14):
         (small_run / "images" / f"z{number}.png").touch()
-    assert main(["circles", str(small_run)]) == 3
+    assert main(["markers", str(small_run)]) == 3
     lines = capsys.readouterr().err.splitlines()
     assert "14 frames could not be worked on:" in lines
     assert sum("is empty" in line for line in lines) == 10
@@ -387,16 +366,6 @@ def test_demands_decide_the_exit_code(
     assert len(lines) == unmet
     assert all("recall" in line for line in lines)
     assert "0.75" in shown.out or "75" in shown.out
-
-
-def test_unmet_precision(compared_run: Path, capsys: Captured) -> None:
-    extra = "LANDMARK_C -1 -2 0.9 0.002 0 0.003 -1\n"
-    rows = (compared_run / "detected.circles").read_text()
-    (compared_run / "detected.circles").write_text(rows + extra)
-    assert main(["compare", str(compared_run), "--min-precision", "0.76"]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "precision" in line
-    assert main(["compare", str(compared_run), "--min-precision", "0.75"]) == 0
 
 
 def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:

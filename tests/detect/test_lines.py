@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera import Camera, read_camera
-from detect.drawing.frame import draw_response, draw_rows, draw_tracks, track_pixels
+from detect.drawing.frame import draw_rows, draw_tracks, track_pixels
 from detect.drawing.inputs import SeenRows
 from detect.errors import DetectError, FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
@@ -25,7 +25,6 @@ from detect.lines import ACCEPTED, JOINED, detect_lines
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import decode_gray
-from detect.verticals.response import line_response
 from detect.viewing_options import CompareOptions
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, LineLandmark, Step, parse_record
@@ -384,15 +383,6 @@ def test_drawn_tracks_name_their_fates() -> None:
     track = found.members[0][0]
     pixels = np.rint(track_pixels(found.tracks, TABLE, track)).astype(int)
     assert np.all(picture[pixels[:, 1], pixels[:, 0]] == [60, 220, 60])
-
-
-def test_drawn_response_shows_polarity() -> None:
-    response = line_response(scene(CAMERA), TABLE, DEFAULT)
-    picture = draw_response(response, TABLE)
-    rising, falling = response > 0.3, response < -0.3
-    assert np.all(picture[rising, 2] > 150)
-    assert np.all(picture[rising, 0] == 0)
-    assert np.all(picture[falling, 0] > 150)
 
 
 # -- photographs and renders with truth ---------------------------------------------------------

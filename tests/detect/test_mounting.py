@@ -102,7 +102,6 @@ def test_the_demos_camera_comes_back(
     unmoved = replace(found, robot_from_camera=true.robot_from_camera, covariance=true.covariance)
     assert unmoved == true
     assert main(command) == 1  # nothing is overwritten unasked
-    assert main([*command, "--force"]) == 0
 
 
 def test_an_existing_file_is_found_first(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detect.cli import main, parsed
@@ -18,6 +18,7 @@ from detect.settings import PRESETS, CircleSettings, MarkerSettings
 from detect.settings_files import read_settings, settings_text
 
 
+@settings(max_examples=25)
 @given(
     st.sampled_from(list(PRESETS.values())),
     st.sampled_from(list(LINE_PRESETS.values())),
@@ -68,11 +69,13 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
         ("[]", 'no "settings"'),
         ('{"settings": 3}', 'no "settings"'),
         ('{"settings": {"circles": 3}}', "names and values"),
-        ('{"settings": {"circles": {"radius": 1}}}', "no setting 'radius'"),
-        ('{"settings": {"circles": {"radius_m": "1"}}}', "another type"),
-        ('{"settings": {"circles": {"verify": 1}}}', "another type"),
+        ('{"settings": {"circles": {"radius": 1}}}', "radius is no parameter of CircleSettings"),
+        ('{"settings": {"circles": {"radius_m": "1"}}}', "expected a number"),
+        ('{"settings": {"circles": {"verify": 1}}}', "expected True or False"),
         ('{"settings": {"circles": {"radius_m": -1}}}', "radius_m"),
-        ('{"settings": {"lines": {"refine_steps_px": 3}}}', "another type"),
+        ('{"settings": {"lines": {"refine_steps_px": 3}}}', "expected a list of numbers"),
+        ('{"settings": {"circles": {"polarity": "grey"}}}', "expected one of any, light, dark"),
+        ('{"settings": {"circles": {"samples": 16.5}}}', "expected a whole number"),
     ],
 )
 def test_refusals(tmp_path: Path, content: str, words: str) -> None:

@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from tyro.conf import Positional
 
-from detect.comparison.compare import compare_runs
+from detect.comparison.compare import compare_with_file
+from detect.comparison.result import DiscComparison
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.runs.plan import FramePlan, Job, Known
@@ -21,7 +22,7 @@ from detect.runs.stream import detect_run
 from detect.settings import CircleSettings, Polarity
 from detect.sources.opening import open_run
 from detect.viewing_options import CompareOptions
-from redetect.landmarks import FrameTilt, read_tilts, squared_mahalanobis
+from redetect.landmarks import FrameTilt, read_frames, read_tilts, squared_mahalanobis
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
@@ -131,7 +132,13 @@ class Tilt:
             for label, known in (("without", Known()), ("with", Known(tilts=tilts))):
                 discs = Path(folder) / f"{label}.circles"
                 _detect(self.run, {"circles": discs}, known, circles=settings)
-                result = compare_runs(self.run, detected=discs, options=CompareOptions(gate_m=0.3))
+                result = compare_with_file(
+                    "circles",
+                    Path(self.run) / "map.circles",
+                    read_frames(discs),
+                    CompareOptions(gate_m=0.3),
+                )
+                assert isinstance(result, DiscComparison)
                 if result.error_median_m is None:
                     print(f"discs {label} the tilt: none is near one of {result.reference_name}")
                     continue

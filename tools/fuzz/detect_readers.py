@@ -126,8 +126,7 @@ def _message(encoding: str, step: int, bytes_there: int, big: int = 0) -> bytes:
 
 
 def _head(path: Path) -> object:
-    head = read_head(path)
-    return head.circle_settings, head.line_settings
+    return read_head(path).circle_settings
 
 
 def _journal(path: Path) -> object:
@@ -198,14 +197,10 @@ _MESSAGES = (
 _ENCODINGS = (
     b"mono16", b"8UC1", b"8UC4", b"bayer_bggr16", b"bayer_gbrg8", b"uyvy", b"rgba8", b"bgr16",
 )  # fmt: skip
-_HEADS = (
-    b"# redetect 0.1.0\n# settings radius_m=0.1 samples=16 polarity=any refine=True\n",
-    b"# settings refine_steps_px=((1.0,0.5),(0.5,0.25)) threshold=0.2 alpha=published\n",
-    b"# settings blurred_widths=(2.0,3.0) blurred_sharpness=0.6\n",
-)
+_HEADS = (b"# redetect 0.1.0\n# settings radius_m=0.1 samples=16 polarity=any refine=True\n",)
 _SETTING_WORDS = (
     b"settings ", b"radius_m=", b"samples=", b"verify=", b"polarity=", b"threshold=",
-    b"refine_steps_px=", b"blurred_widths=", b"sigma_x_px=", b"evidence=", b"border_px=",
+    b"sigma_x_px=", b"evidence=", b"border_px=",
     b"True", b"1-2", b"1e5e5", *NUMBERS,
 )  # fmt: skip
 _JOURNALS = (

@@ -12,12 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detect.comparison.compare import compare_frames, compare_runs
+from detect.comparison.compare import compare_frames
+from detect.comparison.report import comparison_of
 from detect.comparison.result import DiscComparison, unmet_demands
-from detect.errors import CompareError
+from detect.errors import CompareError, DetectError
 from detect.sources.image_files import image_name
-from detect.viewing_options import CompareOptions
-from redetect.landmarks import CircleLandmark, Frame, LandmarkFileError, Step, write_frames
+from detect.viewing_options import Compare, CompareOptions
+from redetect.landmarks import CircleLandmark, Frame, Step, read_frames, write_frames
 from tests.detect.comparison.formatting import format_text
 
 STANDARD = CompareOptions()
@@ -359,18 +360,17 @@ def test_text_escapes_what_a_terminal_would_obey() -> None:
 def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
     write_frames(tmp_path / "map.circles", REFERENCE, line_end="\r\n")
     write_frames(tmp_path / "detected.circles", DETECTED)
-    found = compare_runs(tmp_path)
+    found = comparison_of(Compare(tmp_path))
     assert (found.matched, found.missed, found.extra) == (4, 1, 1)
     assert found.reference_name == str(tmp_path / "map.circles")
-    swapped = compare_runs(
-        tmp_path, reference=tmp_path / "detected.circles", detected=tmp_path / "map.circles"
-    )
+    sides = tmp_path / "detected.circles", tmp_path / "map.circles"
+    swapped = comparison_of(Compare(tmp_path, reference=sides[0], detected=sides[1]))
     assert (swapped.matched, swapped.missed, swapped.extra) == (4, 1, 1)
-    loose = compare_runs(tmp_path, options=CompareOptions(gate_m=0.001))
-    assert loose.matched == 2
+    strict = comparison_of(Compare(tmp_path, matching=CompareOptions(gate_m=0.001)))
+    assert strict.matched == 2
     (tmp_path / "detected.circles").unlink()
-    with pytest.raises(LandmarkFileError, match=r"detected\.circles: no such landmark file"):
-        compare_runs(tmp_path)
+    with pytest.raises(DetectError, match=r"detected\.circles: no such landmark file"):
+        comparison_of(Compare(tmp_path))
 
 
 DISCS = st.lists(
@@ -405,7 +405,7 @@ def test_rows_are_accounted_for_whatever_they_are(
 
 def test_the_shipped_file_agrees_with_itself(shared_data: Path) -> None:
     path = shared_data / "dlr" / "map.circles"
-    found = compare_runs(shared_data, reference=path, detected=path)
+    found = compare_frames(read_frames(path), read_frames(path))
     assert (found.matched, found.missed, found.extra) == (14745, 0, 0)
     assert found.error_95_m == 0
     # The known medians of quality from 0.8 m to 4 m.

@@ -11,7 +11,7 @@ import pytest
 
 from detect.cli import main
 from detect.export import FRAME_ID, message_definitions, topic_of
-from redetect.landmarks import Frame, Landmark, Step, read_frames, read_tilts
+from redetect.landmarks import read_frames, read_tilts
 from redetect.landmarks.columns import TABLES, TableName, values_of
 
 Captured = pytest.CaptureFixture[str]
@@ -267,23 +267,6 @@ def test_a_calibration_is_another_commands(project_root: Path, capsys: Captured)
         camera_main(["convert", "--help"])
     assert left.value.code == 0
     assert "cameras.txt" in capsys.readouterr().out
-
-
-def test_the_demo_run_reads_back(project_root: Path, tmp_path: Path) -> None:
-    """From the CSV, the frames of the file can be put together again."""
-    source = project_root / "images" / "e" / "map.circles"
-    assert main(["export", str(source), "-o", str(tmp_path / "e.csv")]) == 0
-    steps = read_csv(tmp_path / "e.steps.csv", "steps")
-    landmarks: list[list[Landmark]] = [[] for _ in steps]
-    from redetect.landmarks import CircleLandmark
-
-    for frame, _, _, *values in read_csv(tmp_path / "e.csv", "circles"):
-        landmarks[frame].append(CircleLandmark(*values))
-    found = [
-        Frame(Step(image, *values), tuple(rows))
-        for (_, image, _, *values), rows in zip(steps, landmarks)
-    ]
-    assert found == list(read_frames(source))
 
 
 def test_the_documentation_shows_the_schema(project_root: Path) -> None:

@@ -60,14 +60,6 @@ def test_rows_of_a_folder_without_a_calibration(
     assert len(list((folder / "drawn").glob("*.png"))) == 3
 
 
-def test_existing_rows_are_kept_unless_forced(folder: Path) -> None:
-    assert main(["markers", str(folder)]) == 0
-    before = (folder / "detected.markers").read_bytes()
-    assert main(["markers", str(folder)]) == 1
-    assert main(["markers", str(folder), "--force"]) == 0
-    assert (folder / "detected.markers").read_bytes() == before
-
-
 def test_ids_and_presets_on_the_command_line(folder: Path) -> None:
     output = folder / "only.markers"
     assert main(["markers", str(folder), "--ids", "9", "11", "-o", str(output)]) == 0

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
 from camera import Camera
-from detect.grey_values import estimate_noise
 from detect.markers import pattern_model as model
 from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
@@ -251,13 +250,3 @@ def test_templates_know_the_turned_patterns_and_their_place() -> None:
         assert black[:, -1].all()
     # 24 units: the border's end, seven cells of two units from 5 to 19, the border.
     np.testing.assert_allclose(24.0 * templates.lines, [0, 5, 7, 9, 11, 13, 15, 17, 19, 24])
-
-
-@pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])
-def test_the_noise_is_measured(sigma: float) -> None:
-    rng = np.random.default_rng(5)
-    v, u = np.mgrid[0:300, 0:400]
-    grey = 100.0 + 0.1 * u + 0.05 * v + 60.0 * (u > 200) + rng.normal(0.0, sigma, u.shape)
-    assert estimate_noise(np.rint(grey).astype(np.uint8), most_rows=64) == pytest.approx(
-        sigma, rel=0.12
-    )

@@ -13,15 +13,13 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.comparison.compare import compare_frames, compare_line_frames, compare_runs
+from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
-from detect.drawing.inputs import read_head
-from detect.line_settings import PUBLISHED as PUBLISHED_LINES
-from detect.report.figures import binned, disc_rates, line_rates, whitened
+from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
 from detect.sources.interface import camera_in
 from detect.viewing_options import CompareOptions
-from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step
+from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
 from tests.detect.test_cli import assert_refused
 
 Captured = pytest.CaptureFixture[str]
@@ -67,7 +65,7 @@ def test_rates_of_a_case_made_by_hand() -> None:
         ([disc(0.0, -3.0)], [disc(0.0, -3.02, 0.95)]),
         ([], [disc(0.5, -1.5, 0.6)]),
     ]
-    curve = disc_rates(compared(discs), [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
+    curve = rates_over(compared(discs), [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
     assert curve.kept.tolist() == [5, 4, 3, 2, 1, 0]
     np.testing.assert_allclose(curve.recall, [2 / 3, 2 / 3, 2 / 3, 2 / 3, 1 / 3, 0.0])
     np.testing.assert_allclose(curve.precision, [2 / 5, 2 / 4, 2 / 3, 1.0, 1.0, np.nan])
@@ -77,7 +75,7 @@ def test_rates_of_verticals_count_joined_ones_as_comparing_does() -> None:
     wanted = [line(0.0, 0.001), line(0.004, 0.001), line(0.5, 0.001), line(-0.5, 0.001)]
     found = [line(0.001, 0.01), line(0.502, 0.002), line(1.0, 0.004)]
     result = compared_lines([(wanted, found)])
-    curve = line_rates(result, [0.003, 0.005, 0.02])
+    curve = rates_over(result, [0.003, 0.005, 0.02])
     # The wide one represents both lines that it covers.
     np.testing.assert_allclose(curve.recall, [1 / 4, 1 / 4, 3 / 4])
     np.testing.assert_allclose(curve.precision, [1.0, 1 / 2, 2 / 3])
@@ -90,13 +88,13 @@ def test_rows_set_aside_are_not_kept() -> None:
     discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
     unlisted = (Frame(Step("e.0", *[0.0] * 9), (disc(1.0, -2.0),)),)
     result = compare_frames(frames(discs, 0), frames(discs, 1), GATE, unlisted=unlisted)
-    curve = disc_rates(result, [0.4, 0.7])
+    curve = rates_over(result, [0.4, 0.7])
     assert curve.kept.tolist() == [1, 0]
     np.testing.assert_allclose(curve.precision, [1.0, np.nan])
 
 
 def test_without_rows_there_are_no_rates() -> None:
-    curve = disc_rates(compared([([], [])]), [0.5])
+    curve = rates_over(compared([([], [])]), [0.5])
     assert np.isnan(curve.recall).all()
     assert np.isnan(curve.precision).all()
 
@@ -147,17 +145,6 @@ def test_bins_are_of_equally_many() -> None:
         most, [np.quantile(2.0 * at[k : k + 8], 0.95) for k in range(0, 80, 8)]
     )
     assert len(binned(np.zeros(0), np.zeros(0))[0]) == 0
-
-
-def test_settings_of_verticals_are_read_back(small_run: Path) -> None:
-    assert main(["lines", str(small_run), "--preset", "published", "--least-rows", "31"]) == 0
-    settings = read_head(small_run / "detected.lines").line_settings
-    assert settings.least_rows == 31
-    assert settings.largest_shift_px == PUBLISHED_LINES.largest_shift_px
-    assert settings.refine_steps_px == ()
-    assert settings.blurred_widths == ()
-    assert main(["lines", str(small_run), "--force"]) == 0
-    assert read_head(small_run / "detected.lines").line_settings == type(settings)()
 
 
 # -- the page ---------------------------------------------------------------------------------
@@ -236,7 +223,8 @@ def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> No
     words = " ".join(" ".join(page.words).split())
     camera = camera_in(judged_run)
     assert camera is not None
-    expected = compare_runs(judged_run, sight=Sight(camera))
+    reference, found = (read_frames(judged_run / f"{name}.circles") for name in ("map", "detected"))
+    expected = compare_frames(reference, found, sight=Sight(camera))
     assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
     assert f"recall {expected.recall:.4f}" in words
     assert f"precision {expected.precision:.4f}" in words
@@ -362,14 +350,6 @@ def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: 
     (tmp_path / "x.html").write_text(f"<!DOCTYPE html><title>not in</title>{HOSTILE}")
     shown, _ = in_browser(tmp_path / "x.html", tmp_path / "profile")
     assert "<title>in</title>" in shown
-
-
-@pytest.mark.long
-def test_browser_has_nothing_to_complain_of(judged_run: Path, tmp_path: Path) -> None:
-    reported(judged_run, tmp_path / "r.html")
-    shown, said = in_browser(tmp_path / "r.html", tmp_path / "profile")
-    assert "Effective configuration" in shown
-    assert "CONSOLE" not in said
 
 
 def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,7 @@ from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
-from lut import TableError
 from redetect.landmarks import read_frames, read_rows, read_steps
-from redetect.storage import OutputExistsError
 from tests.detect.conftest import SMALL_RUN_DISCS
 
 
@@ -56,14 +53,6 @@ def test_rows_are_the_discs_of_each_image(small_run: Path) -> None:
             covariance = np.array([[row.cxx, row.cxy], [row.cxy, row.cyy]])
             assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
             assert row.ids == (-1,)
-
-
-def test_steps_are_those_of_the_odometry(small_run: Path) -> None:
-    output = small_run / "out.circles"
-    detected(open_run(small_run), CircleSettings(), output)
-    written = [frame.step for frame in read_frames(output)]
-    assert written == list(read_steps(small_run / "s.txt"))
-    assert written[1].dx == -0.00375
 
 
 @pytest.mark.lowest
@@ -106,15 +95,6 @@ def test_head_tells_how_rows_were_made(small_run: Path) -> None:
         assert f" {name}={value}" in text
     assert "threshold=0.45" in text
     assert "768x288 px" in text
-
-
-def test_without_odometry_steps_are_zeros(small_run: Path) -> None:
-    (small_run / "s.txt").unlink()
-    output = small_run / "out.circles"
-    detected(open_run(small_run), CircleSettings(), output)
-    assert "the steps are zeros" in output.read_text()
-    for frame, prefix in zip(read_frames(output), SMALL_RUN_DISCS, strict=True):
-        assert dataclasses.astuple(frame.step) == (prefix, *[0.0] * 9)
 
 
 def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> None:
@@ -174,71 +154,3 @@ def test_published_json_has_no_evidence(small_run: Path, tmp_path: Path) -> None
     discs = [d for frame in json.loads(as_json.read_text())["frames"] for d in frame["discs"]]
     assert len(discs) >= 3
     assert all(disc["evidence"] is None for disc in discs)
-
-
-def left_in(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
-
-
-def test_existing_output_stays(small_run: Path) -> None:
-    output = small_run / "out.circles"
-    output.write_bytes(b"precious\n")
-    run = open_run(small_run)
-    before = left_in(small_run)
-    with pytest.raises(OutputExistsError, match=r"out\.circles"):
-        detected(run, CircleSettings(), output)
-    assert output.read_bytes() == b"precious\n"
-    assert left_in(small_run) == before
-    detected(run, CircleSettings(), output, overwrite=True)
-    assert len(list(read_frames(output))) == 3
-
-
-def test_all_outputs_or_none(small_run: Path, tmp_path: Path) -> None:
-    """Where the JSON cannot go, no rows are written either."""
-    output = small_run / "out.circles"
-    output.write_bytes(b"precious\n")
-    before = left_in(small_run)
-    with pytest.raises(FileNotFoundError):
-        detected(
-            open_run(small_run),
-            CircleSettings(),
-            output,
-            overwrite=True,
-            json_output=tmp_path / "nowhere" / "out.json",
-        )
-    assert output.read_bytes() == b"precious\n"
-    assert left_in(small_run) == before
-
-
-def test_an_interrupted_run_writes_no_more_than_its_journal(
-    small_run: Path, tmp_path: Path
-) -> None:
-    output, as_json = small_run / "out.circles", small_run / "out.json"
-    before = left_in(small_run)
-    ticks = []
-
-    def interrupt() -> None:
-        ticks.append(1)
-        if len(ticks) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        detected(
-            open_run(small_run),
-            CircleSettings(),
-            output,
-            json_output=as_json,
-            on_progress=interrupt,
-        )
-    assert left_in(small_run) - before == {".out.circles.journal"}
-
-
-def test_settings_without_a_table_are_refused(small_run: Path) -> None:
-    """A camera under the floor."""
-    output = small_run / "out.circles"
-    run = open_run(small_run)
-    rows = run.camera.robot_from_camera
-    under = replace(run.camera, robot_from_camera=(*rows[:2], (*rows[2][:3], -1.5)))
-    with pytest.raises(TableError, match=r"the camera is -1\.5 m above the floor: expected more"):
-        detected(replace(run, camera=under), CircleSettings(), output)
-    assert not output.exists()

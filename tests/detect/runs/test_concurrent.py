@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from detect.cli import main
 from detect.sources.opening import open_run
-from tests.detect.forked_runs import StopAfter, forked_runs
+from tests.detect.demo_frames import demo_frames
+from tests.detect.forked_runs import ForkedRuns, StopAfter, forked_runs, started
+from tests.detect.test_cli import files_in
 from tools.benchmark.material import repeated_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
+DETECT = ("-m", "detect")
 FRAMES = 16
 LONG_FRAMES = 80
 
@@ -30,13 +32,14 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source, run = project_root / "images" / "e", tmp_path_factory.mktemp("run") / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(FRAMES):
-        image = source / "images" / f"e.{number % 8:04d}.jpg"
-        shutil.copy(image, run / "images" / f"e.{number:04d}.jpg")
-    return run
+    run = tmp_path_factory.mktemp("run") / "e"
+    return demo_frames(project_root, run, [place % 8 for place in range(FRAMES)])
+
+
+@pytest.fixture(scope="module")
+def runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkedRuns]:
+    with forked_runs(run_folder, tmp_path_factory.mktemp("forked")) as started_runs:
+        yield started_runs
 
 
 @pytest.fixture(scope="module")
@@ -46,25 +49,9 @@ def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return repeated_run(open_run(project_root / "images" / "e"), folder, LONG_FRAMES, 0)
 
 
-def started(arguments: list[str], **environment: str) -> subprocess.Popen[str]:
-    root = Path(__file__).resolve().parents[3]
-    return subprocess.Popen(
-        [sys.executable, "-m", "detect", *arguments],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root), **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
     _, said = process.communicate(timeout=PATIENCE_S)
     return process.returncode, said
-
-
-def results(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 def folder_of(path: Path) -> Path:
@@ -83,59 +70,52 @@ def assert_one_run_wrote_all(folder: Path) -> None:
 
 def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> None:
     """Cold tables, filled by all of them at once."""
-    kinds = ("circles", "lines", "markers")
+    kinds = ("circles", "lines")
     alone, together = folder_of(tmp_path / "alone"), folder_of(tmp_path / "together")
     for kind in kinds:
         assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 0
     cold = {"REDETECT_CACHE": str(tmp_path / "tables")}
     processes = [
-        started([kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
+        started([*DETECT, kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
         for kind in kinds
     ]
     for process in processes:
         code, said = ended(process)
         assert code == 0, said
-    assert results(together) == results(alone)
+    assert files_in(together) == files_in(alone)
     tables = [path.name for path in (tmp_path / "tables").iterdir()]
     assert len(tables) == 2
     assert all(name.endswith(".table") for name in tables)
 
 
-def test_the_same_command_twice_is_refused(run_folder: Path, tmp_path: Path) -> None:
+def test_the_same_command_twice_is_refused(
+    runs: ForkedRuns, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = folder_of(tmp_path / "output")
     arguments = ["all", str(run_folder), "-o", str(output)]
-    with (
-        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
-        runs.started(arguments, StopAfter(FRAMES // 2)) as first,
-    ):
+    with runs.started(arguments, StopAfter(FRAMES // 2)) as first:
         first.wait_until_stopped()
-        others = [started(arguments), started([*arguments, "--resume"])]
-        for code, said in map(ended, others):
-            assert code == 1, said
-            *_, line = said.splitlines()
+        for flags in ([], ["--resume"]):
+            assert main([*arguments, *flags]) == 1
+            *_, line = capsys.readouterr().err.splitlines()
             journal = output / ".detected.journal"
             assert line.startswith(f"error: {journal}: another run is writing")
         first.go_on()
         assert first.wait() == 0, first.said()
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 5
+    assert len(files_in(output)) == 5
 
 
 def test_of_two_runs_that_may_overwrite_one_is_the_last(
-    run_folder: Path, long_run: Path, tmp_path: Path
+    runs: ForkedRuns, long_run: Path, tmp_path: Path
 ) -> None:
     """With other settings each, so that a mixture would be seen."""
     output = folder_of(tmp_path / "output")
     arguments = ["all", str(long_run), "-o", str(output), "--force"]
-    with (
-        forked_runs(run_folder, folder_of(tmp_path / "forked")) as runs,
-        runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first,
-    ):
+    with runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first:
         first.wait_until_stopped()
-        others = [
-            started([*arguments, "--circles.threshold", "0.5", "--lines.alpha", "published"])
-            for _ in range(2)
-        ]
+        flags = ["--circles.threshold", "0.5", "--lines.alpha", "published"]
+        others = [started([*DETECT, *arguments, *flags]) for _ in range(2)]
         for process in others:  # at work, and neither resumes
             assert process.stderr is not None
             assert "another run is writing" in process.stderr.readline()
@@ -145,7 +125,7 @@ def test_of_two_runs_that_may_overwrite_one_is_the_last(
             code, said = ended(process)
             assert code == 0, said
     assert_one_run_wrote_all(output)
-    assert len(results(output)) == 5  # and nothing that is hidden
+    assert len(files_in(output)) == 5  # and nothing that is hidden
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")

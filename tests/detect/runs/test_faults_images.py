@@ -164,16 +164,6 @@ def test_enormous_images_take_no_memory(tmp_path: Path) -> None:
     assert int(done.stdout) < 8 * 1024  # the images claim 0.9 and 3.6 million times that
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
-def test_pipes_and_devices_are_no_images(tmp_path: Path, published_camera: Camera) -> None:
-    """Nobody writes into the pipe, and the device never ends: neither is waited for."""
-    os.mkfifo(tmp_path / "pipe.png")
-    (tmp_path / "zeros.png").symlink_to("/dev/zero")
-    for name in ("pipe.png", "zeros.png"):
-        with pytest.raises(FrameError, match="cannot be read: is a pipe, socket or device"):
-            read_image(frame_of(tmp_path / name), published_camera)
-
-
 def test_files_larger_than_any_such_image_are_not_read(
     tmp_path: Path, published_camera: Camera
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from detect.sources.interface import RunFrame
 from detect.sources.opening import open_run
 from redetect.landmarks import FrameTilt
 from redetect.storage.parts import left_part, new_part
+from tests.detect.demo_frames import demo_frames
 
 FRAMES = 12
 
@@ -26,11 +26,7 @@ FRAMES = 12
 @pytest.fixture
 def tasks_and_plan(project_root: Path, tmp_path: Path) -> tuple[list[FrameTask], FramePlan]:
     """More frames than are decoded at once; of some there is no image."""
-    source, run = project_root / "images" / "e", tmp_path / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(FRAMES):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "images")
+    run = demo_frames(project_root, tmp_path / "e", range(FRAMES))
     opened = open_run(run)
     (run / "images" / "e.0003.jpg").write_bytes(b"no image")
     (run / "images" / "e.0009.jpg").unlink()
@@ -105,7 +101,7 @@ def test_a_journal_gives_back_what_was_noted(
 def test_pictures_are_not_noted(
     tasks_and_plan: tuple[list[FrameTask], FramePlan], tmp_path: Path
 ) -> None:
-    drawn = ROWS_OF_JOURNAL[0]._replace(pictures=(("e.0001.png", b"PNG"),))
+    drawn = ROWS_OF_JOURNAL[0]._replace(picture=b"PNG")
     with new_part(tmp_path / "a", "journal") as file:
         journal = Journal(file)
         journal.write(["program"])

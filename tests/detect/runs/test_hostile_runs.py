@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import cv2
@@ -104,18 +103,6 @@ def test_a_folder_of_images_may_be_a_link(run: Path, published_camera: Camera) -
     (run / "images").symlink_to("../elsewhere")
     for frame in open_run(run).frames:
         assert read_image(frame, published_camera).shape == (288, 768)
-
-
-def test_nothing_but_files_is_read(run: Path, published_camera: Camera) -> None:
-    for number, make in enumerate((os.mkfifo, os.mkdir)):
-        image = run / "images" / f"s.000{number}.png"
-        image.unlink()
-        make(image)
-    first, second, third = open_run(run).frames
-    for frame in (first, second):
-        with pytest.raises(FrameError, match="cannot be read"):
-            read_image(frame, published_camera)
-    assert read_image(third, published_camera).shape == (288, 768)
 
 
 def test_names_that_a_terminal_would_act_upon_are_escaped(

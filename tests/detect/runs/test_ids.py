@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from detect.cli import main
 from detect.runs.plan import MapByImage
 from redetect.landmarks import CircleLandmark, LandmarkFileError, read_frames
+from tests.detect.demo_frames import demo_frames
 
 FRAMES = 30
 
@@ -18,14 +18,10 @@ FRAMES = 30
 @pytest.fixture
 def run(project_root: Path, tmp_path: Path) -> Path:
     """Some frames of the demo run."""
-    source, run = project_root / "images" / "e", tmp_path / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    steps = (source / "e.txt").read_text().splitlines(keepends=True)
+    run = demo_frames(project_root, tmp_path / "e", range(FRAMES))
+    steps = (project_root / "images" / "e" / "e.txt").read_text().splitlines(keepends=True)
     rows = [row for row in steps if row.startswith("STEP")]
     (run / "e.txt").write_text("".join(rows[:FRAMES]))
-    for number in range(FRAMES):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "images")
     return run
 
 

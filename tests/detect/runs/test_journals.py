@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import random
 import shutil
 from collections.abc import Sequence
@@ -223,13 +222,3 @@ def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> No
     assert main([*arguments, "--resume"]) == 3
     assert results(drawings) == whole
     assert (tmp_path / "rows").read_bytes() == rows
-
-
-def test_the_log_says_nothing_of_the_interruption(
-    kept: Kept, undisturbed: dict[str, bytes], capsys: Captured
-) -> None:
-    resumed(kept.run, kept.output, capsys)
-    log = json.loads(results(kept.output)["detected.log.json"])
-    assert [failure["prefix"] for failure in log["failures"]] == ["e.0011"]
-    assert log["failures"][0]["frame"] == 11
-    assert log["frames"] == FRAMES

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from camera import Camera
-from detect.cli import main
 from detect.run_tilt import LEAST_FRAMES
 from detect.runs.frame import level_run
 from detect.runs.plan import RunSummary
@@ -63,20 +59,3 @@ def test_few_frames_are_levelled_each_by_itself(published_camera: Camera) -> Non
     assert (first.circles[0].px, first.circles[0].py) == (0.5, -2.5)
     assert all(frame.levelled_by is not None for frame in others)
     assert written["run tilt"].startswith(b"NOTILT 0 2\n")
-
-
-@pytest.mark.parametrize("way", ["frame", "run"])
-def test_files_keep_their_heads(small_run: Path, way: str) -> None:
-    assert main(["all", str(small_run), "--tilt", way]) == 0
-    for name in ("detected.circles", "detected.tilt", "detected.lines"):
-        assert (small_run / name).read_text().startswith("# "), name
-    log = json.loads((small_run / "detected.log.json").read_text())
-    for written in log["outputs"]:
-        content = (small_run / written["name"]).read_bytes()
-        assert hashlib.sha256(content).hexdigest() == written["sha256"]
-
-
-def test_rows_end_as_demanded(small_run: Path) -> None:
-    assert main(["all", str(small_run), "--tilt", "run", "--line-ends", "crlf"]) == 0
-    rows = (small_run / "detected.circles").read_bytes()
-    assert rows.count(b"\r\n") == rows.count(b"\n") > 3

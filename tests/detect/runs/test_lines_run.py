@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -18,6 +17,7 @@ from detect.runs.stream import detect_run
 from detect.sources.opening import open_run
 from detect.verticals.detections import carry_ids
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
+from tests.detect.demo_frames import demo_frames
 from tests.detect.line_scene import pinhole
 
 
@@ -41,12 +41,7 @@ def test_ids_go_where_there_is_no_doubt() -> None:
 
 @pytest.fixture
 def short_run(project_root: Path, tmp_path: Path) -> Path:
-    source, run = project_root / "images" / "e", tmp_path / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    for number in range(4):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "images")
-    return run
+    return demo_frames(project_root, tmp_path / "e", range(4))
 
 
 def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_path: Path) -> None:
@@ -63,18 +58,6 @@ def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_pat
     for frame in truth["frames"][:4]:
         found = tilts[frame["prefix"]]
         np.testing.assert_allclose([found.pitch, found.roll], frame["tilt"], atol=0.003)
-
-
-def test_bad_frame_costs_its_frame_only(
-    short_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (short_run / "images" / "e.0002.jpg").write_bytes(b"not an image")
-    assert main(["lines", str(short_run)]) == 3
-    assert "e.0002.jpg" in capsys.readouterr().err
-    frames = list(read_frames(short_run / "detected.lines"))
-    assert len(frames) == 4
-    assert frames[2].lines == ()
-    assert sorted(read_tilts(short_run / "detected.tilt")) == ["e.0000", "e.0001", "e.0003"]
 
 
 @pytest.mark.lowest

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ from detect.runs.workers import (
 )
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
+from tests.detect.demo_frames import demo_frames
+from tests.detect.forked_runs import started
 
 KINDS = ("lines", "tilt", "circles")
 FRAMES = 48
@@ -46,17 +48,7 @@ PATIENCE_S = 600.0
 @pytest.fixture
 def run_folder(project_root: Path, tmp_path: Path) -> Path:
     """Long enough to be disturbed: frames of the demo run, over and over."""
-    source, run = project_root / "images" / "e", tmp_path / "e"
-    (run / "images").mkdir(parents=True)
-    shutil.copy(source / "e.cam", run)
-    # Links that lead out of a run are refused.
-    (run / "few").mkdir()
-    for number in range(8):
-        shutil.copy(source / "images" / f"e.{number:04d}.jpg", run / "few")
-    for number in range(FRAMES):
-        image = run / "few" / f"e.{number % 8:04d}.jpg"
-        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
-    return run
+    return demo_frames(project_root, tmp_path / "e", [place % 8 for place in range(FRAMES)])
 
 
 def detected(
@@ -121,17 +113,26 @@ def test_a_killed_process_costs_nothing(run_folder: Path, tmp_path: Path) -> Non
 # -- interrupts -----------------------------------------------------------------------------
 
 
-def processes_with(environment: str) -> list[int]:
-    """Processes that have a variable in their environment."""
+@contextmanager
+def at_work(run: Path, jobs: int) -> Iterator[subprocess.Popen[str]]:
+    """`detect all` at work."""
+    arguments = ["-m", "detect", "all", str(run), "--jobs", str(jobs)]
+    with started(arguments, REDETECT_TEST=str(run)) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def processes_of(run: Path) -> list[int]:
+    """Processes that are at work on a run, by a variable in their environment."""
     found = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit() and int(folder.name) != os.getpid():
-            try:
+            with suppress(OSError):
                 content = (folder / "environ").read_bytes()
-            except OSError:
-                continue
-            if environment.encode() in content.split(b"\0"):
-                found.append(int(folder.name))
+                if f"REDETECT_TEST={run}".encode() in content.split(b"\0"):
+                    found.append(int(folder.name))
     return found
 
 
@@ -143,31 +144,12 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
 
 
 def make_long(run: Path) -> None:
+    """One image over and over; links that lead out of a run are refused."""
+    image = (run / "images" / "e.0000.jpg").rename(run / "image.jpg")
     shutil.rmtree(run / "images")
     (run / "images").mkdir()
     for number in range(MANY_FRAMES):
-        image = run / "images" / f"e.{number:04d}.jpg"
-        image.symlink_to(run / "few" / "e.0000.jpg")
-
-
-@contextmanager
-def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
-    """`detect all` at work in a process group of its own, as a shell starts it."""
-    name, value = mark.split("=")
-    root = Path(__file__).resolve().parents[3]
-    with subprocess.Popen(
-        [sys.executable, "-m", "detect", "all", str(run), "--jobs", str(jobs)],
-        cwd=root,
-        env={**os.environ, name: value},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
 
 
 @pytest.mark.long
@@ -175,10 +157,9 @@ def started(run: Path, jobs: int, mark: str) -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.parametrize(("jobs", "delay_s"), [(1, 0.5), (2, 0.3), (2, 2.5)])
 def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: float) -> None:
     """Control-C reaches the whole group of processes, at whatever they are."""
-    mark = f"REDETECT_TEST={run_folder}"
     make_long(run_folder)
     before = sorted(path.name for path in run_folder.iterdir())
-    with started(run_folder, jobs, mark) as process:
+    with at_work(run_folder, jobs) as process:
         wait_until(lambda: bool(list(run_folder.glob(".*.journal"))), "the run to begin")
         time.sleep(delay_s)
         os.killpg(process.pid, signal.SIGINT)
@@ -193,19 +174,18 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
         {".detected.journal"},
     )  # whether a frame was done: `--resume` goes on after it
     assert ("--resume" in err) == bool(left)
-    wait_until(lambda: not processes_with(mark), "its processes to end")
+    wait_until(lambda: not processes_of(run_folder), "its processes to end")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 def test_processes_end_with_the_one_that_started_them(run_folder: Path) -> None:
-    mark = f"REDETECT_TEST={run_folder}"
     make_long(run_folder)
-    with started(run_folder, 2, mark) as process:
+    with at_work(run_folder, 2) as process:
         # Itself, both workers, and the one that Python has look after semaphores.
-        wait_until(lambda: len(processes_with(mark)) >= 4, "the workers")
+        wait_until(lambda: len(processes_of(run_folder)) >= 4, "the workers")
         process.kill()
-    wait_until(lambda: not processes_with(mark), "its processes to end")
+    wait_until(lambda: not processes_of(run_folder), "its processes to end")
 
 
 # -- a cluster ------------------------------------------------------------------------------

@@ -81,13 +81,15 @@ def test_a_bag_that_needs_nothing_else(
         Said("/rear/camera_info", 1.0, info(ros, foreign, roi_width=5)),
     ]
     path = ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
-    expected, found = tmp_path / "expected.circles", tmp_path / "found.circles"
-    assert main(["circles", str(small_run), "-o", str(expected)]) == 0
-    assert main(["circles", str(path), "-o", str(found)]) == 0
     camera = open_run(path).camera
     np.testing.assert_allclose(
         camera.robot_from_camera, published_camera.robot_from_camera, atol=1e-4
     )
+    if kind == "ros1":
+        return  # images of all kinds of bags: test_bag.py
+    expected, found = tmp_path / "expected.circles", tmp_path / "found.circles"
+    assert main(["circles", str(small_run), "-o", str(expected)]) == 0
+    assert main(["circles", str(path), "-o", str(found)]) == 0
     for first, second in zip(read_frames(expected), read_frames(found), strict=True):
         assert len(first.circles) == len(second.circles)
         for a, b in zip(first.circles, second.circles):

@@ -101,7 +101,7 @@ def test_workers_write_the_same_bytes(project_root: Path, tmp_path: Path, kind: 
     source = project_root / "images" / "e"
     images = [
         np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((source / "images").glob("*.jpg"))[:40]
+        for path in sorted((source / "images").glob("*.jpg"))[:20]
     ]
     if kind == "video":
         path = write_video(tmp_path / "e.avi", images)
@@ -254,12 +254,6 @@ def test_refusals_tell_what_to_do(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     assert told in line
-
-
-def test_a_wrong_size_tells_what_to_do(small_run: Path, capsys: Captured) -> None:
-    cv2.imwrite(str(small_run / "images" / "s.0001.png"), np.zeros((48, 64), np.uint8))
-    assert main(["circles", str(small_run)]) == 3
-    assert "is 64x48 px: expected 768x288, the calibration's size: name" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["circles", "lines", "markers", "all"])

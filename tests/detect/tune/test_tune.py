@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,23 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.cli import main
-from detect.comparison.compare import compare_runs
+from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.report.figures import f1_score, knee, pareto_front
-from detect.runs.plan import FramePlan
-from detect.runs.workers import Workers, local_workers
 from detect.settings import CircleSettings
-from detect.sources.opening import open_run
 from detect.tune import (
     Trial,
     combinations,
     curve_picture,
     parameter_values,
     trial_records,
-    tune_run,
 )
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.test_cli import assert_refused
@@ -115,8 +106,8 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
         (CircleSettings, "radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
         (CircleSettings, "least_rows", "1", "no parameter of CircleSettings"),
         (LineSettings, "radius_m", "1", "no parameter of LineSettings"),
-        (LineSettings, "refine_steps_px", "1", "cannot be varied"),
-        (LineSettings, "blurred_widths", "2", "cannot be varied"),
+        (LineSettings, "refine_steps_px", "1", "a list of numbers"),
+        (LineSettings, "blurred_widths", "2", "a list of numbers"),
         (CircleSettings, "threshold", "0.3:0.7", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
         (CircleSettings, "threshold", "0.3:0.7:0", "FROM:TO:STEP"),
@@ -149,12 +140,13 @@ def test_all_combinations_are_tried() -> None:
 
 def test_records_mark_front_and_knee() -> None:
     grid = [{"threshold": k / 10} for k in range(len(CURVE))]
-    trials = [Trial(10, 9, 8, r, p, 0.0123456789, None) for r, p in CURVE]
-    records = trial_records(grid, trials, "m")
+    trials = [
+        Trial({"recall": r, "precision": p, "error_median_m": 0.0123456789}) for r, p in CURVE
+    ]
+    records = trial_records(grid, trials)
     assert [r["front"] for r in records] == [True] * 4 + [False] * 3
     assert [r["knee"] for r in records] == [False, True] + [False] * 5
     assert records[0]["error_median_m"] == 0.0123457
-    assert records[0]["normalised_error"] is None
     picture = curve_picture(grid, trials, "by hand")
     assert picture == curve_picture(grid, trials, "by hand")
     shown = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
@@ -191,7 +183,10 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     for row in rows:
         flags = ["--threshold", row["threshold"], "--samples", row["samples"]]
         assert main(["circles", str(small_run), *flags, "--force"]) == 0
-        expected = compare_runs(small_run)
+        reference, found = (
+            read_frames(small_run / f"{name}.circles") for name in ("map", "detected")
+        )
+        expected = compare_frames(reference, found)
         counts = (expected.reference, expected.detected, expected.matched)
         assert tuple(int(row[n]) for n in ("reference", "detected", "matched")) == counts
         assert row["recall"] == f"{expected.recall:.6g}"
@@ -214,44 +209,6 @@ def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
     for name in ("table.csv", "table.json", "curve.png"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
-
-
-class Mortal(Executor):
-    """Does its tasks at once, until it dies of the so manieth."""
-
-    def __init__(self, tasks: int) -> None:
-        self.left = tasks
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.left -= 1
-        if self.left < 0:
-            future.set_exception(BrokenExecutor("killed"))
-        else:
-            future.set_result(fn(*args, **kwargs))
-        return future
-
-
-@pytest.mark.parametrize("lives", [[9], [0, 9], [1, 9], [3, 9], [4, 0, 1, 9]])
-def test_workers_that_died_are_replaced(small_run: Path, lives: list[int]) -> None:
-    run = open_run(small_run)
-    write_reference(small_run, SMALL_RUN_DISCS)
-    frames = list(zip(run.frames, read_frames(small_run / "map.circles")))
-    settings = [CircleSettings(), CircleSettings(threshold=0.999)]
-    crews: list[Mortal] = []
-
-    @contextmanager
-    def start(_: FramePlan) -> Iterator[Executor]:
-        crews.append(Mortal(lives[len(crews)]))
-        yield crews[-1]
-
-    def trials(workers: Workers) -> list[Trial]:
-        return list(tune_run(run, frames, settings, CompareOptions(), workers))
-
-    found = trials(Workers(start, chunk=1, window=lambda: 1))
-    assert found == trials(local_workers(1))
-    assert all(trial.failures == () for trial in found)
-    assert len(crews) == len(lives)
 
 
 def test_verticals_are_tuned_as_well(small_run: Path, tmp_path: Path) -> None:
