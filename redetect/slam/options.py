@@ -45,15 +45,23 @@ class RunFlags:
     force: bool = False
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
+    @property
+    def runs(self) -> tuple[Path, ...]:
+        """All runs that are named."""
+        return (self.run, *getattr(self, "more", ()))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Map(RunFlags):
-    """Least-squares map: all poses and landmarks of a run at once.
+    """Least-squares map: all poses and landmarks of a run at once, or of several runs.
 
     Example: slam map images/e --circles --lines -o /tmp/e-map
 
     Parameters
     ----------
+    more : several paths
+        Further runs of the same building, with the same identifiers; the map is in the frame of
+        the first one's start.
     camera : Path
         Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     calibrate : bool
@@ -75,11 +83,13 @@ class Map(RunFlags):
     start : three floats
         Pose at the start in the map (m, m, rad).
     output : Path
-        Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
+        Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
+        pictures; by default `slam` in the run folder.
     interactive : bool
         Show the pictures in windows as well.
     """
 
+    more: Positional[tuple[Path, ...]] = ()
     calibrate: bool = False
     row_errors: Literal["corrected", "recorded"] = "corrected"
     tilt_deg: float = 0.0
@@ -212,7 +222,7 @@ class Ekf(FilterFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Associate(RunFlags):
-    """Find out which rows of a run show the same landmark, and write the run with those IDs.
+    """Find out which rows of a run, or of several, show the same landmark, and write those IDs.
 
     Where the file has IDs of its own they are not used, but the result is scored against them.
 
@@ -220,6 +230,8 @@ class Associate(RunFlags):
 
     Parameters
     ----------
+    more : several paths
+        Further runs of the same building, each from wherever it started: one set of IDs for all.
     method : str
         `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
         frame's rows (JCBB).
@@ -243,9 +255,11 @@ class Associate(RunFlags):
         Of that noise.
     output : Path
         The landmark file to write; by default associated.circles (or .lines) in the run folder.
-        With both kinds two files, which differ in the suffix. The scores go into a .json beside.
+        With both kinds two files, which differ in the suffix; of several runs found_1.circles,
+        found_2.circles, ... for found.circles. The scores go into a .json beside.
     """
 
+    more: Positional[tuple[Path, ...]] = ()
     method: Literal["nearest", "joint"] = "joint"
     map_level: bool = True
     gate_probability: float = 0.999

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,12 @@ UNKNOWN_ID = -1
 #: The noise of odometry that states none.
 ASSUMED = OdometryNoise()
 
+#: Beyond these standard deviations a step gives no information about the robot's motion.
+MOST_STEP_SIGMA_M = 100.0
+MOST_STEP_SIGMA_RAD = float(np.pi)
+#: Those of the step from one run to another.
+LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
+
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 _STEP_COLUMNS = (
@@ -31,24 +37,12 @@ _STEP_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class CircleRows:
-    """All disc rows of a run.
+    """All disc rows of a run."""
 
-    Attributes
-    ----------
-    frame : (n,) int64
-        The frame of each row, ascending from 0: it was seen after step `frame`.
-    xy : (n, 2) float64
-        Centres in the robot frame (m).
-    covariance : (n, 2, 2) float64
-        Of `xy` (m^2), positive definite.
-    ids : (n,) int64
-        Identifiers; -1 where unknown, as are all below 0. Of a row with several the first that is
-        known counts.
-    """
-
-    frame: IntArray
-    xy: FloatArray
-    covariance: FloatArray
+    frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
+    xy: FloatArray  # (n, 2): centres in the robot frame (m)
+    covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
+    # (n,): -1 where unknown, as are all below 0; of a row with several the first that is known.
     ids: IntArray
 
     def __len__(self) -> int:
@@ -68,23 +62,12 @@ class CircleRows:
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
-    """All rows of vertical lines of a run.
+    """All rows of vertical lines of a run."""
 
-    Attributes
-    ----------
-    frame : (n,) int64
-        The frame of each row, ascending from 0.
-    bearing_rad : (n,) float64
-        alpha of each row, 0 forward and positive to the left.
-    sigma_rad : (n,) float64
-        Its standard deviation, above 0.
-    ids : tuple of n tuples of int
-        All lines that a row shows (joined rows have several); empty where unknown.
-    """
-
-    frame: IntArray
-    bearing_rad: FloatArray
-    sigma_rad: FloatArray
+    frame: IntArray  # (n,): of each row, ascending from 0
+    bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
+    sigma_rad: FloatArray  # (n,): its standard deviation, above 0
+    # All lines that each row shows (joined rows have several); empty where unknown.
     ids: tuple[tuple[int, ...], ...]
 
     def __len__(self) -> int:
@@ -98,32 +81,79 @@ class LineRows:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A run: N steps of odometry and the measurements after each.
+    """A run: N steps of odometry and the measurements after each."""
 
-    Attributes
-    ----------
-    prefixes : tuple of N str
-        The frames' names.
-    steps : (N, 3) float64
-        dx, dy (m), dphi (rad) in the robot frame before each step.
-    step_covariance : (N, 3, 3) float64
-        Of `steps`, positive definite.
-    circles : CircleRows
-    lines : LineRows
-        Without rows if they were not requested.
-    unstated_steps : int
-        Steps whose covariance their source does not state: it is an assumed one.
-    """
-
-    prefixes: tuple[str, ...]
-    steps: FloatArray
-    step_covariance: FloatArray
+    prefixes: tuple[str, ...]  # the frames' names
+    steps: FloatArray  # (N, 3): dx, dy (m), dphi (rad) in the robot frame before each step
+    step_covariance: FloatArray  # (N, 3, 3): positive definite
     circles: CircleRows
-    lines: LineRows
-    unstated_steps: int = 0
+    lines: LineRows  # none if they were not requested
+    unstated_steps: int = 0  # steps whose covariance their source does not state: it is assumed
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    @property
+    def lost(self) -> IntArray:
+        """Steps whose odometry says nothing of the robot's motion."""
+        way = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
+        turn = self.step_covariance[:, 2, 2]
+        return np.flatnonzero((way > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
+
+    def part(self, first: int, last: int | None = None) -> Recording:
+        """The frames from one on, up to another or the end."""
+        end = len(self) if last is None else last
+        circles, lines = self.circles, self.lines
+        seen = (circles.frame >= first) & (circles.frame < end)
+        some = slice(*np.searchsorted(lines.frame, [first, end]))
+        return Recording(
+            self.prefixes[first:end],
+            self.steps[first:end],
+            self.step_covariance[first:end],
+            replace(circles.only(seen), frame=circles.frame[seen] - first),
+            LineRows(
+                lines.frame[some] - first,
+                lines.bearing_rad[some],
+                lines.sigma_rad[some],
+                lines.ids[some],
+            ),
+        )
+
+
+def first_poses(runs: Sequence[Recording]) -> IntArray:
+    """(k + 1,) where in the path of `joined` runs each one's begins, and the number of poses."""
+    return np.cumsum([0, *(len(run) + 1 for run in runs)])
+
+
+def joined(runs: Sequence[Recording]) -> Recording:
+    """Runs as one: a lost step leads from the end of each to the start of the next.
+
+    The frame after that step has no rows; it is called `start`.
+    """
+    if len(runs) == 1:
+        return runs[0]
+    starts = first_poses(runs)
+    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
+    lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
+    # The first run's start is no step.
+    return Recording(
+        tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
+        np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
+        np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
+        CircleRows(
+            np.concatenate([some.frame + start for some, start in zip(circles, starts)]),
+            np.concatenate([some.xy for some in circles]),
+            np.concatenate([some.covariance for some in circles]),
+            np.concatenate([some.ids for some in circles]),
+        ),
+        LineRows(
+            np.concatenate([some.frame + start for some, start in zip(lines, starts)]),
+            np.concatenate([some.bearing_rad for some in lines]),
+            np.concatenate([some.sigma_rad for some in lines]),
+            tuple(ids for some in lines for ids in some.ids),
+        ),
+        sum(run.unstated_steps for run in runs),
+    )
 
 
 def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:

@@ -171,10 +171,7 @@ def test_merging_never_joins_what_was_seen_together_and_never_splits(
 
 
 def test_pairs_are_in_the_order_of_their_votes() -> None:
-    matches = [
-        Match(0, 9, np.array(pairs), 0.0, np.zeros(2), -5.0)
-        for pairs in ([[1, 5], [2, 6]], [[6, 2], [3, 7]], [[2, 6]])
-    ]
+    matches = map(np.array, ([[1, 5], [2, 6]], [[6, 2], [3, 7]], [[2, 6]]))
     assert pairs_by_votes(matches) == [(2, 6), (1, 5), (3, 7)]
 
 

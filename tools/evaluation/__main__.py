@@ -24,6 +24,7 @@ STUDIES = {
     "fusion": "fusion.FusionStudy",
     "fusion-gaps": "fusion.GapStudy",
     "fusion-speed": "fusion.FusionSpeed",
+    "joining": "association.Joining",
     "laser-log": "lasers.LaserLog",
     "laser-sessions": "lasers.LaserSessions",
     "map": "maps.MapStudy",

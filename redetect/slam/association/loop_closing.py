@@ -6,6 +6,7 @@ so that rows count less which contradict all others.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -128,6 +129,9 @@ def solve_path(
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
+# Weight of a step that says nothing: just enough to keep the equations solvable.
+_LOST_WEIGHT = 1e-3
+NO_STEPS = np.zeros(0, dtype=np.int64)
 # Labels farther apart than this are not compared.
 _FARTHEST_M = 0.35
 
@@ -191,13 +195,9 @@ def in_order(labels: IntArray) -> IntArray:
     return rank[inverse]
 
 
-def pairs_by_votes(matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """The pairs of labels of all matches, those that most matches agree on first."""
-    votes: dict[tuple[int, int], int] = {}
-    for match in matches:
-        for a, b in match.pairs.tolist():
-            key = (min(a, b), max(a, b))
-            votes[key] = votes.get(key, 0) + 1
+def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
+    """The pairs of labels (k, 2) of all matches, those that most matches agree on first."""
+    votes = Counter((min(a, b), max(a, b)) for pairs in matches for a, b in pairs.tolist())
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
 
@@ -227,7 +227,9 @@ def pairs_in_place(
     return [(int(first[k]), int(second[k])) for k in ordered]
 
 
-def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
+def closed_path(
+    path: FloatArray, matches: Sequence[Match], lost: IntArray = NO_STEPS
+) -> FloatArray:
     """A path that satisfies the matches: where least squares over everything may start from.
 
     Headings first, then places: each of the two problems is linear (L. Carlone, R. Aragues, J. A.
@@ -235,7 +237,7 @@ def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
     International Journal of Robotics Research 33, 2014). So it does not matter how far off the path
     was.
 
-    Takes `path` (N + 1, 3); returns (N + 1, 3).
+    Takes `path` (N + 1, 3), and the steps that say nothing; returns (N + 1, 3).
     """
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)
@@ -250,6 +252,8 @@ def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
     turns = np.concatenate([np.diff(path[:, 2]), moved[:, 2] - path[first, 2]])
     is_match = np.arange(len(before)) >= count
     weights = [1.0 / np.where(is_match, _MATCH_SIGMA[a], _STEP_SIGMA[a]) for a in (0, 1)]
+    for weight in weights:
+        weight[lost] = _LOST_WEIGHT
     theta = path[0, 2] + _chained(before, after, turns[:, None], weights[0], count)[:, 0]
     offsets = np.einsum("nij,nj->ni", rotation(theta[before]), seen[:, :2])
     xy = path[0, :2] + _chained(before, after, offsets, weights[1], count)

@@ -20,21 +20,36 @@ from redetect.slam.filters.frames import NO_CAMERA, FilterRun
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import FilterFlags, RunFlags
 from redetect.slam.pictures import draw_errors, draw_map
-from redetect.slam.recording import Recording, demand_landmarks, landmark_file, read_recording
+from redetect.slam.recording import (
+    Recording,
+    demand_landmarks,
+    joined,
+    landmark_file,
+    read_recording,
+)
 from redetect.storage import OutputExistsError, write_whole
 
 
+def recordings_of(flags: RunFlags) -> list[Recording]:
+    """Read the rows of the runs that a command names; assumptions on their odometry are printed."""
+    recordings = [
+        read_recording(
+            run,
+            circles=flags.circles or not flags.lines,
+            lines=flags.lines,
+            stem=flags.stem,
+            noise=flags.odometry_noise,
+        )
+        for run in flags.runs
+    ]
+    for recording in recordings:
+        print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
+    return recordings
+
+
 def recording_of(flags: RunFlags) -> Recording:
-    """Read the rows of the run that a command names; assumptions on its odometry are printed."""
-    recording = read_recording(
-        flags.run,
-        circles=flags.circles or not flags.lines,
-        lines=flags.lines,
-        stem=flags.stem,
-        noise=flags.odometry_noise,
-    )
-    print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
-    return recording
+    """`recordings_of` the runs that a command names, as one."""
+    return joined(recordings_of(flags))
 
 
 def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
@@ -118,12 +133,12 @@ def default_output(run: Path, name: str = "") -> Path:
     return (run if run.is_dir() else run.parent) / "slam" / name
 
 
-def landmark_files(flags: RunFlags) -> list[Path]:
-    """The landmark files of the kinds that a command names."""
-    if not flags.run.is_dir():
-        return [demand_landmarks(flags.run)]
+def landmark_files(flags: RunFlags, run: Path) -> list[Path]:
+    """The landmark files of a run, of the kinds that a command names."""
+    if not run.is_dir():
+        return [demand_landmarks(run)]
     kinds = (".circles", flags.circles or not flags.lines), (".lines", flags.lines)
-    return [landmark_file(flags.run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
+    return [landmark_file(run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
 PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
@@ -139,7 +154,7 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
     """A command's flags as a JSON file has them."""
     return {
-        name: str(value) if isinstance(value, Path) else value
+        name: json.loads(json.dumps(value, default=str))
         for name, value in asdict(cast(Any, command)).items()
         if name not in but
     }

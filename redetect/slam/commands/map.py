@@ -24,7 +24,7 @@ from redetect.slam.commands.files import (
     default_output,
     demand_free,
     flags_of,
-    recording_of,
+    recordings_of,
     write_json,
 )
 from redetect.slam.errors import SlamError
@@ -42,7 +42,7 @@ from redetect.slam.mapping.run_map import (
 from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import Recording
+from redetect.slam.recording import Recording, first_poses, joined
 from redetect.storage.bounds import FINITE, demand
 
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
@@ -56,15 +56,20 @@ def perform(command: Map) -> int:
     """Carry the command out; 0 if all went well."""
     output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
-    names = (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME)
+    paths = [PATH_NAME]
+    if command.more:
+        paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
+    names = (MAP_NAME, joint_name, *paths, TABLE_NAME, PICTURE_NAME)
     demand_free([output / name for name in names], overwrite=command.force)
-    recording = recording_of(command)
+    runs = recordings_of(command)
+    recording = joined(runs)
     begin = time.perf_counter()
     mapped = mapped_run_of(command, recording)
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam map {slam.__version__}: {command.run.resolve().name}"]
+    name = ", ".join(run.resolve().name for run in command.runs)
+    head = [f"slam map {slam.__version__}: {name}"]
     final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
     path = path_of(recording, mapped.estimate, mapped.covariance)
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
@@ -75,7 +80,9 @@ def perform(command: Map) -> int:
     else:
         # One of another map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
-    write_path(output / PATH_NAME, path, head, overwrite=command.force)
+    ends = first_poses(runs)
+    for first, end, own in zip(ends, ends[1:], paths):
+        write_path(output / own, path.part(first, end), head, overwrite=command.force)
     write_json(output / TABLE_NAME, _results(mapped, command), overwrite=command.force)
     for line in _report(mapped, seconds):
         print(line)
@@ -91,11 +98,11 @@ def perform(command: Map) -> int:
         final,
         path,
         before=(start, path_of(recording, mapped.start, None)),
-        title=command.run.resolve().name,
+        title=name,
         overwrite=command.force,
         interactive=command.interactive,
     )
-    print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
+    print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, PICTURE_NAME))}")
     return 0
 
 

@@ -44,30 +44,18 @@ _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, belo
 
 @dataclass(frozen=True)
 class Weighting:
-    """The cost function and the unknowns.
+    """The cost function and the unknowns."""
 
-    Attributes
-    ----------
-    loss : str
-        How much a landmark row counts; odometry always counts in full.
-    loss_scale : float
-        Standard deviations from which on rows pull less.
-    calibrate : bool
-        Whether the camera's rotation and height are unknowns.
-    row_errors : "corrected" or "recorded"
-        Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
-        is put on the floor by the camera as mounted, under the row's own covariance. `recorded`:
-        the row that the calibrated camera would have written is compared with the one it wrote,
-        which is where that covariance belongs.
-    tilt_sigma_rad : float
-        Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
-        are compared as recorded.
-    """
-
-    loss: LossKind = "none"
-    loss_scale: Positive = 3.0
-    calibrate: bool = False
+    loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
+    loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
+    calibrate: bool = False  # whether the camera's rotation and height are unknowns
+    # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
+    # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
+    # row that the calibrated camera would have written is compared with the one it wrote, which is
+    # where that covariance belongs.
     row_errors: RowErrors = "corrected"
+    # Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
+    # are compared as recorded.
     tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0
 
     def __post_init__(self) -> None:
@@ -112,24 +100,13 @@ def layout_of(graph: Graph, weighting: Weighting) -> Layout:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Whitened errors by kind, not robustified.
+    """Whitened errors by kind, not robustified."""
 
-    Attributes
-    ----------
-    odometry : (N, 3) float64
-    discs : (n, 2) float64
-        NaN where a disc would be out of the camera's sight.
-    lines : (q,) float64
-    tilt : (N, 2) or (0, 2) float64
-    prior : (K, 2) or (0, 2) float64
-        Lines less where they are believed to be.
-    """
-
-    odometry: FloatArray
-    discs: FloatArray
-    lines: FloatArray
-    tilt: FloatArray
-    prior: FloatArray
+    odometry: FloatArray  # (N, 3)
+    discs: FloatArray  # (n, 2): NaN where a disc would be out of the camera's sight
+    lines: FloatArray  # (q,)
+    tilt: FloatArray  # (N, 2) or (0, 2)
+    prior: FloatArray  # (K, 2) or (0, 2): lines less where they are believed to be
 
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
