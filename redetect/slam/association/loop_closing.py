@@ -29,9 +29,13 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.mapping.graph import Estimate, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
+
+# Lines whose places are less certain have none.
+_LEAST_SIGMA_M = 0.5
 
 
 class LabelledMap(NamedTuple):
@@ -53,30 +57,12 @@ def intersect_bearings(
 
     Takes `path` (N + 1, 3), `labels` (n,), `camera_xy` (2,); returns (L, 2).
     """
-    lines = recording.lines
-    count = int(labels.max(initial=-1)) + 1
-    pose = path[lines.frame + 1]
-    centre = apply(pose, np.broadcast_to(np.asarray(camera_xy), (len(pose), 2)))
-    angle = lines.bearing_rad + pose[:, 2]
-    along = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    offset = np.sum(normal * centre, axis=1)
-    distance = np.full(len(pose), 3.0)
-    places = np.full((count, 2), np.nan)
-    for _ in range(4):  # the farther a line, the less its bearing says
-        weight = 1.0 / (lines.sigma_rad * np.maximum(distance, 0.3)) ** 2
-        information = np.zeros((count, 2, 2))
-        np.add.at(information, labels, weight[:, None, None] * normal[:, :, None] * normal[:, None])
-        vector = np.zeros((count, 2))
-        np.add.at(vector, labels, (weight * offset)[:, None] * normal)
-        smallest = np.linalg.eigvalsh(information)[:, 0]
-        certain = smallest > 1.0 / 0.5**2
-        places[:] = np.nan
-        places[certain] = np.linalg.solve(information[certain], vector[certain][..., None])[..., 0]
-        ahead = np.sum(along * (places[labels] - centre), axis=1)
-        distance = np.where(np.isfinite(ahead), np.abs(ahead), distance)
-    behind = np.bincount(labels, ahead < 0.0, minlength=count) > 0
-    places[behind] = np.nan
+    lines, count = recording.lines, int(labels.max(initial=-1)) + 1
+    poses = path[lines.frame + 1]
+    places, ahead, _ = meeting_points(
+        poses, lines.bearing_rad, lines.sigma_rad, labels, count, camera_xy, _LEAST_SIGMA_M**-2
+    )
+    places[np.bincount(labels, ahead < 0.0, minlength=count) > 0] = np.nan
     return places
 
 

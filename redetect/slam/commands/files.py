@@ -8,15 +8,17 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from camera import Camera, read_camera
+from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Path2D, read_path
+from redetect.landmarks.map_file import LandmarkMap, read_path, write_path
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA, FilterRun
+from redetect.slam.filters.report import path_distance, summary, table
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import FilterFlags, RunFlags
 from redetect.slam.pictures import draw_errors, draw_map
@@ -117,17 +119,6 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
     return np.array([mounting[0][3], mounting[1][3]])
 
 
-def read_reference(path: Path, poses: Path2D) -> Path2D:
-    """A path to compare with, which must be of the same run."""
-    reference = read_path(path)
-    if len(reference.poses) != len(poses.poses):
-        raise SlamError(
-            f"{path}: {len(reference.poses)} poses: expected {len(poses.poses)}, the start and one "
-            "after each step of the run"
-        )
-    return reference
-
-
 def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
@@ -160,7 +151,13 @@ def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
     }
 
 
-def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
+def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
+    """Write a summary."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def filtered(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
     """Take a filter through a run; also returned is what to print of its time."""
     began, began_working = time.perf_counter(), time.thread_time()
     run = work()
@@ -172,36 +169,59 @@ def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
     )
 
 
-def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write a summary."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+def filter_output(command: FilterFlags, name: str, more: tuple[str, ...] = ()) -> Path:
+    """The folder for a filter's results, in which nothing of their names may be."""
+    output = command.output or default_output(command.run, name)
+    names = [PATH_NAME, f"{name}.json", MAP_PICTURE, *more]
+    names += [ERROR_PICTURE] * (command.reference is not None)
+    demand_free([output / name for name in names], overwrite=command.force)
+    return output
 
 
-def draw_results(
-    output: Path,
-    landmark_map: LandmarkMap,
-    path: Path2D,
-    reference: Path2D | None,
-    title: str,
-    flags: FilterFlags,
-) -> None:
-    """Draw the map with the path and, beside a reference, the distance from it."""
+class FilterResults(NamedTuple):
+    """What a filter's command writes and prints."""
+
+    name: str  # of the command
+    run: FilterRun
+    landmark_map: LandmarkMap
+    source: str  # of the path, for its head
+    title: str  # of the pictures
+    figures: dict[str, Any]  # for the JSON file
+    lines: list[str]  # for the terminal
+
+
+def write_filtered(command: FilterFlags, output: Path, results: FilterResults) -> None:
+    """Write a filter's path, figures and pictures, and print its table."""
+    run, reference, distance = results.run, None, None
+    if command.reference:
+        reference = read_path(command.reference)
+        if len(reference.poses) != len(run.path.poses):
+            raise SlamError(
+                f"{command.reference}: {len(reference.poses)} poses: expected "
+                f"{len(run.path.poses)}, the start and one after each step of the run"
+            )
+        distance = path_distance(run.path, reference.poses)
+    output.mkdir(parents=True, exist_ok=True)
+    head = [f"slam {results.name} {slam.__version__}: {results.source}"]
+    write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
+    content = summary(run, flags_of(command), distance) | results.figures
+    write_json(output / f"{results.name}.json", content, overwrite=command.force)
+    print("\n".join([*table(run, distance), *results.lines]))
     draw_map(
         output / MAP_PICTURE,
-        landmark_map,
-        path,
+        results.landmark_map,
+        run.path,
         reference=reference,
-        title=title,
-        overwrite=flags.force,
-        interactive=flags.interactive,
+        title=results.title,
+        overwrite=command.force,
+        interactive=command.interactive,
     )
     if reference is not None:
         draw_errors(
             output / ERROR_PICTURE,
-            path,
+            run.path,
             reference.poses,
-            title=title,
-            overwrite=flags.force,
-            interactive=flags.interactive,
+            title=results.title,
+            overwrite=command.force,
+            interactive=command.interactive,
         )

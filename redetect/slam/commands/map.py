@@ -43,7 +43,7 @@ from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
-from redetect.storage.bounds import FINITE, demand
+from redetect.storage.bounds import ABOVE_0, FINITE, demand, from_to
 
 MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
 
@@ -108,7 +108,9 @@ def perform(command: Map) -> int:
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     """The map of a run's rows that a command asks for."""
-    _check(command)
+    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0, tilt_deg=from_to(0.0, 45.0))
+    if command.tilt_deg and command.row_errors != "recorded":
+        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
     camera = None
     if command.calibrate or command.tilt_deg or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
@@ -131,16 +133,6 @@ def weighting_of(command: Map) -> Weighting:
         row_errors=command.row_errors,
         tilt_sigma_rad=math.radians(command.tilt_deg),
     )
-
-
-def _check(command: Map) -> None:
-    demand(command, SlamError, start=FINITE)
-    if not (math.isfinite(command.loss_scale) and command.loss_scale > 0.0):
-        raise SlamError(f"--loss-scale {command.loss_scale:g}: expected above 0")
-    if not (0.0 <= command.tilt_deg < 45.0):
-        raise SlamError(f"--tilt-deg {command.tilt_deg:g}: expected from 0 to below 45")
-    if command.tilt_deg and command.row_errors != "recorded":
-        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
 
 
 def _report(mapped: MappedRun, seconds: float) -> list[str]:

@@ -14,13 +14,14 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.plane import rotation
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
     Pairing,
     chi_squared_gates,
+    individual_distances,
     joint_compatible,
     nearest_compatible,
 )
@@ -263,7 +264,9 @@ class Associator:
             pairing = self._paired(innovation, predicted, rows.disc_covariance)
             paired = pairing.landmark >= 0
             found[paired] = names[pairing.landmark[paired]]
-            closest = _closest(innovation, predicted, rows.disc_covariance)
+            closest = np.min(
+                individual_distances(innovation, predicted, rows.disc_covariance), axis=1
+            )
         if new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
@@ -358,13 +361,6 @@ def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArr
     reach = np.sqrt(pose[0, 0] + pose[1, 1]) + np.sqrt(pose[2, 2]) * np.hypot(*seen_xy.T)
     near = np.any(np.hypot(*offset.transpose(2, 0, 1)) < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
     return names[near], slots[near]
-
-
-def _closest(innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    """Squared Mahalanobis distance of each row of a disc from the landmark closest to it: (n,)."""
-    pairs = np.arange(innovation.shape[1])
-    own = predicted.reshape(len(pairs), 2, len(pairs), 2)[pairs, :, pairs, :]
-    return np.asarray(np.min(squared_mahalanobis(innovation, own + noise[:, None]), axis=1))
 
 
 def innovation_root(covariance: FloatArray) -> FloatArray:
