@@ -106,7 +106,9 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
     state, covariance, known = dense_filter(recording)
     assert list(ekf.disc_slots) == known
     np.testing.assert_allclose(ekf.state, state, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ekf.covariance.dense(), covariance, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        ekf.block(np.arange(ekf.covariance.size)), covariance, rtol=0, atol=1e-12
+    )
     landmarks = ekf.landmark_map().discs
     np.testing.assert_array_equal(landmarks.ids, known)
     np.testing.assert_allclose(landmarks.covariance[7], covariance[17:19, 17:19], atol=1e-12)
@@ -167,7 +169,7 @@ def test_the_filter_is_batch_least_squares_where_all_is_nearly_linear() -> None:
     sigma = np.sqrt(np.diag(covariance))
     # Both agree far better than they are apart from the odometry they started from.
     np.testing.assert_allclose((ekf.state[order] - state) / sigma, 0.0, atol=2e-3)
-    ratio = ekf.covariance.dense()[np.ix_(order, order)] / np.outer(sigma, sigma)
+    ratio = ekf.block(np.arange(ekf.covariance.size))[np.ix_(order, order)] / np.outer(sigma, sigma)
     np.testing.assert_allclose(ratio, covariance / np.outer(sigma, sigma), atol=5e-3)
 
 
@@ -180,7 +182,7 @@ def test_covariance_of_a_new_disc_by_monte_carlo() -> None:
     poses = rng.multivariate_normal(pose, spread, 200_000)
     sampled = apply(poses, rng.multivariate_normal(seen, noise, len(poses)))
     joint = np.cov(np.column_stack([poses, sampled]).T)
-    found = ekf.covariance.dense()
+    found = ekf.block(np.arange(ekf.covariance.size))
     sigma = np.sqrt(np.diag(found))
     np.testing.assert_allclose(
         joint / np.outer(sigma, sigma), found / np.outer(sigma, sigma), atol=0.01

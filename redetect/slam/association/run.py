@@ -134,7 +134,11 @@ def associate_run(
     if setting.map_level:
         by_discs = len(recording.circles) > 0
         closed = _closed_by_parts(
-            recording, circle_labels if by_discs else line_labels, setting, camera_xy, report
+            _without_lines(recording) if by_discs else recording,
+            circle_labels if by_discs else line_labels,
+            setting,
+            camera_xy,
+            report,
         )
         path, matches = closed.path, closed.matches
         if by_discs:
@@ -256,7 +260,7 @@ def _closed(
     by_discs = len(recording.circles) > 0
     frames = _frames_of_labels(recording)
     swayed, loops = _swayed(recording, setting.local), setting.loops
-    none = np.zeros(len(recording.lines), dtype=np.int64)
+    none = np.zeros(0, dtype=np.int64)
     everywhere = replace(
         loops,
         most_turn_rad=np.pi,
@@ -278,7 +282,7 @@ def _closed(
             line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
         found = solve_path(
             swayed,
-            labels if by_discs else none[:0],
+            labels if by_discs else none,
             none if by_discs else labels,
             path,
             line_xy,

@@ -110,20 +110,9 @@ def perform(options: Associate) -> int:
 
 
 def score_run(recording: Recording, found: RunAssociation) -> Scores:
-    """Score the association with the file's own IDs.
+    """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run with its IDs.
-    found : RunAssociation
-        Of the same rows.
-
-    Returns
-    -------
-    dict
-        ``scores["circles"]["local"]`` and so on, for kinds of which a row has an ID; the stages
-        are ``local`` and, after the map level, ``map``.
+    Kinds are those of which a row has an ID; stages ``local`` and, after the map level, ``map``.
     """
     discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
     scores: Scores = {}

@@ -65,26 +65,10 @@ def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
 
 
 def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
-    """Read the calibration that belongs to a run.
+    """Read the calibration that belongs to a run, a folder or a file in one.
 
-    Parameters
-    ----------
-    run : Path
-        Run folder, or a file in one.
-    camera : Path, optional
-        The calibration; by default the one ``.cam`` in the folder, ``<run>.cam`` if there are
-        several.
-
-    Returns
-    -------
-    Camera
-
-    Raises
-    ------
-    SlamError
-        If there is none, or it is not clear which.
-    camera.CameraError
-        If the file is malformed.
+    By default it is the one ``.cam`` in the folder, ``<run>.cam`` if there are several. Raises
+    `SlamError` if there is none, or it is not clear which.
     """
     if camera is not None:
         return read_camera(camera)

@@ -306,22 +306,11 @@ def run_filter(
     associator: Associator | None = None,
     new_id: Callable[[], int] | None = None,
 ) -> FilterRun:
-    """Take a filter through a run.
+    """Take a filter, which is at the start, through a run.
 
-    Parameters
-    ----------
-    recording : Recording
-    estimate : Filter
-        At the start; changed.
-    associator : Associator, optional
-        How rows are paired with landmarks; by default by their identifiers.
-    new_id : callable, optional
-        Gives the next identifier for a row that is found to show a new disc.
-
-    Raises
-    ------
-    SlamError
-        If an update is not possible; the message names the step.
+    Rows are paired with landmarks by their identifiers, unless an associator says otherwise;
+    `new_id` gives the next one for a row that is found to show a new disc. Raises `SlamError`,
+    which names the step, if an update is not possible.
     """
     pairing = associator or Associator()
     disc_ids: list[int] = []

@@ -42,20 +42,9 @@ _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
 def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
-    """Vectors, poses or steps in the data set's axes, brought into others.
+    """Vectors, poses or steps in the data set's axes, brought into others, or `back`.
 
-    Parameters
-    ----------
-    values : (..., 2) or (..., 3) array_like
-        x, y and, of poses and steps, the angle.
-    axes : str
-        The axes to bring them into.
-    back : bool
-        From those axes into the data set's instead.
-
-    Returns
-    -------
-    float64 of the same shape
+    Takes (..., 2) or (..., 3): x, y and, of poses and steps, the angle; returns the same shape.
     """
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":

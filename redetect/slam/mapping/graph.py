@@ -75,16 +75,7 @@ class Estimate:
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
     """The problem that a run's odometry and discs pose; lines come in by `with_lines`.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run. Rows without an identifier are left out.
-    camera : Camera, optional
-        As calibrated.
-
-    Returns
-    -------
-    Graph
+    Rows without an identifier are left out.
     """
     circles = recording.circles
     known = circles.ids >= 0
@@ -130,18 +121,9 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
 
 
 def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
-    """Poses as odometry chains them, discs where they were first seen, no lines.
+    """Poses as odometry chains them from the first (3,), discs where they were first seen.
 
-    Parameters
-    ----------
-    graph : Graph
-        Its lines are not placed: `line_xy` is NaN.
-    start : (3,) array_like
-        The first pose.
-
-    Returns
-    -------
-    Estimate
+    Lines are not placed: `line_xy` is NaN.
     """
     poses = chain_steps(graph.steps, start)
     _, first = np.unique(graph.disc_index, return_index=True)
