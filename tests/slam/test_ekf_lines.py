@@ -101,7 +101,7 @@ def test_a_copy_of_the_pose_is_used_again_when_its_lines_are_placed() -> None:
     assert len(ekf.state) == 3 + 3 + 4
     np.testing.assert_allclose(ekf.state[3:6], ekf.state[:3])
     np.testing.assert_allclose(
-        ekf.covariance.block(np.arange(3, 6)), ekf.covariance.pose(), atol=1e-15
+        ekf.covariance.block(np.arange(3, 6)), ekf.pose_covariance, atol=1e-15
     )
 
 

@@ -178,7 +178,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
         disc_xy=estimate.disc_xy + discs.reshape(-1, 2),
         line_xy=estimate.line_xy + lines.reshape(-1, 2),
     )
-    if layout.tilted and estimate.tilt is not None:
+    if tilt.size and estimate.tilt is not None:
         turned = np.concatenate([np.zeros((1, 2)), tilt.reshape(-1, 2)])
         after = replace(after, tilt=estimate.tilt + turned)
     if mounting.size and estimate.mounting is not None:
