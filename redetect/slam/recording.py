@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks import Frame, is_positive_definite, read_frames
+from redetect.landmarks import (
+    Frame,
+    Step,
+    circle_landmarks,
+    is_positive_definite,
+    read_frames,
+)
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
 
@@ -59,6 +66,17 @@ class CircleRows:
             self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
         )
 
+    @classmethod
+    def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
+        """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
+        table = list(rows)
+        return cls(
+            np.array([row[0] for row in table], dtype=np.int64),
+            np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
+            np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
+            np.array([row[3] for row in table], dtype=np.int64),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
@@ -77,6 +95,26 @@ class LineRows:
     def identified(self) -> BoolArray:
         """(n,) which rows say what lines they show."""
         return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
+
+    def only(self, chosen: BoolArray) -> LineRows:
+        """The chosen rows."""
+        return LineRows(
+            self.frame[chosen],
+            self.bearing_rad[chosen],
+            self.sigma_rad[chosen],
+            tuple(self.ids[k] for k in np.flatnonzero(chosen)),
+        )
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple[int, float, float, tuple[int, ...]]] = ()) -> LineRows:
+        """Rows of frame, bearing, its standard deviation and identifiers."""
+        table = list(rows)
+        return cls(
+            np.array([row[0] for row in table], dtype=np.int64),
+            np.array([row[1] for row in table], dtype=np.float64),
+            np.array([row[2] for row in table], dtype=np.float64),
+            tuple(row[3] for row in table),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,20 +141,14 @@ class Recording:
     def part(self, first: int, last: int | None = None) -> Recording:
         """The frames from one on, up to another or the end."""
         end = len(self) if last is None else last
-        circles, lines = self.circles, self.lines
-        seen = (circles.frame >= first) & (circles.frame < end)
-        some = slice(*np.searchsorted(lines.frame, [first, end]))
+        discs = self.circles.only((self.circles.frame >= first) & (self.circles.frame < end))
+        lines = self.lines.only((self.lines.frame >= first) & (self.lines.frame < end))
         return Recording(
             self.prefixes[first:end],
             self.steps[first:end],
             self.step_covariance[first:end],
-            replace(circles.only(seen), frame=circles.frame[seen] - first),
-            LineRows(
-                lines.frame[some] - first,
-                lines.bearing_rad[some],
-                lines.sigma_rad[some],
-                lines.ids[some],
-            ),
+            replace(discs, frame=discs.frame - first),
+            replace(lines, frame=lines.frame - first),
         )
 
 
@@ -269,41 +301,60 @@ def recording_of_frames(
     )
 
 
+def frames_of_discs(
+    prefixes: Sequence[str],
+    steps: FloatArray,
+    step_covariance: FloatArray,
+    circles: CircleRows,
+    quality: FloatArray,
+) -> list[Frame]:
+    """Steps and rows of discs as frames: what `recording_of_frames` gathers.
+
+    Takes `prefixes` of N, `steps` (N, 3), `step_covariance` (N, 3, 3), `quality` (n,) of the rows.
+    """
+    starts = np.searchsorted(circles.frame, np.arange(len(steps) + 1))
+    numbers = np.column_stack([steps, step_covariance.reshape(-1, 9)[:, [0, 1, 4, 2, 5, 8]]])
+    frames = []
+    for k, (prefix, row) in enumerate(zip(prefixes, numbers.tolist())):
+        some = slice(starts[k], starts[k + 1])
+        seen = circle_landmarks(
+            circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
+        )
+        frames.append(Frame(Step(prefix, *row), seen))
+    return frames
+
+
 def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
-    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
-    numbers = np.array(
-        [(r.px, r.py, r.cxx, r.cxy, r.cxy, r.cyy) for _, r in rows], dtype=np.float64
-    ).reshape(-1, 6)
-    covariance = numbers[:, 2:].reshape(-1, 2, 2)
-    for bad in np.flatnonzero(~is_positive_definite(covariance)):
-        k, row = rows[bad]
+    seen = [row for frame in frames for row in frame.circles]
+    rows = CircleRows.of(
+        (
+            *(k, (r.px, r.py), ((r.cxx, r.cxy), (r.cxy, r.cyy))),
+            next((i for i in r.ids if i >= 0), UNKNOWN_ID),
+        )
+        for k, frame in enumerate(frames)
+        for r in frame.circles
+    )
+    for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
+        k, row = rows.frame[bad], seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
             "has a covariance that is not positive definite"
         )
-    return CircleRows(
-        frame=np.array([k for k, _ in rows], dtype=np.int64),
-        xy=numbers[:, :2].copy(),
-        covariance=covariance,
-        ids=np.array(
-            [next((i for i in r.ids if i >= 0), UNKNOWN_ID) for _, r in rows], dtype=np.int64
-        ),
-    )
+    return rows
 
 
 def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
-    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
-    for k, row in rows:
-        if not row.sigma > 0.0:
-            raise SlamError(
-                f"{name}: step {k + 1} ({frames[k].step.prefix}): the line at bearing "
-                f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
-            )
-    return LineRows(
-        frame=np.array([k for k, _ in rows], dtype=np.int64),
-        bearing_rad=np.array([r.alpha for _, r in rows], dtype=np.float64),
-        sigma_rad=np.array([r.sigma for _, r in rows], dtype=np.float64),
-        ids=tuple(tuple(i for i in r.ids if i >= 0) for _, r in rows),
+    for k, frame in enumerate(frames):
+        for row in frame.lines:
+            if not row.sigma > 0.0:
+                raise SlamError(
+                    f"{name}: step {k + 1} ({frame.step.prefix}): the line at bearing "
+                    f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
+                )
+    return LineRows.of(
+        (k, row.alpha, row.sigma, tuple(i for i in row.ids if i >= 0))
+        for k, frame in enumerate(frames)
+        for row in frame.lines
     )
 
 

@@ -54,22 +54,13 @@ def small_run(seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14) -
             circle_rows.append((k, seen[i] + error, spread, i + 1))
         bearing = bearing_of_vertical(poses[k + 1], line_xy, CAMERA_XY)
         for j in np.flatnonzero(np.abs(bearing) < 1.2):
-            line_rows.append((k, bearing[j] + noise * 0.004 * rng.standard_normal(), (int(j) + 1,)))
+            error = noise * 0.004 * rng.standard_normal()
+            line_rows.append((k, bearing[j] + error, 0.004, (int(j) + 1,)))
     recording = Recording(
         prefixes=tuple(f"s.{k:04d}" for k in range(steps)),
         steps=measured,
         step_covariance=np.tile(step_covariance, (steps, 1, 1)),
-        circles=CircleRows(
-            frame=np.array([r[0] for r in circle_rows]),
-            xy=np.array([r[1] for r in circle_rows]),
-            covariance=np.array([r[2] for r in circle_rows]),
-            ids=np.array([r[3] for r in circle_rows]),
-        ),
-        lines=LineRows(
-            frame=np.array([r[0] for r in line_rows]),
-            bearing_rad=np.array([r[1] for r in line_rows]),
-            sigma_rad=np.full(len(line_rows), 0.004),
-            ids=tuple(r[2] for r in line_rows),
-        ),
+        circles=CircleRows.of(circle_rows),
+        lines=LineRows.of(line_rows),
     )
     return SmallRun(recording, poses, disc_xy, line_xy)

@@ -269,12 +269,11 @@ def test_bearings_intersect_where_the_line_stands() -> None:
     lines = np.array([[1.5, -6.0], [-1.2, -5.0], [0.0, -300.0]])
     frame, label = np.repeat(np.arange(20), 3), np.tile(np.arange(3), 20)
     bearing = bearing_of_vertical(path[frame + 1], lines[label], (0.02, -0.08))
-    empty = np.zeros(0, dtype=np.int64)
     recording = Recording(
         tuple(map(str, range(20))),
         between(path[:-1], path[1:]),
         np.tile(np.eye(3), (20, 1, 1)),
-        CircleRows(empty, np.zeros((0, 2)), np.zeros((0, 2, 2)), empty),
+        CircleRows.of(),
         LineRows(frame, bearing, np.full(60, 0.002), tuple((int(i),) for i in label)),
     )
     found = intersect_bearings(recording, path, label, camera_xy=(0.02, -0.08))

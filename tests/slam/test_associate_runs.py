@@ -60,23 +60,12 @@ def drive(
         reach = np.linalg.norm(lines - pose[:2], axis=1)
         for i in np.flatnonzero((np.abs(bearing) < 0.9) & (reach < 6.0)):
             upright.append((k, int(i), float(bearing[i] + LINE_SIGMA * rng.normal())))
-    n, m = len(seen), len(upright)
     return Recording(
         prefixes=tuple(f"s.{k}" for k in range(count)),
         steps=steps,
         step_covariance=np.tile(np.diag(sigma**2), (count, 1, 1)),
-        circles=CircleRows(
-            np.array([k for k, _, _ in seen], dtype=np.int64),
-            np.array([xy for _, _, xy in seen]).reshape(-1, 2),
-            np.tile(DISC_SIGMA**2 * np.eye(2), (n, 1, 1)),
-            np.array([i for _, i, _ in seen], dtype=np.int64),
-        ),
-        lines=LineRows(
-            np.array([k for k, _, _ in upright], dtype=np.int64),
-            wrap_angle(np.array([b for _, _, b in upright])),
-            np.full(m, LINE_SIGMA),
-            tuple((i,) for _, i, _ in upright),
-        ),
+        circles=CircleRows.of((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, i, xy in seen),
+        lines=LineRows.of((k, float(wrap_angle(b)), LINE_SIGMA, (i,)) for k, i, b in upright),
     )
 
 
@@ -204,7 +193,7 @@ def test_ids_in_the_file_are_not_looked_at_and_the_result_is_the_same_every_time
 def test_lines_do_not_change_what_becomes_of_the_discs() -> None:
     discs = scattered(7, 40, 0.4)
     recording = drive(circuit(0.2), discs, scattered(16, 60, 0.02), seed=8)
-    none = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+    none = LineRows.of()
     alone = associate_run(replace(recording, lines=none))
     both = associate_run(recording, camera_xy=CAMERA_XY)
     assert both.circle_labels.tolist() == alone.circle_labels.tolist()

@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 def discs_only(seed: int, discs: int = 14) -> SmallRun:
     """Two laps of 120 steps."""
     run = small_run(seed, steps=240, discs=discs)
-    none = LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ())
+    none = LineRows.of()
     return replace(run, recording=replace(run.recording, lines=none))
 
 

@@ -15,8 +15,8 @@ from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.filters.joint_covariance import JointCovariance
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
-from redetect.slam.recording import CircleRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
+from redetect.slam.recording import CircleRows, LineRows, Recording
+from tests.slam.ekf_rows import CAMERA_XY, rows_of, spd
 
 FloatArray = NDArray[np.float64]
 
@@ -43,13 +43,8 @@ def drive(
         prefixes=tuple(f"a.{k:04d}" for k in range(steps)),
         steps=np.array(measured),
         step_covariance=np.array(covariances),
-        circles=CircleRows(
-            frame=np.array([r[0] for r in rows]),
-            xy=np.array([r[1] for r in rows]),
-            covariance=np.array([r[2] for r in rows]),
-            ids=np.array([r[3] for r in rows]),
-        ),
-        lines=NOTHING,
+        circles=CircleRows.of(rows),
+        lines=LineRows.of(),
     )
     return recording, np.array(poses), places
 
@@ -220,7 +215,7 @@ def test_first_estimates_do_not_teach_the_heading() -> None:
             spread = 2e-2 * np.eye(2)
             seen = rng.multivariate_normal(np.zeros(2), spread, 12) + disc_in_robot(true, places)
             ekf.measure(rows_of([(i, xy, spread) for i, xy in enumerate(seen)]))
-            found = min(found, ekf.covariance.pose()[2, 2])
+            found = min(found, ekf.pose_covariance[2, 2])
         return found
 
     assert smallest("first") >= 0.1 - 1e-9

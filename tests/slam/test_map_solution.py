@@ -25,7 +25,7 @@ from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 
 def _only_discs(run: SmallRun) -> Recording:
-    none = LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ())
+    none = LineRows.of()
     return replace(run.recording, lines=none)
 
 

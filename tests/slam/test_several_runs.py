@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.landmarks import Frame, Step, circle_landmarks, squared_mahalanobis, write_frames
+from redetect.landmarks import squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import read_joint_covariance, read_map, read_path
 from redetect.plane import apply, between, invert
 from redetect.slam.association.joining import lay_together
 from redetect.slam.association.loops import Stretch
 from redetect.slam.cli import main
 from redetect.slam.models import disc_in_robot
-from redetect.slam.recording import Recording, joined, read_recording
+from redetect.slam.recording import Recording, frames_of_discs, joined, read_recording
 from tests.slam.test_associate_runs import NO_LINES, circuit, drive, scattered
 
 DISCS = scattered(3, 45, 0.5, 5.0)
@@ -25,16 +25,8 @@ PATHS = circuit(1.2, 5.0), circuit(2.0, 5.0)[70:]
 
 def write_run(file: Path, run: Recording, *, known: bool) -> str:
     """A run as a landmark file, with the simulation's identifiers or without."""
-    frames = []
-    for k, (prefix, step, c) in enumerate(
-        zip(run.prefixes, run.steps.tolist(), run.step_covariance.tolist())
-    ):
-        rows = run.circles.only(run.circles.frame == k)
-        seen = circle_landmarks(
-            rows.xy, np.ones(len(rows)), rows.covariance, rows.ids if known else 0 * rows.ids - 1
-        )
-        spread = [c[0][0], c[0][1], c[1][1], c[0][2], c[1][2], c[2][2]]
-        frames.append(Frame(Step(prefix, *step, *spread), seen))
+    rows = run.circles if known else replace(run.circles, ids=0 * run.circles.ids - 1)
+    frames = frames_of_discs(run.prefixes, run.steps, run.step_covariance, rows, np.ones(len(rows)))
     write_frames(file, frames, head="simulated")
     return str(file)
 

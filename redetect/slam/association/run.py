@@ -325,8 +325,7 @@ def _of_round(report: Progress, number: int, text: str) -> None:
 
 
 def _without_lines(recording: Recording) -> Recording:
-    none = np.zeros(0)
-    return replace(recording, lines=LineRows(none.astype(np.int64), none, none, ()))
+    return replace(recording, lines=LineRows.of())
 
 
 def _swayed(recording: Recording, setting: LocalSettings) -> Recording:

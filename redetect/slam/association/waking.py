@@ -74,7 +74,7 @@ def wake_up(
     settings : LoopSettings
         How discs are compared; its stretches are not used.
     """
-    if len(disc_xy) < settings.least_agreeing or len(recording) == 0:
+    if len(recording) == 0:
         return None
     most = min(len(recording), _MOST_FRAMES)
     poses = chain_steps(recording.steps[:most])
@@ -117,7 +117,7 @@ def placed(discs: FloatArray, disc_xy: FloatArray, settings: LoopSettings) -> Pl
 
     Takes `discs` (n, 2), `disc_xy` (M, 2) of the map.
     """
-    if len(discs) < settings.least_agreeing:
+    if min(len(discs), len(disc_xy)) < settings.least_agreeing:
         return None
     turn, x, y, agreeing, tried = motion_onto(discs, disc_xy, settings)
     if agreeing < settings.least_agreeing:

@@ -12,6 +12,7 @@ from redetect.landmarks.map_file import (
     write_map,
 )
 from redetect.slam.commands.files import (
+    MAP_NAME,
     FilterResults,
     filter_output,
     filtered,
@@ -24,8 +25,6 @@ from redetect.slam.filters.frames import Associator
 from redetect.slam.filters.report import map_distance
 from redetect.slam.options import Ekf
 from redetect.storage.bounds import FINITE, demand
-
-MAP_NAME = "map.csv"
 
 
 def perform(command: Ekf) -> int:

@@ -116,7 +116,7 @@ def landmark_files(flags: RunFlags, run: Path) -> list[Path]:
     return [landmark_file(run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
-PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
+MAP_NAME, PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "map.csv", "path.csv", "map.png", "errors.png"
 
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:

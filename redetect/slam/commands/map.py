@@ -20,6 +20,9 @@ from redetect.landmarks.map_file import (
     write_path,
 )
 from redetect.slam.commands.files import (
+    MAP_NAME,
+    MAP_PICTURE,
+    PATH_NAME,
     camera_of_run,
     default_output,
     demand_free,
@@ -45,7 +48,7 @@ from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.storage.bounds import ABOVE_0, FINITE, demand, from_to
 
-MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
+TABLE_NAME = "table.json"
 
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
@@ -59,7 +62,7 @@ def perform(command: Map) -> int:
     paths = [PATH_NAME]
     if command.more:
         paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
-    names = (MAP_NAME, joint_name, *paths, TABLE_NAME, PICTURE_NAME)
+    names = (MAP_NAME, joint_name, *paths, TABLE_NAME, MAP_PICTURE)
     demand_free([output / name for name in names], overwrite=command.force)
     runs = recordings_of(command)
     recording = joined(runs)
@@ -94,7 +97,7 @@ def perform(command: Map) -> int:
     first = landmark_map(mapped.graph, mapped.start, None)
     start = LandmarkMap(discs=first.discs, lines=no_landmarks())
     draw_map(
-        output / PICTURE_NAME,
+        output / MAP_PICTURE,
         final,
         path,
         before=(start, path_of(recording, mapped.start, None)),
@@ -102,7 +105,7 @@ def perform(command: Map) -> int:
         overwrite=command.force,
         interactive=command.interactive,
     )
-    print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, PICTURE_NAME))}")
+    print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE))}")
     return 0
 
 
