@@ -48,20 +48,37 @@ class RunFlags:
     @property
     def runs(self) -> tuple[Path, ...]:
         """All runs that are named."""
-        return (self.run, *getattr(self, "more", ()))
+        return (self.run,)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map(RunFlags):
+class RunsFlags(RunFlags):
+    """Options of commands that take several runs.
+
+    Parameters
+    ----------
+    more : several paths
+        Further runs of the same building, each from wherever it started.
+    """
+
+    more: Positional[tuple[Path, ...]] = ()
+
+    @property
+    def runs(self) -> tuple[Path, ...]:
+        """All runs that are named."""
+        return (self.run, *self.more)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map(RunsFlags):
     """Least-squares map: all poses and landmarks of a run at once, or of several runs.
+
+    Of several, identifiers have to agree, and the map is in the frame of the first one's start.
 
     Example: slam map images/e --circles --lines -o /tmp/e-map
 
     Parameters
     ----------
-    more : several paths
-        Further runs of the same building, with the same identifiers; the map is in the frame of
-        the first one's start.
     camera : Path
         Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     calibrate : bool
@@ -89,7 +106,6 @@ class Map(RunFlags):
         Show the pictures in windows as well.
     """
 
-    more: Positional[tuple[Path, ...]] = ()
     calibrate: bool = False
     row_errors: Literal["corrected", "recorded"] = "corrected"
     tilt_deg: float = 0.0
@@ -221,7 +237,7 @@ class Ekf(FilterFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Associate(RunFlags):
+class Associate(RunsFlags):
     """Find out which rows of a run, or of several, show the same landmark, and write those IDs.
 
     Where the file has IDs of its own they are not used, but the result is scored against them.
@@ -230,8 +246,6 @@ class Associate(RunFlags):
 
     Parameters
     ----------
-    more : several paths
-        Further runs of the same building, each from wherever it started: one set of IDs for all.
     method : str
         `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
         frame's rows (JCBB).
@@ -259,7 +273,6 @@ class Associate(RunFlags):
         found_2.circles, ... for found.circles. The scores go into a .json beside.
     """
 
-    more: Positional[tuple[Path, ...]] = ()
     method: Literal["nearest", "joint"] = "joint"
     map_level: bool = True
     gate_probability: float = 0.999

@@ -51,11 +51,11 @@ def small_run(seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14) -
         for i in np.flatnonzero(ahead & (np.linalg.norm(seen, axis=1) < 3.5)):
             spread = 0.0016 * np.eye(2) + 0.0004 * np.outer(seen[i], seen[i]) / 4
             error = noise * rng.multivariate_normal(np.zeros(2), spread)
-            circle_rows.append((k, seen[i] + error, spread, i + 1))
+            circle_rows.append((k, seen[i] + error, spread, int(i) + 1))
         bearing = bearing_of_vertical(poses[k + 1], line_xy, CAMERA_XY)
         for j in np.flatnonzero(np.abs(bearing) < 1.2):
-            error = noise * 0.004 * rng.standard_normal()
-            line_rows.append((k, bearing[j] + error, 0.004, (int(j) + 1,)))
+            off = noise * 0.004 * rng.standard_normal()
+            line_rows.append((k, bearing[j] + off, 0.004, (int(j) + 1,)))
     recording = Recording(
         prefixes=tuple(f"s.{k:04d}" for k in range(steps)),
         steps=measured,

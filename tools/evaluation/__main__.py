@@ -25,6 +25,7 @@ STUDIES = {
     "fusion-gaps": "fusion.GapStudy",
     "fusion-speed": "fusion.FusionSpeed",
     "joining": "association.Joining",
+    "joining-pairs": "association.JoiningPairs",
     "laser-log": "lasers.LaserLog",
     "laser-sessions": "lasers.LaserSessions",
     "map": "maps.MapStudy",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +19,7 @@ from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.association.waking import wake_up
 from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
+from redetect.slam.errors import SlamError
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import first_poses, joined, read_recording
@@ -146,4 +149,38 @@ class Joining:
                 f"{np.median(distance):.3f} m and {np.median(turn):.2f} deg (medians), at most "
                 f"{distance.max():.3f} m and {turn.max():.2f} deg"
             )
+        return 0
+
+
+@dataclass(frozen=True)
+class JoiningPairs:
+    """Cut a run into pieces, join each with each other one, and see which have discs in common."""
+
+    run: Positional[Path]  # Run folder or `.circles` file with IDs.
+    frames: int = 300  # In a piece.
+    least: int = 5  # Discs that pieces have in common if they show one place.
+
+    def __call__(self) -> int:
+        whole = read_recording(self.run)
+        starts = range(0, len(whole) - self.frames + 1, self.frames)
+        pieces = [whole.part(start, start + self.frames) for start in starts]
+        joined_pairs, wrong, off, counts = Counter[bool](), 0, [], Counter[bool]()
+        for one, other in combinations(pieces, 2):
+            shared = np.intersect1d(one.circles.ids, other.circles.ids)
+            same = len(shared[shared >= 0]) >= self.least
+            counts[same] += 1
+            try:
+                both = joined([one, other])
+                found = associate_run(both)
+            except SlamError:
+                continue
+            joined_pairs[same] += 1
+            score = score_run(both, found)["circles"]["map"]
+            off.append(score.pair_precision)
+            wrong += score.wrong_merges
+        print(
+            f"{joined_pairs[True]} of {counts[True]} pairs with {self.least} or more discs in "
+            f"common joined, and {joined_pairs[False]} of the {counts[False]} others; precision "
+            f"{np.mean(off):.4f} on average, {min(off):.4f} at least, wrong merges {wrong}"
+        )
         return 0
