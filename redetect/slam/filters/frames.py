@@ -26,7 +26,7 @@ from redetect.slam.association.compatibility import (
     nearest_compatible,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_in_robot
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 
@@ -62,27 +62,26 @@ def frame_innovation(
     Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
     `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
     """
-    d, e, rows = len(discs.slot), len(lines.slot), 2 * len(discs.slot) + len(lines.bearing_rad)
-    places = np.concatenate([discs.slot, lines.slot])[:, None] + np.arange(2)
-    pose, line_xy = state[:3], state[places[d:]]
-    every_disc, every_line = np.arange(d), np.arange(e)
-    count = np.diff(lines.start)
-    row = np.repeat(np.arange(len(count)), count)  # of each line
-    off = wrap_angle(lines.bearing_rad[row] - bearing_of_vertical(pose, line_xy, camera_xy))
-    mean = np.bincount(row, off / count[row], minlength=len(count))
-    innovation = np.concatenate([(discs.xy - disc_in_robot(pose, state[places[:d]])).ravel(), mean])
-
-    by_place = np.zeros((rows, d + e, 2))
-    of_discs = by_place[: 2 * d].reshape(d, 2, d + e, 2)
-    of_discs[every_disc, :, every_disc] = rotation(pose[2]).T
-    _, by_line = bearing_jacobians(pose, line_xy, camera_xy)
-    by_place[2 * d + row, d + every_line] = by_line / count[row, None]
+    d, rows = len(discs.slot), 2 * len(discs.slot) + len(lines.bearing_rad)
+    slots = np.concatenate([discs.slot, lines.slot])
+    places = slots[:, None] + np.arange(2)
+    pose, xy, every_disc = state[:3], state[places], np.arange(d)
+    turn = rotation(pose[2]).T
+    innovation, by_place = np.empty(rows), np.zeros((rows, len(slots), 2))
+    innovation[: 2 * d] = (discs.xy - (xy[:d] - pose[:2]) @ turn.T).ravel()
+    by_place[: 2 * d].reshape(d, 2, len(slots), 2)[every_disc, :, every_disc] = turn
+    if len(lines.slot):
+        count = np.diff(lines.start)
+        row = np.repeat(np.arange(len(count)), count)  # of each line
+        off = wrap_angle(lines.bearing_rad[row] - bearing_of_vertical(pose, xy[d:], camera_xy))
+        innovation[2 * d :] = np.bincount(row, off / count[row], minlength=len(count))
+        _, by_line = bearing_jacobians(pose, xy[d:], camera_xy)
+        by_place[2 * d + row, np.arange(d, len(slots))] = by_line / count[row, None]
     # Turning the robot is turning the landmarks about it the other way.
     offset = linearised_at[places] - linearised_at[:2]
-    by_heading = np.einsum("rkc,kc->r", by_place, np.stack([offset[:, 1], -offset[:, 0]], axis=1))
-    jacobian = np.column_stack(
-        [-by_place.sum(axis=1), by_heading, by_place.reshape(rows, 2 * (d + e))]
-    )
+    by_heading = by_place[:, :, 0] @ offset[:, 1] - by_place[:, :, 1] @ offset[:, 0]
+    by_landmarks = by_place.reshape(rows, 2 * len(slots))
+    jacobian = np.concatenate([-by_place.sum(axis=1), by_heading[:, None], by_landmarks], axis=1)
 
     noise = np.diag(np.concatenate([np.zeros(2 * d), lines.sigma_rad**2]))
     at = 2 * every_disc[:, None] + np.arange(2)
