@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.slam.filters.frames import FrameRows
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])
 
 

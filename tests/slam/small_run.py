@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.plane import between
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
-
-FloatArray = NDArray[np.float64]
 
 CAMERA_XY = np.array([0.018, -0.081])
 

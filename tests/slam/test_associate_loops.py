@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.plane import apply, between, fitted, rotation
 from redetect.slam.association.loop_closing import (
     closed_path,
@@ -32,8 +32,6 @@ from redetect.slam.association.loops import (
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 SETTINGS = LoopSettings()
 
 

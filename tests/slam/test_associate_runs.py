@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
 from redetect.slam.association.frame_to_frame import (
@@ -25,7 +25,6 @@ from redetect.slam.association.score import score_association
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = (0.02, -0.08)
 STEP_SIGMA = np.array([0.004, 0.004, 0.006])
 DISC_SIGMA, LINE_SIGMA = 0.03, 0.002

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
@@ -17,8 +17,6 @@ from redetect.slam.filters.joint_covariance import JointCovariance
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, rows_of, spd
-
-FloatArray = NDArray[np.float64]
 
 
 def drive(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
@@ -14,8 +14,6 @@ from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLine
 from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_jacobians, move
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from tests.slam.ekf_rows import CAMERA_XY, bearings_of, spd
-
-FloatArray = NDArray[np.float64]
 
 
 def test_covariance_of_a_new_line_by_monte_carlo() -> None:

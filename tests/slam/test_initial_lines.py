@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.least_squares.solver import LossKind
@@ -20,7 +19,6 @@ from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import small_run
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.05, -0.1])
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.line_points import (
     PointSettings,
@@ -21,7 +21,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = (0.02, -0.08)
 SIGMA_RAD = 0.002
 

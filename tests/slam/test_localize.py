@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
@@ -23,14 +23,7 @@ from redetect.slam.models import (
     move_jacobians,
 )
 from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
-
-FloatArray = NDArray[np.float64]
-CAMERA_XY = np.array([0.0179777, -0.0808609])
-
-
-def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
-    root = rng.normal(0, 1, (size, size))
-    return np.asarray(scale**2 * (root @ root.T / size + 0.3 * np.eye(size)))
+from tests.slam.ekf_rows import CAMERA_XY, spd
 
 
 def landmarks(rng: np.random.Generator, count: int, scale: float) -> Landmarks:
