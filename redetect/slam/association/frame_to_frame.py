@@ -172,7 +172,7 @@ class LocalSettings:
     # So is a disc whose position relative to the robot has become less certain than this, beyond
     # 4 m in proportion to its distance.
     forget_sigma_m: Limit = 0.35
-    # So many landmarks of each kind are kept, those seen last.
+    # At most this many landmarks of each kind are kept, those seen last.
     most_landmarks: Annotated[int, whole(1)] = 40
     most_nodes: Annotated[int, whole(1)] = 30_000  # bound of the joint search
 

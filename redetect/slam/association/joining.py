@@ -1,8 +1,8 @@
-"""Maps of several runs of one building laid on each other, by constellations of landmarks.
+"""Lays the maps of several runs of one building on each other, by constellations of landmarks.
 
-Nothing is known of where a run lies in another's map, but that each of its stretches would be
-placed there as a robot that wakes up is (`waking`). Stretches that are placed by chance, or in a
-room that looks like another, do not agree with each other.
+Nothing is known of where a run lies in another's map. Each of its stretches is placed there by
+itself, as a robot that wakes up is (`waking`). Stretches that are placed by chance, or in a room
+like another, do not agree with each other.
 """
 
 from __future__ import annotations
