@@ -22,15 +22,16 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
+from redetect.slam.commands.files import MAP_NAME, PATH_NAME
 from redetect.slam.commands.localize import localized_run_of
-from redetect.slam.commands.map import MAP_NAME, PATH_NAME, mapped_run_of, weighting_of
+from redetect.slam.commands.map import mapped_run_of, weighting_of
 from redetect.slam.filters.frames import FilterRun
 from redetect.slam.filters.report import path_distance
 from redetect.slam.mapping.run_map import MappedRun, landmark_map, path_of
 from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import Recording, read_recording
+from redetect.slam.recording import Recording, joined, read_recording
 
 PathLike = str | os.PathLike[str]
 
@@ -169,7 +170,7 @@ def map_landmarks(
         Which landmarks to use.
     **options
         Further flags of `slam map` (`redetect.slam.options.Map`), such as `stem`, `calibrate`,
-        `loss` or `start`.
+        `loss`, `start` or `more`, the paths of further runs of the same building.
 
     Returns
     -------
@@ -234,20 +235,27 @@ def localize(
 
 
 def _recording_of(command: Map | Localize) -> Recording:
-    return read_recording(
-        command.run,
-        circles=command.circles,
-        lines=command.lines,
-        stem=command.stem,
-        noise=command.odometry_noise,
+    return joined(
+        [
+            read_recording(
+                run,
+                circles=command.circles,
+                lines=command.lines,
+                stem=command.stem,
+                noise=command.odometry_noise,
+            )
+            for run in command.runs
+        ]
     )
 
 
 def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: Path(value) if name == "camera" and value is not None else value
-        for name, value in options.items()
-    }
+    paths = dict(options)
+    if paths.get("camera") is not None:
+        paths["camera"] = Path(paths["camera"])
+    if "more" in paths:
+        paths["more"] = tuple(map(Path, paths["more"]))
+    return paths
 
 
 def _picture(landmarks: LandmarkMap, path: Path2D) -> bytes:

@@ -90,6 +90,11 @@ class Path2D:
     poses: FloatArray
     covariance: FloatArray | None = None
 
+    def part(self, first: int, end: int) -> Path2D:
+        """The poses from one on, up to another."""
+        spread = None if self.covariance is None else self.covariance[first:end]
+        return Path2D(self.prefixes[first:end], self.poses[first:end], spread)
+
 
 def no_landmarks() -> Landmarks:
     """A map of nothing."""

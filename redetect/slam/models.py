@@ -105,19 +105,9 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
 
 
 def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
-    """Poses that odometry alone leads to.
+    """Poses that odometry alone leads to: the start, and that after each step.
 
-    Parameters
-    ----------
-    steps : (N, 3) array_like
-        Odometry steps.
-    start : (3,) array_like
-        Pose before the first.
-
-    Returns
-    -------
-    (N + 1, 3) float64
-        The start and the pose after each step; theta is not wrapped.
+    Takes `steps` (N, 3), `start` (3,); returns (N + 1, 3), theta not wrapped.
     """
     step = np.asarray(steps, dtype=np.float64).reshape(-1, 3)
     first = np.asarray(start, dtype=np.float64)
@@ -130,28 +120,14 @@ def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatAr
 def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
     """Measurement model of a disc: its centre in the robot frame.
 
-    Parameters
-    ----------
-    pose : (..., 3) array_like
-        x, y (m), theta (rad) of the robot in the map.
-    disc_xy : (..., 2) array_like
-        The disc's centre in the map (m).
-
-    Returns
-    -------
-    (..., 2) float64
-        The centre in the robot frame (m).
+    Takes `pose` (..., 3) of the robot in the map, `disc_xy` (..., 2), the centre in the map;
+    returns (..., 2).
     """
     robot = np.asarray(pose, dtype=np.float64)
     offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
     cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
-    return np.stack(
-        [
-            cos * offset[..., 0] + sin * offset[..., 1],
-            -sin * offset[..., 0] + cos * offset[..., 1],
-        ],
-        axis=-1,
-    )
+    x, y = offset[..., 0], offset[..., 1]
+    return np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
 
 
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -174,19 +150,8 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
     """Measurement model of a vertical line: the bearing under which the camera sees it.
 
-    Parameters
-    ----------
-    pose : (..., 3) array_like
-        The robot's pose in the map.
-    line_xy : (..., 2) array_like
-        Position of the line in the map (m).
-    camera_xy : (2,) array_like
-        (cx, cy): the camera's centre in the robot frame (m), from `sensor2World`.
-
-    Returns
-    -------
-    (...) float64
-        Bearing (rad) in [-pi, pi].
+    Takes `pose` (..., 3), `line_xy` (..., 2), both in the map, and `camera_xy` (2,), the camera's
+    centre in the robot frame; returns (...) in [-pi, pi].
     """
     seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
     return np.asarray(np.arctan2(seen[..., 0], -seen[..., 1]))

@@ -18,19 +18,10 @@ from redetect.slam.errors import SlamError
 
 
 def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations of rotation vectors, and the left Jacobians of that map.
+    """Rotations exp([v]x) of rotation vectors, by Rodrigues' formula, and their left Jacobians J.
 
-    Parameters
-    ----------
-    vectors : (..., 3) float array
-        Rotation vectors, radians.
-
-    Returns
-    -------
-    rotations : (..., 3, 3) float array
-        exp([v]x), by Rodrigues' formula.
-    left_jacobians : (..., 3, 3) float array
-        J with ``exp([v + d]x) = exp([J d]x) exp([v]x)`` to first order in d.
+    To first order in d, ``exp([v + d]x) = exp([J d]x) exp([v]x)``. Takes (..., 3), radians; returns
+    two arrays (..., 3, 3).
     """
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     # sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, all defined at a = 0.
@@ -63,22 +54,10 @@ def rows_through_mounting(
 ) -> tuple[FloatArray, FloatArray]:
     """Where rows' rays meet the floor if the camera is mounted otherwise.
 
-    Parameters
-    ----------
-    camera : Camera
-        As calibrated.
-    directions : (n, 3) float64
-        See `directions_of_rows`.
-    mounting : (3, 4) float64
-        robot_from_camera as mounted.
-
-    Returns
-    -------
-    floor_xy : (n, 2) float64
-        In the robot frame (m); NaN where a ray does not go down.
-    by_mounting : (n, 2, 4) float64
-        Derivatives by a rotation vector in the robot frame, applied to the mounting from the left,
-        and by the height.
+    Takes `directions` (n, 3), see `directions_of_rows`, and robot_from_camera as mounted (3, 4).
+    Returns `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and
+    `by_mounting` (n, 2, 4): derivatives by a rotation vector in the robot frame, applied to the
+    mounting from the left, and by the height.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]

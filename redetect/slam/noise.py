@@ -74,24 +74,8 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
 def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recording:
     """A run whose landmark rows are noisier by a factor on their own standard deviations.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    factor : float
-        Standard deviation of the added noise as a multiple of each row's own; 0 adds none.
-    seed : int
-        Everything random follows from it.
-
-    Returns
-    -------
-    Recording
-        Covariances are 1 + factor^2 times what they were; odometry stays.
-
-    Raises
-    ------
-    SlamError
-        If the factor is negative or not finite, or the seed is negative.
+    Covariances become 1 + factor^2 times what they were; odometry stays. Everything random follows
+    from the seed.
     """
     AddedNoise(disc_m=factor, seed=seed)  # which refuses what makes no sense
     rng = np.random.default_rng([seed, 2])

@@ -45,10 +45,35 @@ class RunFlags:
     force: bool = False
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
+    @property
+    def runs(self) -> tuple[Path, ...]:
+        """All runs that are named."""
+        return (self.run,)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Map(RunFlags):
-    """Least-squares map: all poses and landmarks of a run at once.
+class RunsFlags(RunFlags):
+    """Options of commands that take several runs.
+
+    Parameters
+    ----------
+    more : several paths
+        Further runs of the same building, each from wherever it started.
+    """
+
+    more: Positional[tuple[Path, ...]] = ()
+
+    @property
+    def runs(self) -> tuple[Path, ...]:
+        """All runs that are named."""
+        return (self.run, *self.more)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map(RunsFlags):
+    """Least-squares map: all poses and landmarks of a run at once, or of several runs.
+
+    Of several, identifiers have to agree, and the map is in the frame of the first one's start.
 
     Example: slam map images/e --circles --lines -o /tmp/e-map
 
@@ -75,7 +100,8 @@ class Map(RunFlags):
     start : three floats
         Pose at the start in the map (m, m, rad).
     output : Path
-        Folder for map.csv, path.csv, table.json and pictures; by default `slam` in the run folder.
+        Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
+        pictures; by default `slam` in the run folder.
     interactive : bool
         Show the pictures in windows as well.
     """
@@ -211,8 +237,8 @@ class Ekf(FilterFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Associate(RunFlags):
-    """Find out which rows of a run show the same landmark, and write the run with those IDs.
+class Associate(RunsFlags):
+    """Find out which rows of a run, or of several, show the same landmark, and write those IDs.
 
     Where the file has IDs of its own they are not used, but the result is scored against them.
 
@@ -243,7 +269,8 @@ class Associate(RunFlags):
         Of that noise.
     output : Path
         The landmark file to write; by default associated.circles (or .lines) in the run folder.
-        With both kinds two files, which differ in the suffix. The scores go into a .json beside.
+        With both kinds two files, which differ in the suffix; of several runs found_1.circles,
+        found_2.circles, ... for found.circles. The scores go into a .json beside.
     """
 
     method: Literal["nearest", "joint"] = "joint"

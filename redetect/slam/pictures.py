@@ -317,7 +317,12 @@ def _draw_panel(
             reference.poses[:, 0], reference.poses[:, 1], color=_REFERENCE, lw=0.9, ls=(0, (4, 2)),
             label="reference", zorder=4,
         )  # fmt: skip
-    axes.plot(path.poses[:, 0], path.poses[:, 1], color=_PATH, lw=0.9, label="path", zorder=3)
+    # Of several runs each begins with a start.
+    starts = [k for k, name in enumerate(path.prefixes) if k and name == path.prefixes[0]]
+    runs = np.split(path.poses, starts)
+    for k, poses in enumerate(runs):
+        label = None if k else "path"
+        axes.plot(poses[:, 0], poses[:, 1], color=_PATH, lw=0.9, label=label, zorder=3)
     if some is not None:
         ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
         _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
@@ -329,9 +334,10 @@ def _draw_panel(
                     color=_DISC, zorder=6,
                 )  # fmt: skip
     for index, name, marker in ((0, "start", "o"), (-1, "end", "s")):
+        at = np.array([poses[index] for poses in runs if len(poses)]).reshape(-1, 3)
         axes.plot(
-            path.poses[index, :1], path.poses[index, 1:2], ls="", marker=marker, ms=6, mfc="white",
-            mec="black", mew=1.2, label=name, zorder=7,
+            at[:, 0], at[:, 1], ls="", marker=marker, ms=6, mfc="white", mec="black", mew=1.2,
+            label=name, zorder=7,
         )  # fmt: skip
 
 

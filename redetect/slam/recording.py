@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks import Frame, is_positive_definite, read_frames
+from redetect.landmarks import (
+    Frame,
+    Step,
+    circle_landmarks,
+    is_positive_definite,
+    read_frames,
+)
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
 
@@ -18,6 +25,12 @@ UNKNOWN_ID = -1
 
 #: The noise of odometry that states none.
 ASSUMED = OdometryNoise()
+
+#: Beyond these standard deviations a step gives no information about the robot's motion.
+MOST_STEP_SIGMA_M = 100.0
+MOST_STEP_SIGMA_RAD = float(np.pi)
+#: Those of the step from one run to another.
+LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
@@ -31,24 +44,12 @@ _STEP_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class CircleRows:
-    """All disc rows of a run.
+    """All disc rows of a run."""
 
-    Attributes
-    ----------
-    frame : (n,) int64
-        The frame of each row, ascending from 0: it was seen after step `frame`.
-    xy : (n, 2) float64
-        Centres in the robot frame (m).
-    covariance : (n, 2, 2) float64
-        Of `xy` (m^2), positive definite.
-    ids : (n,) int64
-        Identifiers; -1 where unknown, as are all below 0. Of a row with several the first that is
-        known counts.
-    """
-
-    frame: IntArray
-    xy: FloatArray
-    covariance: FloatArray
+    frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
+    xy: FloatArray  # (n, 2): centres in the robot frame (m)
+    covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
+    # (n,): -1 where unknown, as are all below 0; of a row with several the first that is known.
     ids: IntArray
 
     def __len__(self) -> int:
@@ -65,26 +66,26 @@ class CircleRows:
             self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
         )
 
+    @classmethod
+    def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
+        """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
+        table = list(rows)
+        return cls(
+            np.array([row[0] for row in table], dtype=np.int64),
+            np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
+            np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
+            np.array([row[3] for row in table], dtype=np.int64),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
-    """All rows of vertical lines of a run.
+    """All rows of vertical lines of a run."""
 
-    Attributes
-    ----------
-    frame : (n,) int64
-        The frame of each row, ascending from 0.
-    bearing_rad : (n,) float64
-        alpha of each row, 0 forward and positive to the left.
-    sigma_rad : (n,) float64
-        Its standard deviation, above 0.
-    ids : tuple of n tuples of int
-        All lines that a row shows (joined rows have several); empty where unknown.
-    """
-
-    frame: IntArray
-    bearing_rad: FloatArray
-    sigma_rad: FloatArray
+    frame: IntArray  # (n,): of each row, ascending from 0
+    bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
+    sigma_rad: FloatArray  # (n,): its standard deviation, above 0
+    # All lines that each row shows (joined rows have several); empty where unknown.
     ids: tuple[tuple[int, ...], ...]
 
     def __len__(self) -> int:
@@ -95,35 +96,96 @@ class LineRows:
         """(n,) which rows say what lines they show."""
         return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
 
+    def only(self, chosen: BoolArray) -> LineRows:
+        """The chosen rows."""
+        return LineRows(
+            self.frame[chosen],
+            self.bearing_rad[chosen],
+            self.sigma_rad[chosen],
+            tuple(self.ids[k] for k in np.flatnonzero(chosen)),
+        )
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple[int, float, float, tuple[int, ...]]] = ()) -> LineRows:
+        """Rows of frame, bearing, its standard deviation and identifiers."""
+        table = list(rows)
+        return cls(
+            np.array([row[0] for row in table], dtype=np.int64),
+            np.array([row[1] for row in table], dtype=np.float64),
+            np.array([row[2] for row in table], dtype=np.float64),
+            tuple(row[3] for row in table),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A run: N steps of odometry and the measurements after each.
+    """A run: N steps of odometry and the measurements after each."""
 
-    Attributes
-    ----------
-    prefixes : tuple of N str
-        The frames' names.
-    steps : (N, 3) float64
-        dx, dy (m), dphi (rad) in the robot frame before each step.
-    step_covariance : (N, 3, 3) float64
-        Of `steps`, positive definite.
-    circles : CircleRows
-    lines : LineRows
-        Without rows if they were not requested.
-    unstated_steps : int
-        Steps whose covariance their source does not state: it is an assumed one.
-    """
-
-    prefixes: tuple[str, ...]
-    steps: FloatArray
-    step_covariance: FloatArray
+    prefixes: tuple[str, ...]  # the frames' names
+    steps: FloatArray  # (N, 3): dx, dy (m), dphi (rad) in the robot frame before each step
+    step_covariance: FloatArray  # (N, 3, 3): positive definite
     circles: CircleRows
-    lines: LineRows
-    unstated_steps: int = 0
+    lines: LineRows  # none if they were not requested
+    unstated_steps: int = 0  # steps whose covariance their source does not state: it is assumed
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    @property
+    def lost(self) -> IntArray:
+        """Steps whose odometry says nothing of the robot's motion."""
+        way = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
+        turn = self.step_covariance[:, 2, 2]
+        return np.flatnonzero((way > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
+
+    def part(self, first: int, last: int | None = None) -> Recording:
+        """The frames from one on, up to another or the end."""
+        end = len(self) if last is None else last
+        discs = self.circles.only((self.circles.frame >= first) & (self.circles.frame < end))
+        lines = self.lines.only((self.lines.frame >= first) & (self.lines.frame < end))
+        return Recording(
+            self.prefixes[first:end],
+            self.steps[first:end],
+            self.step_covariance[first:end],
+            replace(discs, frame=discs.frame - first),
+            replace(lines, frame=lines.frame - first),
+        )
+
+
+def first_poses(runs: Sequence[Recording]) -> IntArray:
+    """(k + 1,) where in the path of `joined` runs each one's begins, and the number of poses."""
+    return np.cumsum([0, *(len(run) + 1 for run in runs)])
+
+
+def joined(runs: Sequence[Recording]) -> Recording:
+    """Runs as one: a lost step leads from the end of each to the start of the next.
+
+    The frame after that step has no rows; it is called `start`.
+    """
+    if len(runs) == 1:
+        return runs[0]
+    starts = first_poses(runs)
+    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
+    lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
+    # The first run's start is no step.
+    return Recording(
+        tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
+        np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
+        np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
+        CircleRows(
+            np.concatenate([some.frame + start for some, start in zip(circles, starts)]),
+            np.concatenate([some.xy for some in circles]),
+            np.concatenate([some.covariance for some in circles]),
+            np.concatenate([some.ids for some in circles]),
+        ),
+        LineRows(
+            np.concatenate([some.frame + start for some, start in zip(lines, starts)]),
+            np.concatenate([some.bearing_rad for some in lines]),
+            np.concatenate([some.sigma_rad for some in lines]),
+            tuple(ids for some in lines for ids in some.ids),
+        ),
+        sum(run.unstated_steps for run in runs),
+    )
 
 
 def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:
@@ -239,41 +301,60 @@ def recording_of_frames(
     )
 
 
+def frames_of_discs(
+    prefixes: Sequence[str],
+    steps: FloatArray,
+    step_covariance: FloatArray,
+    circles: CircleRows,
+    quality: FloatArray,
+) -> list[Frame]:
+    """Steps and rows of discs as frames: what `recording_of_frames` gathers.
+
+    Takes `prefixes` of N, `steps` (N, 3), `step_covariance` (N, 3, 3), `quality` (n,) of the rows.
+    """
+    starts = np.searchsorted(circles.frame, np.arange(len(steps) + 1))
+    numbers = np.column_stack([steps, step_covariance.reshape(-1, 9)[:, [0, 1, 4, 2, 5, 8]]])
+    frames = []
+    for k, (prefix, row) in enumerate(zip(prefixes, numbers.tolist())):
+        some = slice(starts[k], starts[k + 1])
+        seen = circle_landmarks(
+            circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
+        )
+        frames.append(Frame(Step(prefix, *row), seen))
+    return frames
+
+
 def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
-    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
-    numbers = np.array(
-        [(r.px, r.py, r.cxx, r.cxy, r.cxy, r.cyy) for _, r in rows], dtype=np.float64
-    ).reshape(-1, 6)
-    covariance = numbers[:, 2:].reshape(-1, 2, 2)
-    for bad in np.flatnonzero(~is_positive_definite(covariance)):
-        k, row = rows[bad]
+    seen = [row for frame in frames for row in frame.circles]
+    rows = CircleRows.of(
+        (
+            *(k, (r.px, r.py), ((r.cxx, r.cxy), (r.cxy, r.cyy))),
+            next((i for i in r.ids if i >= 0), UNKNOWN_ID),
+        )
+        for k, frame in enumerate(frames)
+        for r in frame.circles
+    )
+    for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
+        k, row = rows.frame[bad], seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
             "has a covariance that is not positive definite"
         )
-    return CircleRows(
-        frame=np.array([k for k, _ in rows], dtype=np.int64),
-        xy=numbers[:, :2].copy(),
-        covariance=covariance,
-        ids=np.array(
-            [next((i for i in r.ids if i >= 0), UNKNOWN_ID) for _, r in rows], dtype=np.int64
-        ),
-    )
+    return rows
 
 
 def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
-    rows = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
-    for k, row in rows:
-        if not row.sigma > 0.0:
-            raise SlamError(
-                f"{name}: step {k + 1} ({frames[k].step.prefix}): the line at bearing "
-                f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
-            )
-    return LineRows(
-        frame=np.array([k for k, _ in rows], dtype=np.int64),
-        bearing_rad=np.array([r.alpha for _, r in rows], dtype=np.float64),
-        sigma_rad=np.array([r.sigma for _, r in rows], dtype=np.float64),
-        ids=tuple(tuple(i for i in r.ids if i >= 0) for _, r in rows),
+    for k, frame in enumerate(frames):
+        for row in frame.lines:
+            if not row.sigma > 0.0:
+                raise SlamError(
+                    f"{name}: step {k + 1} ({frame.step.prefix}): the line at bearing "
+                    f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
+                )
+    return LineRows.of(
+        (k, row.alpha, row.sigma, tuple(i for i in row.ids if i >= 0))
+        for k, frame in enumerate(frames)
+        for row in frame.lines
     )
 
 

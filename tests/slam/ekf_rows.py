@@ -1,22 +1,13 @@
-"""Rows of single frames, and what recordings without a kind of landmark have."""
+"""Rows of single frames."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.slam.filters.frames import FrameRows
-from redetect.slam.recording import CircleRows, LineRows
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])
-NOTHING = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
-NO_DISCS = CircleRows(
-    np.zeros(0, dtype=np.int64),
-    np.zeros((0, 2)),
-    np.zeros((0, 2, 2)),
-    np.zeros(0, dtype=np.int64),
-)
 
 
 def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:

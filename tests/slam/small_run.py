@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.plane import between
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
-
-FloatArray = NDArray[np.float64]
 
 CAMERA_XY = np.array([0.018, -0.081])
 
@@ -53,25 +51,16 @@ def small_run(
         for i in np.flatnonzero(ahead & (np.linalg.norm(seen, axis=1) < 3.5)):
             spread = 0.0016 * np.eye(2) + 0.0004 * np.outer(seen[i], seen[i]) / 4
             error = noise * rng.multivariate_normal(np.zeros(2), spread)
-            circle_rows.append((k, seen[i] + error, spread, i + 1))
+            circle_rows.append((k, seen[i] + error, spread, int(i) + 1))
         bearing = bearing_of_vertical(poses[k + 1], line_xy, CAMERA_XY)
         for j in np.flatnonzero(np.abs(bearing) < 1.2):
-            line_rows.append((k, bearing[j] + noise * 0.004 * rng.standard_normal(), (int(j) + 1,)))
+            off = noise * 0.004 * rng.standard_normal()
+            line_rows.append((k, bearing[j] + off, 0.004, (int(j) + 1,)))
     recording = Recording(
         prefixes=tuple(f"s.{k:04d}" for k in range(steps)),
         steps=measured,
         step_covariance=np.tile(step_covariance, (steps, 1, 1)),
-        circles=CircleRows(
-            frame=np.array([r[0] for r in circle_rows]),
-            xy=np.array([r[1] for r in circle_rows]),
-            covariance=np.array([r[2] for r in circle_rows]),
-            ids=np.array([r[3] for r in circle_rows]),
-        ),
-        lines=LineRows(
-            frame=np.array([r[0] for r in line_rows]),
-            bearing_rad=np.array([r[1] for r in line_rows]),
-            sigma_rad=np.full(len(line_rows), 0.004),
-            ids=tuple(r[2] for r in line_rows),
-        ),
+        circles=CircleRows.of(circle_rows),
+        lines=LineRows.of(line_rows),
     )
     return SmallRun(recording, poses, disc_xy, line_xy)

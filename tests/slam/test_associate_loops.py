@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.plane import apply, between, fitted, rotation
 from redetect.slam.association.loop_closing import (
     closed_path,
@@ -32,8 +32,6 @@ from redetect.slam.association.loops import (
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 SETTINGS = LoopSettings()
 
 
@@ -171,10 +169,7 @@ def test_merging_never_joins_what_was_seen_together_and_never_splits(
 
 
 def test_pairs_are_in_the_order_of_their_votes() -> None:
-    matches = [
-        Match(0, 9, np.array(pairs), 0.0, np.zeros(2), -5.0)
-        for pairs in ([[1, 5], [2, 6]], [[6, 2], [3, 7]], [[2, 6]])
-    ]
+    matches = map(np.array, ([[1, 5], [2, 6]], [[6, 2], [3, 7]], [[2, 6]]))
     assert pairs_by_votes(matches) == [(2, 6), (1, 5), (3, 7)]
 
 
@@ -272,12 +267,11 @@ def test_bearings_intersect_where_the_line_stands() -> None:
     lines = np.array([[1.5, -6.0], [-1.2, -5.0], [0.0, -300.0]])
     frame, label = np.repeat(np.arange(20), 3), np.tile(np.arange(3), 20)
     bearing = bearing_of_vertical(path[frame + 1], lines[label], (0.02, -0.08))
-    empty = np.zeros(0, dtype=np.int64)
     recording = Recording(
         tuple(map(str, range(20))),
         between(path[:-1], path[1:]),
         np.tile(np.eye(3), (20, 1, 1)),
-        CircleRows(empty, np.zeros((0, 2)), np.zeros((0, 2, 2)), empty),
+        CircleRows.of(),
         LineRows(frame, bearing, np.full(60, 0.002), tuple((int(i),) for i in label)),
     )
     found = intersect_bearings(recording, path, label, camera_xy=(0.02, -0.08))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import read_frames
 from redetect.plane import apply
 from redetect.slam.cli import main
@@ -18,13 +18,11 @@ from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.small_run import SmallRun, small_run
 
-IntArray = NDArray[np.int64]
-
 
 def discs_only(seed: int, discs: int = 14) -> SmallRun:
     """Two laps of 120 steps."""
     run = small_run(seed, steps=240, discs=discs)
-    none = LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ())
+    none = LineRows.of()
     return replace(run, recording=replace(run.recording, lines=none))
 
 
@@ -35,7 +33,7 @@ def second_lap(run: SmallRun, number: int) -> IntArray:
 
 
 def spoilt(
-    run: SmallRun, *, ids: IntArray | None = None, xy: NDArray[np.float64] | None = None
+    run: SmallRun, *, ids: IntArray | None = None, xy: FloatArray | None = None
 ) -> Recording:
     circles = run.recording.circles
     ids, xy = circles.ids if ids is None else ids, circles.xy if xy is None else xy

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from redetect.array_types import FloatArray
 from redetect.slam.association.compatibility import (
     chi_squared_gates,
     joint_compatible,
@@ -18,7 +18,6 @@ from redetect.slam.association.compatibility import (
 )
 from redetect.slam.errors import SlamError
 
-FloatArray = NDArray[np.float64]
 Case = tuple[FloatArray, FloatArray, FloatArray]
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.io import savemat
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.cli import main
@@ -17,7 +17,6 @@ from redetect.slam.formats.data_sets import discs_of_ranges, trees_of
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 
-FloatArray = NDArray[np.float64]
 RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01
 
 

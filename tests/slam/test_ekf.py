@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
@@ -15,10 +15,8 @@ from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.filters.joint_covariance import JointCovariance
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
-from redetect.slam.recording import CircleRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, NOTHING, rows_of, spd
-
-FloatArray = NDArray[np.float64]
+from redetect.slam.recording import CircleRows, LineRows, Recording
+from tests.slam.ekf_rows import CAMERA_XY, rows_of, spd
 
 
 def drive(
@@ -43,13 +41,8 @@ def drive(
         prefixes=tuple(f"a.{k:04d}" for k in range(steps)),
         steps=np.array(measured),
         step_covariance=np.array(covariances),
-        circles=CircleRows(
-            frame=np.array([r[0] for r in rows]),
-            xy=np.array([r[1] for r in rows]),
-            covariance=np.array([r[2] for r in rows]),
-            ids=np.array([r[3] for r in rows]),
-        ),
-        lines=NOTHING,
+        circles=CircleRows.of(rows),
+        lines=LineRows.of(),
     )
     return recording, np.array(poses), places
 
@@ -106,7 +99,9 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
     state, covariance, known = dense_filter(recording)
     assert list(ekf.disc_slots) == known
     np.testing.assert_allclose(ekf.state, state, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ekf.covariance.dense(), covariance, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        ekf.block(np.arange(ekf.covariance.size)), covariance, rtol=0, atol=1e-12
+    )
     landmarks = ekf.landmark_map().discs
     np.testing.assert_array_equal(landmarks.ids, known)
     np.testing.assert_allclose(landmarks.covariance[7], covariance[17:19, 17:19], atol=1e-12)
@@ -167,7 +162,7 @@ def test_the_filter_is_batch_least_squares_where_all_is_nearly_linear() -> None:
     sigma = np.sqrt(np.diag(covariance))
     # Both agree far better than they are apart from the odometry they started from.
     np.testing.assert_allclose((ekf.state[order] - state) / sigma, 0.0, atol=2e-3)
-    ratio = ekf.covariance.dense()[np.ix_(order, order)] / np.outer(sigma, sigma)
+    ratio = ekf.block(np.arange(ekf.covariance.size))[np.ix_(order, order)] / np.outer(sigma, sigma)
     np.testing.assert_allclose(ratio, covariance / np.outer(sigma, sigma), atol=5e-3)
 
 
@@ -180,7 +175,7 @@ def test_covariance_of_a_new_disc_by_monte_carlo() -> None:
     poses = rng.multivariate_normal(pose, spread, 200_000)
     sampled = apply(poses, rng.multivariate_normal(seen, noise, len(poses)))
     joint = np.cov(np.column_stack([poses, sampled]).T)
-    found = ekf.covariance.dense()
+    found = ekf.block(np.arange(ekf.covariance.size))
     sigma = np.sqrt(np.diag(found))
     np.testing.assert_allclose(
         joint / np.outer(sigma, sigma), found / np.outer(sigma, sigma), atol=0.01
@@ -218,7 +213,7 @@ def test_first_estimates_do_not_teach_the_heading() -> None:
             spread = 2e-2 * np.eye(2)
             seen = rng.multivariate_normal(np.zeros(2), spread, 12) + disc_in_robot(true, places)
             ekf.measure(rows_of([(i, xy, spread) for i, xy in enumerate(seen)]))
-            found = min(found, ekf.covariance.pose()[2, 2])
+            found = min(found, ekf.pose_covariance[2, 2])
         return found
 
     assert smallest("first") >= 0.1 - 1e-9

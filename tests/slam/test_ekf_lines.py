@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
 from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_jacobians, move
-from redetect.slam.recording import LineRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, NO_DISCS, bearings_of, spd
-
-FloatArray = NDArray[np.float64]
+from redetect.slam.recording import CircleRows, LineRows, Recording
+from tests.slam.ekf_rows import CAMERA_XY, bearings_of, spd
 
 
 def test_covariance_of_a_new_line_by_monte_carlo() -> None:
@@ -101,7 +99,7 @@ def test_a_copy_of_the_pose_is_used_again_when_its_lines_are_placed() -> None:
     assert len(ekf.state) == 3 + 3 + 4
     np.testing.assert_allclose(ekf.state[3:6], ekf.state[:3])
     np.testing.assert_allclose(
-        ekf.covariance.block(np.arange(3, 6)), ekf.covariance.pose(), atol=1e-15
+        ekf.covariance.block(np.arange(3, 6)), ekf.pose_covariance, atol=1e-15
     )
 
 
@@ -118,18 +116,13 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
         pose = move(pose, step)
         measured.append(step + share * rng.multivariate_normal(np.zeros(3), covariance))
         bearings = bearing_of_vertical(pose, lines, CAMERA_XY) + share * sigma * rng.normal(size=3)
-        rows += [(k, float(b), (i,)) for i, b in enumerate(bearings)]
+        rows += [(k, float(b), sigma, (i,)) for i, b in enumerate(bearings)]
     recording = Recording(
         prefixes=tuple(f"c.{k}" for k in range(steps)),
         steps=np.array(measured),
         step_covariance=np.tile(covariance, (steps, 1, 1)),
-        circles=NO_DISCS,
-        lines=LineRows(
-            np.array([r[0] for r in rows]),
-            np.array([r[1] for r in rows]),
-            np.full(len(rows), sigma),
-            tuple(r[2] for r in rows),
-        ),
+        circles=CircleRows.of(),
+        lines=LineRows.of(rows),
     )
     ekf = EkfSlam(camera_xy=CAMERA_XY, jacobians=jacobians)
     run = run_ekf(recording, ekf)
@@ -152,7 +145,7 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
             J[:, 3 * k : 3 * k + 3] = second
             normal += J.T @ weight @ J
             right += J.T @ weight @ (recording.steps[k] - between(poses[k], poses[k + 1]))
-        for k, bearing, (i,) in rows:
+        for k, bearing, _, (i,) in rows:
             row = np.zeros(unknowns)
             at = 3 * steps + 2 * i
             row[3 * k : 3 * k + 3], row[at : at + 2] = bearing_jacobians(
@@ -246,7 +239,7 @@ def test_rays_that_do_not_meet_in_front(bearings: tuple[float, float]) -> None:
 
 
 def test_lines_can_not_be_identified_before_they_are_placed() -> None:
-    lines = LineRows(np.array([0]), np.array([0.1]), np.array([0.01]), ((),))
-    recording = Recording(("a",), np.zeros((1, 3)), np.eye(3)[None], NO_DISCS, lines)
+    lines = LineRows.of([(0, 0.1, 0.01, ())])
+    recording = Recording(("a",), np.zeros((1, 3)), np.eye(3)[None], CircleRows.of(), lines)
     with pytest.raises(SlamError, match="expected known association"):
         run_ekf(recording, EkfSlam(), Associator("joint"))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.slam.formats.text import Axes, covariance_from_dataset, from_dataset, to_dataset
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, move
-
-FloatArray = NDArray[np.float64]
 
 
 def some_covariances(rng: np.random.Generator, count: int, size: int) -> FloatArray:

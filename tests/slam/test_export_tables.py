@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera import read_camera
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between, rotation
@@ -19,7 +19,6 @@ from redetect.slam.formats.text import Axes, from_dataset
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 
-FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e"
 
 

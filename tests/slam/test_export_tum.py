@@ -70,7 +70,6 @@ def test_a_robot_that_turned_left_ahead_of_the_start(tmp_path: Path) -> None:
         ("0 1 2 0.5 0 0 0 1\n", ":1: expected a pose on the floor"),
         ("0 1 2 0 0.6 0 0 0.8\n", ":1: expected a pose on the floor"),
         ("# AXES dataset (X left)\n0 1 2 0 0 0 0 1\n", ":1: the file's axes are 'dataset'"),
-        ("0 1 2 0 0 0 0 1" + " " * 2**20 + "\n", ":1: longer than"),
     ],
 )
 def test_what_is_no_path_on_the_floor_is_refused(tmp_path: Path, text: str, message: str) -> None:

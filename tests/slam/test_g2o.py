@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import CircleLandmark, Frame, Step, format_frame, read_frames, wrap_angle
 from redetect.plane import between, rotation
 from redetect.slam.errors import SlamError
@@ -28,7 +28,6 @@ from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.text import Axes
 from redetect.slam.models import disc_in_robot
 
-FloatArray = NDArray[np.float64]
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
 
 POSES = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_XY 17 2 1\n"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between
@@ -20,7 +20,6 @@ from redetect.slam.recording import read_recording
 
 gtsam: Any = pytest.importorskip("gtsam", reason="needs gtsam: pip install 'redetect[slam]'")
 
-FloatArray = NDArray[np.float64]
 DOCUMENT = Path(__file__).parents[2] / "docs" / "slam" / "formats.md"
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
 

@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.least_squares.solver import LossKind
 from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.initial_lines import place_lines, triangulate, well_placed
+from redetect.slam.mapping.initial_lines import place_lines, well_placed
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import small_run
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.05, -0.1])
 
 
@@ -38,11 +36,13 @@ def test_a_line_is_placed_if_two_of_its_rays_cross_widely_enough(
     poses = np.column_stack(
         [line - 4.0 * np.column_stack([np.sin(courses), -np.cos(courses)]), courses]
     )
-    sigma = np.full(len(courses), 1e-3)
-    below = triangulate(poses, 0.0 * courses, sigma, np.zeros(2), widest - 1e-6)
-    assert below is not None
-    np.testing.assert_allclose(below, line, atol=1e-6)
-    assert triangulate(poses, 0.0 * courses, sigma, np.zeros(2), widest + 1e-6) is None
+    count = len(courses)
+    rows = LineRows(np.arange(count), 0.0 * courses, np.full(count, 1e-3), ((4,),) * count)
+    path = np.concatenate([poses[:1], poses])
+    below = place_lines(path, rows, np.zeros(2), least_parallax_rad=widest - 1e-6)
+    np.testing.assert_allclose(below.xy, [line], atol=1e-6)
+    above = place_lines(path, rows, np.zeros(2), least_parallax_rad=widest + 1e-6)
+    assert above.unplaced.tolist() == [4]
 
 
 def test_a_line_seen_twenty_thousand_times_is_placed() -> None:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.line_points import (
     PointSettings,
@@ -21,7 +21,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = (0.02, -0.08)
 SIGMA_RAD = 0.002
 
@@ -36,26 +35,21 @@ def seen(
     rng = np.random.default_rng(seed)
     steps = np.tile([0.0, -0.2, 0.01], (frames, 1))
     path = chain_steps(steps)
-    rows: list[tuple[int, float, tuple[int, ...]]] = []
+    rows: list[tuple[int, float, float, tuple[int, ...]]] = []
     for frame in range(frames):
         bearing = bearing_of_vertical(path[frame + 1], lines, CAMERA_XY)
         bearing = bearing + rng.normal(0.0, SIGMA_RAD, len(lines))
         shown = (np.abs(bearing) < 0.7) & (rng.random(len(lines)) < 0.9)
-        rows += [(frame, float(bearing[k]), (int(k) + 1,)) for k in np.flatnonzero(shown)]
-        rows += [(frame, float(b), ()) for b in rng.uniform(-0.7, 0.7, clutter)]
+        rows += [
+            (frame, float(bearing[k]), SIGMA_RAD, (int(k) + 1,)) for k in np.flatnonzero(shown)
+        ]
+        rows += [(frame, float(b), SIGMA_RAD, ()) for b in rng.uniform(-0.7, 0.7, clutter)]
     recording = Recording(
         prefixes=tuple(f"{k}" for k in range(frames)),
         steps=steps,
         step_covariance=np.tile(np.diag([1e-4, 1e-4, 1e-4]), (frames, 1, 1)),
-        circles=CircleRows(
-            np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.int64)
-        ),
-        lines=LineRows(
-            frame=np.array([row[0] for row in rows], dtype=np.int64),
-            bearing_rad=np.array([row[1] for row in rows]),
-            sigma_rad=np.full(len(rows), SIGMA_RAD),
-            ids=tuple(row[2] for row in rows),
-        ),
+        circles=CircleRows.of(),
+        lines=LineRows.of(rows),
     )
     believed = path.copy()
     believed[1:, 2] += rng.normal(0.0, heading_sigma_rad, frames)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
@@ -22,14 +23,7 @@ from redetect.slam.models import (
     move_jacobians,
 )
 from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
-
-FloatArray = NDArray[np.float64]
-CAMERA_XY = np.array([0.0179777, -0.0808609])
-
-
-def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
-    root = rng.normal(0, 1, (size, size))
-    return np.asarray(scale**2 * (root @ root.T / size + 0.3 * np.eye(size)))
+from tests.slam.ekf_rows import CAMERA_XY, spd
 
 
 def landmarks(rng: np.random.Generator, count: int, scale: float) -> Landmarks:
@@ -62,24 +56,14 @@ def drive(seed: int, *, noise: float = 1.0) -> tuple[Recording, LandmarkMap, Flo
             bearings = bearing_of_vertical(pose, some.lines.xy[seen], CAMERA_XY)
             if np.ptp(bearings) < 1.0:
                 bearing = bearings.mean() + noise * rng.normal(0, 0.02)
-                lines.append((k, bearing, tuple(int(i) + 10 for i in seen)))
+                lines.append((k, bearing, 0.02, tuple(int(i) + 10 for i in seen)))
     return (
         Recording(
             prefixes=tuple(f"b.{k}" for k in range(60)),
             steps=np.array(steps),
             step_covariance=covariances,
-            circles=CircleRows(
-                np.array([r[0] for r in circles]),
-                np.array([r[1] for r in circles]),
-                np.array([r[2] for r in circles]),
-                np.array([r[3] for r in circles]),
-            ),
-            lines=LineRows(
-                np.array([r[0] for r in lines]),
-                np.array([r[1] for r in lines]),
-                np.full(len(lines), 0.02),
-                tuple(r[2] for r in lines),
-            ),
+            circles=CircleRows.of(circles),
+            lines=LineRows.of(lines),
         ),
         some,
         np.array(poses),
@@ -230,13 +214,7 @@ def test_rows_that_show_nothing_in_the_map_are_left_out_and_counted() -> None:
     recording.circles.ids[2] = 999
     lines = recording.lines
     ids = ((), (10, 777), *lines.ids[2:])
-    changed = Recording(
-        recording.prefixes,
-        recording.steps,
-        recording.step_covariance,
-        recording.circles,
-        LineRows(lines.frame, lines.bearing_rad, lines.sigma_rad, ids),
-    )
+    changed = replace(recording, lines=replace(lines, ids=ids))
     run = run_filter(changed, Localizer(some, camera_xy=CAMERA_XY))
     assert run.count.left_out == {
         "disc without ID": 2,
@@ -251,22 +229,11 @@ def test_rows_that_show_nothing_in_the_map_are_left_out_and_counted() -> None:
 def test_identities_are_found_in_the_map(method: str) -> None:
     recording, some, _ = drive(5, noise=0.2)
     # One row of a line each, and no disc twice in a frame: else a row has no one right answer.
-    single = [len(numbers) == 1 for numbers in recording.lines.ids]
-    lines = LineRows(
-        recording.lines.frame[single],
-        recording.lines.bearing_rad[single],
-        recording.lines.sigma_rad[single],
-        tuple(numbers for numbers in recording.lines.ids if len(numbers) == 1),
-    )
+    single = np.array([len(numbers) == 1 for numbers in recording.lines.ids])
     pairs = np.stack([recording.circles.frame, recording.circles.ids], axis=1)
     first = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
-    circles = CircleRows(
-        recording.circles.frame[first],
-        recording.circles.xy[first],
-        recording.circles.covariance[first],
-        recording.circles.ids[first],
-    )
-    one = Recording(recording.prefixes, recording.steps, recording.step_covariance, circles, lines)
+    circles = recording.circles.only(np.isin(np.arange(len(pairs)), first))
+    one = replace(recording, circles=circles, lines=recording.lines.only(single))
     certain = Landmarks(
         some.discs.ids, some.discs.xy, some.discs.covariance * 1e-3, some.discs.rows
     )
@@ -279,7 +246,7 @@ def test_identities_are_found_in_the_map(method: str) -> None:
     right = run.disc_ids == circles.ids
     assert np.mean(right | (run.disc_ids < 0)) > 0.99
     assert np.mean(right) > 0.97
-    assert np.mean([found == ids for found, ids in zip(run.line_ids, lines.ids)]) > 0.9
+    assert np.mean([found == ids for found, ids in zip(run.line_ids, one.lines.ids)]) > 0.9
 
 
 def test_covariances_that_contradict_each_other_are_refused() -> None:

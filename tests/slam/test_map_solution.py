@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
@@ -25,7 +25,7 @@ from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 
 def _only_discs(run: SmallRun) -> Recording:
-    none = LineRows(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), ())
+    none = LineRows.of()
     return replace(run.recording, lines=none)
 
 
@@ -36,7 +36,7 @@ def _with_camera_place(camera: Camera) -> Camera:
     return _mounted(camera, matrix)
 
 
-def _mounted(camera: Camera, matrix: NDArray[np.float64]) -> Camera:
+def _mounted(camera: Camera, matrix: FloatArray) -> Camera:
     first, second, third = (tuple(float(x) for x in row) for row in matrix)
     return replace(camera, robot_from_camera=(first, second, third))  # type: ignore[arg-type]
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import RowErrors, Weighting, errors, layout_of, linearise
@@ -146,7 +146,7 @@ def test_first_sight_places_each_disc_where_its_first_row_does() -> None:
 
 
 @given(arrays(np.float64, 3, elements=st.floats(-1.5, 1.5)))
-def test_rotation_vectors_as_scipy_has_them(vector: NDArray[np.float64]) -> None:
+def test_rotation_vectors_as_scipy_has_them(vector: FloatArray) -> None:
     rotation, left = rotation_exp(vector)
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
     for axis in 1e-6 * np.eye(3):

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, between, rotation
 from redetect.slam.models import (
@@ -21,7 +21,6 @@ from redetect.slam.models import (
     move_jacobians,
 )
 
-FloatArray = NDArray[np.float64]
 CAMERA_XY = np.array([0.0179777, -0.0808609])
 
 

@@ -9,17 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from detect.cli import main as detect
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import read_path
 from redetect.plane import between
 from redetect.slam.cli import main as slam
 from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import OdometryNoise, chain_steps
 from tests.detect.recordings import Ros, Said
-
-FloatArray = NDArray[np.float64]
 
 FRAMES = 40
 TIMES = 1000.0 + 0.5 * np.arange(FRAMES)

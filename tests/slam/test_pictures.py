@@ -8,14 +8,12 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.slam.errors import SlamError
 from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
 from redetect.storage import OutputExistsError
-
-FloatArray = NDArray[np.float64]
 
 DISC_BGR = (0x1E, 0x50, 0xC8)
 
@@ -33,7 +31,7 @@ def some_path(count: int = 60, scale: float = 0.2) -> Path2D:
     return Path2D(("start", *(f"p{k}" for k in range(1, count))), poses, spread)
 
 
-def pixels_like(png: Path, bgr: tuple[int, int, int]) -> NDArray[np.bool_]:
+def pixels_like(png: Path, bgr: tuple[int, int, int]) -> BoolArray:
     image = cv2.imread(str(png), cv2.IMREAD_COLOR)
     assert image is not None
     return np.asarray(np.all(np.abs(image.astype(int) - bgr) < 12, axis=2))

@@ -18,6 +18,8 @@ STUDIES = {
     "camera-rendered": "calibration.CameraRendered",
     "disturbed": "disturbed.Disturbed",
     "fusion": "sessions.FusionStudy",
+    "joining": "association.Joining",
+    "joining-pairs": "association.JoiningPairs",
     "laser-sessions": "sessions.LaserSessions",
     "map": "maps.MapStudy",
     "map-speed": "maps.MapSpeed",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -17,8 +19,10 @@ from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.association.waking import wake_up
 from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
+from redetect.slam.errors import SlamError
+from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
-from redetect.slam.recording import read_recording
+from redetect.slam.recording import first_poses, joined, read_recording
 from tools.evaluation.tables import Table
 
 
@@ -82,18 +86,10 @@ class WakingUp:
     def __call__(self) -> int:
         recording, discs = read_recording(self.run), read_map(self.map).discs.xy
         poses = read_path(self.path).poses
-        rows, off, turned, taken, squared = recording.circles, [], [], [], []
+        off, turned, taken, squared = [], [], [], []
         starts = range(0, len(recording), self.every)
         for start in starts:
-            later = rows.only(rows.frame >= start)
-            rest = replace(
-                recording,
-                prefixes=recording.prefixes[start:],
-                steps=recording.steps[start:],
-                step_covariance=recording.step_covariance[start:],
-                circles=replace(later, frame=later.frame - start),
-            )
-            woken = wake_up(rest, discs)
+            woken = wake_up(recording.part(start), discs)
             if woken is None:
                 continue
             difference = woken.pose - poses[start]
@@ -109,4 +105,82 @@ class WakingUp:
                 f"{max(off):.2f} m and {max(turned):.1f} deg; after {np.median(taken):.0f} frames "
                 f"(median), at most {max(taken)}; error^2 / sigma^2 {np.mean(squared):.2f}"
             )
+        return 0
+
+
+@dataclass(frozen=True)
+class Joining:
+    """Cut a run into several, join them without their identifiers, and compare with the whole.
+
+    Each part is in a frame of its own. The whole is associated and mapped the same way.
+    """
+
+    run: Positional[Path]  # Run folder or `.circles` file with IDs.
+    at: tuple[int, ...] = ()  # The frames with which new runs begin; by default half way.
+
+    def __call__(self) -> int:
+        whole = read_recording(self.run)
+        starts = [0, *(self.at or (len(whole) // 2,))]
+        parts = [whole.part(a, b) for a, b in zip(starts, [*starts[1:], len(whole)])]
+        recording = joined(parts)
+        began = time.thread_time()
+        found = associate_run(recording)
+        seconds = time.thread_time() - began
+        s = score_run(recording, found)["circles"]["map"]
+        print(
+            f"precision {s.pair_precision:.4f}, recall {s.pair_recall:.4f}, rows right "
+            f"{s.right_rows:.4f}, landmarks {s.found_landmarks} of {s.true_landmarks}, wrong "
+            f"merges {s.wrong_merges}, splits {s.splits}, {seconds:.1f} s"
+        )
+        apart, one = (
+            map_run(replace(run, circles=replace(run.circles, ids=labels)))
+            for run, labels in (
+                (recording, found.circle_labels),
+                (whole, associate_run(whole).circle_labels),
+            )
+        )
+        print(f"chi-squared factor {apart.table.factor:.2f}, of the whole {one.table.factor:.2f}")
+        for k, (first, start) in enumerate(zip(first_poses(parts), starts)):
+            poses = apart.estimate.poses[first : first + len(parts[k]) + 1]
+            off = poses - one.estimate.poses[start : start + len(poses)]
+            distance, turn = np.hypot(*off[:, :2].T), np.degrees(np.abs(wrap_angle(off[:, 2])))
+            print(
+                f"run {k + 1}: {len(parts[k])} frames; its path off the whole's by "
+                f"{np.median(distance):.3f} m and {np.median(turn):.2f} deg (medians), at most "
+                f"{distance.max():.3f} m and {turn.max():.2f} deg"
+            )
+        return 0
+
+
+@dataclass(frozen=True)
+class JoiningPairs:
+    """Cut a run into pieces, join each with each other one, and see which have discs in common."""
+
+    run: Positional[Path]  # Run folder or `.circles` file with IDs.
+    frames: int = 300  # In a piece.
+    least: int = 5  # Discs that pieces have in common if they show one place.
+
+    def __call__(self) -> int:
+        whole = read_recording(self.run)
+        starts = range(0, len(whole) - self.frames + 1, self.frames)
+        pieces = [whole.part(start, start + self.frames) for start in starts]
+        joined_pairs, wrong, off, counts = Counter[bool](), 0, [], Counter[bool]()
+        for one, other in combinations(pieces, 2):
+            shared = np.intersect1d(one.circles.ids, other.circles.ids)
+            same = len(shared[shared >= 0]) >= self.least
+            counts[same] += 1
+            try:
+                both = joined([one, other])
+                found = associate_run(both)
+            except SlamError:
+                continue
+            joined_pairs[same] += 1
+            score = score_run(both, found)["circles"]["map"]
+            off.append(score.pair_precision)
+            wrong += score.wrong_merges
+        print(
+            f"{joined_pairs[True]} of {counts[True]} pairs with {self.least} or more discs in "
+            f"common joined, and {joined_pairs[False]} of the {counts[False]} others; precision "
+            f"{np.mean(off):.4f} on average, {min(off):.4f} at least, wrong merges {wrong}"
+        )
         return 0

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
 
 DEFAULT_GATE_PROBABILITY = 0.999
@@ -84,25 +85,20 @@ def joint_compatible(
     return Pairing(landmark, float(distance), nodes < most_nodes)
 
 
+@cache
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
     """Largest squared distances of 0, 1, 2, ... pairs that stay below with a probability.
 
-    Returns (most_pairs, 1).
+    Returns (most_pairs + 1,), not to be changed.
     """
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
-    return _gates(float(probability), int(width), max(int(most_pairs), 1)).copy()
+    gates = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
+    return np.concatenate([[0.0], gates])
 
 
 def _contiguous(values: ArrayLike) -> FloatArray:
     return np.ascontiguousarray(values, dtype=np.float64)
-
-
-@cache
-def _gates(probability: float, width: int, most_pairs: int) -> FloatArray:
-    gates = np.zeros(most_pairs + 1)
-    gates[1:] = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
-    return gates
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -141,7 +137,6 @@ def _append(
     return added
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
 def individual_distances(
     innovations: FloatArray, predicted: FloatArray, noise: FloatArray
 ) -> FloatArray:
@@ -150,36 +145,23 @@ def individual_distances(
     Infinite where a covariance is not positive definite or an innovation is not finite.
     """
     n, m, width = innovations.shape
+    every = np.arange(m)
+    covariance = predicted.reshape(m, width, m, width)[every, :, every, :] + noise[:, None]
+    usable = np.isfinite(innovations).all(axis=2) & is_positive_definite(covariance)
     squared = np.full((n, m), np.inf)
-    factor = np.zeros((width, width))
-    whitened = np.zeros(width)
-    cross = np.zeros((width, 0))
-    own = np.zeros((width, width))
-    for i in range(n):
-        for j in range(m):
-            for a in range(width):
-                for b in range(width):
-                    own[a, b] = predicted[j * width + a, j * width + b] + noise[i, a, b]
-            value = _append(factor, whitened, 0, cross, own, innovations[i, j])
-            if value >= 0.0:
-                squared[i, j] = value
+    squared[usable] = squared_mahalanobis(innovations[usable], covariance[usable])
     return squared
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
 def pair_nearest_first(squared: FloatArray, gate: float) -> IntArray:
     """Landmark of each row, -1 without: closest pairs first, each row and landmark once."""
-    n, m = squared.shape
-    partner = np.full(n, -1, dtype=np.int64)
-    taken = np.zeros(m, dtype=np.bool_)
-    order = np.argsort(squared.copy().reshape(-1), kind="mergesort")
-    for index in order:
-        i, j = index // m, index % m
+    partner = np.full(len(squared), -1, dtype=np.int64)
+    for index in np.argsort(squared, axis=None, kind="stable"):
+        i, j = divmod(int(index), squared.shape[1])
         if not squared[i, j] <= gate:
             break
-        if partner[i] < 0 and not taken[j]:
+        if partner[i] < 0 and j not in partner:
             partner[i] = j
-            taken[j] = True
     return partner
 
 

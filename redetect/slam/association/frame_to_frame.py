@@ -30,8 +30,6 @@ from redetect.storage.bounds import PROBABILITY, Bounds, Limit, Positive, demand
 
 # Up to this distance discs have to be equally certain.
 _NEAR_M = 4.0
-# Lines farther away than this have no place yet (1/m).
-_LEAST_INVERSE_DISTANCE = 0.02
 
 
 @dataclass(eq=False)
@@ -147,21 +145,6 @@ def kept(
     )
 
 
-def line_places(
-    local: LocalMap, frame: int, camera_xy: tuple[float, float]
-) -> tuple[FloatArray, IntArray]:
-    """Positions of the lines seen in a frame.
-
-    Takes `camera_xy` (2,); returns `places` (n, 2), `numbers` (n,).
-    """
-    some = (
-        local.is_line & (local.last_frame == frame) & (local.mean[:, 1] > _LEAST_INVERSE_DISTANCE)
-    )
-    bearing, inverse = local.mean[some].T
-    direction = np.stack([np.sin(bearing), -np.cos(bearing)], axis=-1)
-    return direction / inverse[:, None] + np.asarray(camera_xy), local.number[some]
-
-
 Method = Literal["nearest", "joint"]
 
 # Of the first sight of a line: half a metre to infinity within two standard deviations.
@@ -173,42 +156,25 @@ _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, belo
 
 @dataclass(frozen=True)
 class LocalSettings:
-    """How rows are associated from frame to frame.
+    """How rows are associated from frame to frame."""
 
-    Attributes
-    ----------
-    method : str
-        `nearest` or `joint`; see `redetect.slam.association.compatibility`.
-    gate_probability : float
-        Share of right rows (or sets of rows) that pass the gate.
-    sigma_scale : float
-        Factor on the discs' standard deviations: tilt and calibration move a frame's discs
-        together by more than the file says. Bearings are compensated for tilt.
-    tilt_sigma_rad : float
-        Standard deviation of the robot's tilt about both axes of the floor, which moves all discs
-        of a frame together.
-    camera_height_m : float
-        Height of the camera above the floor, which scales the displacement by tilt.
-    forget_frames : int
-        A landmark unseen for longer is forgotten.
-    forget_sigma_m : float
-        So is a disc whose position relative to the robot has become less certain than this, beyond
-        4 m in proportion to its distance.
-    most_landmarks : int
-        At most this many landmarks of each kind are kept, those seen last.
-    most_nodes : int
-        Bound of the joint search; see `redetect.slam.association.compatibility.joint_compatible`.
-    """
-
-    method: Method = "joint"
+    method: Method = "joint"  # see `redetect.slam.association.compatibility`
+    # Share of right rows (or sets of rows) that pass the gate.
     gate_probability: Annotated[float, PROBABILITY] = 0.999
+    # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
+    # by more than the file says. Bearings are compensated for tilt.
     sigma_scale: Positive = 1.4
+    # Standard deviation of the robot's tilt about both axes of the floor, which moves all discs of
+    # a frame together, by the camera's height above the floor.
     tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0035
     camera_height_m: Positive = 1.5
-    forget_frames: Annotated[int, whole(0)] = 60
+    forget_frames: Annotated[int, whole(0)] = 60  # a landmark unseen for longer is forgotten
+    # So is a disc whose position relative to the robot has become less certain than this, beyond
+    # 4 m in proportion to its distance.
     forget_sigma_m: Limit = 0.35
+    # At most this many landmarks of each kind are kept, those seen last.
     most_landmarks: Annotated[int, whole(1)] = 40
-    most_nodes: Annotated[int, whole(1)] = 30_000
+    most_nodes: Annotated[int, whole(1)] = 30_000  # bound of the joint search
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
@@ -221,10 +187,6 @@ class LocalAssociation:
     # (n,): the landmark of each row, numbered from 0 in order of first sight.
     circle_labels: IntArray
     line_labels: IntArray
-    # (L, 2): the last estimate of each line's position in the robot frame (m); NaN if that was
-    # behind the camera or beyond 50 m.
-    line_places: FloatArray
-    line_frames: IntArray  # (L,): after which step
     incomplete: int  # frames whose joint search was cut short
 
 
@@ -242,12 +204,13 @@ def associate_locally(
     line_labels = np.full(len(lines), -1, dtype=np.int64)
     circle_starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
     line_starts = np.searchsorted(lines.frame, np.arange(len(recording) + 1))
-    places: list[FloatArray] = []
-    frames: list[int] = []
     local = LocalMap.empty()
     counts = [0, 0]
     incomplete = 0
+    lost = set(recording.lost.tolist())
     for frame in range(len(recording)):
+        if frame in lost:
+            local = LocalMap.empty()
         local = moved(local, recording.steps[frame], recording.step_covariance[frame], camera_xy)
         local = kept(
             local,
@@ -267,19 +230,9 @@ def associate_locally(
             local, found, complete = _observed(local, frame, seen, noise, is_line, counts, setting)
             incomplete += not complete
             labels[first:last] = found
-        frames += [frame] * (counts[1] - len(frames))
-        places += [np.full(2, np.nan)] * (counts[1] - len(places))
-        for place, number in zip(*line_places(local, frame, camera_xy)):
-            places[number], frames[number] = place, frame
         if progress:
             progress(frame + 1)
-    return LocalAssociation(
-        circle_labels,
-        line_labels,
-        np.array(places).reshape(-1, 2),
-        np.array(frames, dtype=np.int64),
-        incomplete,
-    )
+    return LocalAssociation(circle_labels, line_labels, incomplete)
 
 
 def _measured(

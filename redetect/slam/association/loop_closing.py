@@ -6,6 +6,7 @@ so that rows count less which contradict all others.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -28,9 +29,13 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.mapping.graph import Estimate, graph_of_recording
 from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
+
+# Lines whose places are less certain have none.
+_LEAST_SIGMA_M = 0.5
 
 
 class LabelledMap(NamedTuple):
@@ -52,30 +57,12 @@ def intersect_bearings(
 
     Takes `path` (N + 1, 3), `labels` (n,), `camera_xy` (2,); returns (L, 2).
     """
-    lines = recording.lines
-    count = int(labels.max(initial=-1)) + 1
-    pose = path[lines.frame + 1]
-    centre = apply(pose, np.broadcast_to(np.asarray(camera_xy), (len(pose), 2)))
-    angle = lines.bearing_rad + pose[:, 2]
-    along = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    offset = np.sum(normal * centre, axis=1)
-    distance = np.full(len(pose), 3.0)
-    places = np.full((count, 2), np.nan)
-    for _ in range(4):  # the farther a line, the less its bearing says
-        weight = 1.0 / (lines.sigma_rad * np.maximum(distance, 0.3)) ** 2
-        information = np.zeros((count, 2, 2))
-        np.add.at(information, labels, weight[:, None, None] * normal[:, :, None] * normal[:, None])
-        vector = np.zeros((count, 2))
-        np.add.at(vector, labels, (weight * offset)[:, None] * normal)
-        smallest = np.linalg.eigvalsh(information)[:, 0]
-        certain = smallest > 1.0 / 0.5**2
-        places[:] = np.nan
-        places[certain] = np.linalg.solve(information[certain], vector[certain][..., None])[..., 0]
-        ahead = np.sum(along * (places[labels] - centre), axis=1)
-        distance = np.where(np.isfinite(ahead), np.abs(ahead), distance)
-    behind = np.bincount(labels, ahead < 0.0, minlength=count) > 0
-    places[behind] = np.nan
+    lines, count = recording.lines, int(labels.max(initial=-1)) + 1
+    poses = path[lines.frame + 1]
+    places, ahead, _ = meeting_points(
+        poses, lines.bearing_rad, lines.sigma_rad, labels, count, camera_xy, _LEAST_SIGMA_M**-2
+    )
+    places[np.bincount(labels, ahead < 0.0, minlength=count) > 0] = np.nan
     return places
 
 
@@ -128,6 +115,9 @@ def solve_path(
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
+# Weight of a step that says nothing: just enough to keep the equations solvable.
+_LOST_WEIGHT = 1e-3
+NO_STEPS = np.zeros(0, dtype=np.int64)
 # Labels farther apart than this are not compared.
 _FARTHEST_M = 0.35
 
@@ -191,13 +181,9 @@ def in_order(labels: IntArray) -> IntArray:
     return rank[inverse]
 
 
-def pairs_by_votes(matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """The pairs of labels of all matches, those that most matches agree on first."""
-    votes: dict[tuple[int, int], int] = {}
-    for match in matches:
-        for a, b in match.pairs.tolist():
-            key = (min(a, b), max(a, b))
-            votes[key] = votes.get(key, 0) + 1
+def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
+    """The pairs of labels (k, 2) of all matches, those that most matches agree on first."""
+    votes = Counter((min(a, b), max(a, b)) for pairs in matches for a, b in pairs.tolist())
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
 
@@ -227,7 +213,9 @@ def pairs_in_place(
     return [(int(first[k]), int(second[k])) for k in ordered]
 
 
-def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
+def closed_path(
+    path: FloatArray, matches: Sequence[Match], lost: IntArray = NO_STEPS
+) -> FloatArray:
     """A path that satisfies the matches: where least squares over everything may start from.
 
     Headings first, then places: each of the two problems is linear (L. Carlone, R. Aragues, J. A.
@@ -235,7 +223,7 @@ def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
     International Journal of Robotics Research 33, 2014). So it does not matter how far off the path
     was.
 
-    Takes `path` (N + 1, 3); returns (N + 1, 3).
+    Takes `path` (N + 1, 3), and the steps that say nothing; returns (N + 1, 3).
     """
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)
@@ -250,6 +238,8 @@ def closed_path(path: FloatArray, matches: Sequence[Match]) -> FloatArray:
     turns = np.concatenate([np.diff(path[:, 2]), moved[:, 2] - path[first, 2]])
     is_match = np.arange(len(before)) >= count
     weights = [1.0 / np.where(is_match, _MATCH_SIGMA[a], _STEP_SIGMA[a]) for a in (0, 1)]
+    for weight in weights:
+        weight[lost] = _LOST_WEIGHT
     theta = path[0, 2] + _chained(before, after, turns[:, None], weights[0], count)[:, 0]
     offsets = np.einsum("nij,nj->ni", rotation(theta[before]), seen[:, :2])
     xy = path[0, :2] + _chained(before, after, offsets, weights[1], count)

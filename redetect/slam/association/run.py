@@ -3,11 +3,14 @@
 First, every row is associated with recently seen landmarks
 (`redetect.slam.association.frame_to_frame`). The result is nearly always right, but a landmark that
 is seen again later has several labels. Then loops are detected (`redetect.slam.association.loops`)
-and closed (`redetect.slam.association.loop_closing`, `redetect.slam.association.loop_closing`) in
-rounds. The first round searches within the possible drift of the odometry, later rounds everywhere,
-since each closed loop reduces the map's distortion. Verticals, which the local association often
-confuses, are then associated again along the path that the discs give
-(`redetect.slam.association.line_points`).
+and closed (`redetect.slam.association.loop_closing`) in rounds. The first round searches within the
+possible drift of the odometry, later rounds everywhere, since each closed loop reduces the map's
+distortion. Verticals, which the local association often confuses, are then associated again along
+the path that the discs give (`redetect.slam.association.line_points`).
+
+Several runs are one with steps of which nothing is known (`redetect.slam.recording.joined`). Loops
+are closed in each, their maps laid on each other (`redetect.slam.association.joining`), and loops
+closed again in the whole.
 """
 
 from __future__ import annotations
@@ -15,20 +18,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
-from redetect.plane import rotation
+from redetect.plane import apply, rotation
 from redetect.slam.association.frame_to_frame import (
     LocalAssociation,
     LocalSettings,
     associate_locally,
     tilt_jacobian,
 )
+from redetect.slam.association.joining import lay_together
 from redetect.slam.association.line_points import PointSettings, lines_by_points
 from redetect.slam.association.loop_closing import (
     closed_path,
@@ -39,7 +43,14 @@ from redetect.slam.association.loop_closing import (
     pairs_in_place,
     solve_path,
 )
-from redetect.slam.association.loops import LoopSettings, Match, find_matches, stretches_of
+from redetect.slam.association.loops import (
+    LoopSettings,
+    Match,
+    Stretch,
+    find_matches,
+    stretches_of,
+)
+from redetect.slam.association.waking import ANYWHERE
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import LineRows, Recording
@@ -53,38 +64,24 @@ _SAME_PLACE = 0.999
 _LINE_REACH_M = 0.05
 # Longer than a landmark is in view or waited for by the local map.
 _ATTACHED_FRAMES = 200
+# Covariance of a step that leads nowhere (m^2, rad^2).
+_HARDLY_ANY = 1e-6 * np.eye(3)
 
 
 @dataclass(frozen=True)
 class AssociateSettings:
-    """How a run is associated.
+    """How a run is associated."""
 
-    Attributes
-    ----------
-    local : LocalSettings
-        From frame to frame.
-    map_level : bool
-        Whether loops are detected.
-    loops : LoopSettings
-        Settings of the first round.
-    points : PointSettings
-        How verticals are then associated along the path that the discs give.
-    most_rounds : int
-        Largest number of rounds.
-    kept_probability : float
-        Share of a disc's right rows that keep its label at the end, by their covariances as stated;
-        those farther from its place in the map lose it.
-    fewest_rows : int
-        A disc of fewer such rows is taken for clutter.
-    """
-
-    local: LocalSettings = field(default_factory=LocalSettings)
-    map_level: bool = True
-    loops: LoopSettings = field(default_factory=LoopSettings)
+    local: LocalSettings = field(default_factory=LocalSettings)  # from frame to frame
+    map_level: bool = True  # whether loops are detected
+    loops: LoopSettings = field(default_factory=LoopSettings)  # of the first round
+    # How verticals are then associated along the path that the discs give.
     points: PointSettings = field(default_factory=PointSettings)
     most_rounds: Annotated[int, whole(1)] = 6
+    # Share of a disc's right rows that keep its label at the end, by their covariances as stated;
+    # those farther from its place in the map lose it.
     kept_probability: Annotated[float, PROBABILITY] = 0.99
-    fewest_rows: Annotated[int, whole(1)] = 3
+    fewest_rows: Annotated[int, whole(1)] = 3  # a disc of fewer such rows is taken for clutter
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
@@ -135,8 +132,17 @@ def associate_run(
     matches: tuple[Match, ...] = ()
     path = None
     if setting.map_level:
-        if len(recording.circles):
-            labels, path, matches = _closed(recording, circle_labels, setting, camera_xy, report)
+        by_discs = len(recording.circles) > 0
+        closed = _closed_by_parts(
+            _without_lines(recording) if by_discs else recording,
+            circle_labels if by_discs else line_labels,
+            setting,
+            camera_xy,
+            report,
+        )
+        path, matches = closed.path, closed.matches
+        if by_discs:
+            labels = closed.labels
             circle_labels = _without_clutter(recording, labels, path, setting)
             if len(line_labels):
                 report("verticals on the path of the discs")
@@ -153,7 +159,7 @@ def associate_run(
                     recording, path_of_both, line_labels, setting, camera_xy
                 )
         else:
-            line_labels, path, matches = _closed(recording, line_labels, setting, camera_xy, report)
+            line_labels = closed.labels
     return RunAssociation(
         in_order(circle_labels),
         in_order(line_labels),
@@ -184,21 +190,77 @@ def _associated_locally(
     return replace(local, circle_labels=discs_alone.circle_labels)
 
 
+class _Closed(NamedTuple):
+    """A run whose loops are closed."""
+
+    labels: IntArray  # (n,): of discs if there are any, whose rows give positions, else of lines
+    path: FloatArray  # (N + 1, 3): the path that the labels say
+    xy: FloatArray  # (M, 2): the landmarks' places (m)
+    matches: tuple[Match, ...]  # the loops
+
+
+def _closed_by_parts(
+    recording: Recording,
+    labels: IntArray,
+    setting: AssociateSettings,
+    camera_xy: tuple[float, float],
+    report: Progress,
+) -> _Closed:
+    """Loops closed in each part between which odometry is lost, and then in the whole.
+
+    The parts' maps are laid on each other in between; the first stays where it is.
+    """
+    frames = _frames_of_labels(recording)
+    starts = [0, *recording.lost.tolist()]
+    parts: list[_Closed] = []
+    stretches: list[list[Stretch]] = []
+    loops = setting.loops
+    apart = replace(
+        loops, stride_frames=loops.stretch_frames, least_agreeing=ANYWHERE.least_agreeing
+    )
+    for first, end in zip(starts, [*starts[1:], len(recording)]):
+        part = recording.part(first, end)
+        if parts:  # it begins with its own start, not with the end of the part before
+            known = np.concatenate([_HARDLY_ANY[None], part.step_covariance[1:]])
+            part = replace(part, step_covariance=known)
+        rows = slice(*np.searchsorted(frames, [first, end]))
+        closed = _closed(part, in_order(labels[rows]), setting, camera_xy, report)
+        parts.append(closed)
+        stretches.append(
+            stretches_of(_frames_of_labels(part), closed.labels, closed.xy, len(part), apart)
+        )
+    if len(parts) == 1:
+        return parts[0]
+    report("laying parts on each other")
+    motions, pairs, left = lay_together([part.xy for part in parts], stretches)
+    if left:
+        raise SlamError(
+            f"nothing says where the frames from {recording.prefixes[starts[left[0]]]} "
+            f"({starts[left[0]] + 1}) on lie among the others: expected landmarks that both saw"
+        )
+    counts = np.cumsum([0, *(len(part.xy) for part in parts)])
+    together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
+    own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
+    laid = [np.column_stack([apply(m, p[:, :2]), p[:, 2] + m[2]]) for m, p in zip(motions, own)]
+    labels, _ = merge_labels(frames, together, pairs_by_votes(pairs))
+    whole = _closed(recording, labels, setting, camera_xy, report, np.concatenate(laid))
+    matches = [match for closed in (*parts, whole) for match in closed.matches]
+    return whole._replace(matches=tuple(matches))
+
+
 def _closed(
     recording: Recording,
     labels: IntArray,
     setting: AssociateSettings,
     camera_xy: tuple[float, float],
     report: Progress,
-) -> tuple[IntArray, FloatArray, tuple[Match, ...]]:
-    """Labels after all loops are closed, the path that they say, and the loops.
-
-    Labels are those of discs if there are any, whose rows give positions, else those of lines.
-    """
+    path: FloatArray | None = None,
+) -> _Closed:
+    """All loops closed, from a path (by default odometry) on."""
     by_discs = len(recording.circles) > 0
-    frames = recording.circles.frame if by_discs else recording.lines.frame
+    frames = _frames_of_labels(recording)
     swayed, loops = _swayed(recording, setting.local), setting.loops
-    none = np.zeros(len(recording.lines), dtype=np.int64)
+    none = np.zeros(0, dtype=np.int64)
     everywhere = replace(
         loops,
         most_turn_rad=np.pi,
@@ -207,6 +269,10 @@ def _closed(
         earlier_step=3,
         attached_frames=_ATTACHED_FRAMES,
     )
+    if path is not None:  # most of it is in its place already
+        loops = replace(
+            everywhere, most_turn_rad=loops.most_turn_rad, most_shift_m=loops.most_shift_m
+        )
 
     def solved(path: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Path and places of the landmarks by the labels."""
@@ -216,7 +282,7 @@ def _closed(
             line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
         found = solve_path(
             swayed,
-            labels if by_discs else none[:0],
+            labels if by_discs else none,
             none if by_discs else labels,
             path,
             line_xy,
@@ -225,13 +291,15 @@ def _closed(
         )
         return found.path, found.circle_xy if by_discs else found.line_xy
 
-    path, xy = solved(None)
+    path, xy = solved(path)
     matches: list[Match] = []
     for number in range(1, setting.most_rounds + 1):
         stretches = stretches_of(frames, labels, xy, len(recording), loops)
         found = find_matches(stretches, loops, partial(_of_round, report, number))
-        labels, matched = merge_labels(frames, labels, pairs_by_votes(found))
-        path, xy = solved(closed_path(path, found) if found else path)
+        labels, matched = merge_labels(
+            frames, labels, pairs_by_votes(match.pairs for match in found)
+        )
+        path, xy = solved(closed_path(path, found, recording.lost) if found else path)
         stretches = stretches_of(frames, labels, xy, len(recording), loops)
         spread = _isotropic(len(xy), loops.reach_m)
         if by_discs:
@@ -244,7 +312,12 @@ def _closed(
         if matched + in_place == 0 and loops == everywhere:
             break
         loops = everywhere
-    return labels, path, tuple(matches)
+    return _Closed(labels, path, xy, tuple(matches))
+
+
+def _frames_of_labels(recording: Recording) -> IntArray:
+    """(n,) frames of the rows of discs, or of lines where there are none."""
+    return recording.circles.frame if len(recording.circles) else recording.lines.frame
 
 
 def _of_round(report: Progress, number: int, text: str) -> None:
@@ -252,8 +325,7 @@ def _of_round(report: Progress, number: int, text: str) -> None:
 
 
 def _without_lines(recording: Recording) -> Recording:
-    none = np.zeros(0)
-    return replace(recording, lines=LineRows(none.astype(np.int64), none, none, ()))
+    return replace(recording, lines=LineRows.of())
 
 
 def _swayed(recording: Recording, setting: LocalSettings) -> Recording:

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.plane import apply, rotation
 from redetect.slam.association.loops import (
     LoopSettings,
@@ -29,7 +30,7 @@ from redetect.slam.recording import Recording
 #: Frames that are tried, and by how much more each time.
 _FEWEST_FRAMES, _MORE, _MOST_FRAMES = 5, 1.5, 400
 #: Rows nearer than this are of one disc (m).
-_ONE_DISC_M = 0.25
+ONE_DISC_M = 0.25
 #: Another place may fit with this share of the agreeing discs at most.
 _RIVAL_SHARE = 0.7
 #: Standard deviation of a disc at least (m): of raw rows, seen by a camera that leans.
@@ -37,6 +38,14 @@ _DISC_SIGMA_M = 0.25
 ANYWHERE = LoopSettings(
     least_agreeing=5, most_turn_rad=math.inf, most_shift_m=math.inf, false_alarms=1e-3
 )
+
+
+class Place(NamedTuple):
+    """Where a constellation lies in a map."""
+
+    pose: FloatArray  # (3,) m, m, rad
+    pairs: IntArray  # (k, 2): discs of the map and of the constellation that agree
+    log10_false_alarms: float  # how many places fit as well by chance, as a logarithm
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +74,7 @@ def wake_up(
     settings : LoopSettings
         How discs are compared; its stretches are not used.
     """
-    if len(disc_xy) < settings.least_agreeing or len(recording) == 0:
+    if len(recording) == 0:
         return None
     most = min(len(recording), _MOST_FRAMES)
     poses = chain_steps(recording.steps[:most])
@@ -76,11 +85,12 @@ def wake_up(
         discs = _merged(at[rows.frame < frames])
         # Where nothing new came into view there is nothing to be found.
         if len(discs) != before:
-            found = _placed(discs, disc_xy, settings)
+            found = placed(discs, disc_xy, settings)
             if found is not None:
-                pose, covariance, agreeing, alarms = found
-                drift = _drift(recording.step_covariance[:frames], pose, discs)
-                return Waking(pose, covariance + drift, frames, len(discs), agreeing, alarms)
+                pose, pairs, alarms = found
+                covariance = _covariance(pose, discs[pairs[:, 1]], disc_xy[pairs[:, 0]])
+                covariance += _drift(recording.step_covariance[:frames], pose, discs)
+                return Waking(pose, covariance, frames, len(discs), len(pairs), alarms)
         if frames == most:
             return None
         frames, before = min(math.ceil(_MORE * frames), most), len(discs)
@@ -93,7 +103,7 @@ def _merged(xy: FloatArray) -> FloatArray:
     for row in xy:
         distance = np.linalg.norm(np.array(means).reshape(-1, 2) - row, axis=1)
         k = int(distance.argmin()) if len(means) else -1
-        if k >= 0 and distance[k] < _ONE_DISC_M:
+        if k >= 0 and distance[k] < ONE_DISC_M:
             counts[k] += 1
             means[k] = means[k] + (row - means[k]) / counts[k]
         else:
@@ -102,11 +112,12 @@ def _merged(xy: FloatArray) -> FloatArray:
     return np.array(means).reshape(-1, 2)
 
 
-def _placed(
-    discs: FloatArray, disc_xy: FloatArray, settings: LoopSettings
-) -> tuple[FloatArray, FloatArray, int, float] | None:
-    """Pose, covariance, agreeing discs and false alarms of the only place that fits."""
-    if len(discs) < settings.least_agreeing:
+def placed(discs: FloatArray, disc_xy: FloatArray, settings: LoopSettings) -> Place | None:
+    """The only place of a map that a constellation fits.
+
+    Takes `discs` (n, 2), `disc_xy` (M, 2) of the map.
+    """
+    if min(len(discs), len(disc_xy)) < settings.least_agreeing:
         return None
     turn, x, y, agreeing, tried = motion_onto(discs, disc_xy, settings)
     if agreeing < settings.least_agreeing:
@@ -124,7 +135,7 @@ def _placed(
         rival = motion_onto(discs, others, settings)[3]
         if rival > _RIVAL_SHARE * len(pairs):
             return None
-    return pose, _covariance(pose, discs[pairs[:, 1]], disc_xy[pairs[:, 0]]), len(pairs), alarms
+    return Place(pose, pairs, alarms)
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:

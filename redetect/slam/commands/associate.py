@@ -13,15 +13,22 @@ from typing import Any
 import numpy as np
 
 from redetect import slam
+from redetect.array_types import IntArray
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.slam.association.frame_to_frame import LocalSettings
 from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
-from redetect.slam.commands.files import demand_free, landmark_files, read_run_of, write_json
+from redetect.slam.commands.files import (
+    camera_xy_of,
+    demand_free,
+    landmark_files,
+    recordings_of,
+    write_json,
+)
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.recording import UNKNOWN_ID, Recording, joined
 from redetect.storage.bounds import NOT_NEGATIVE, demand, from_to, whole
 
 #: Of each kind's rows those before and those after the map level.
@@ -48,14 +55,18 @@ def perform(options: Associate) -> int:
         kept_probability=options.kept_probability,
         fewest_rows=options.fewest_rows,
     )
-    sources = landmark_files(options)
-    targets = [_target(options.output, source, len(sources) > 1) for source in sources]
-    report = targets[0].with_suffix(".json")
+    sources = [(k, f) for k, run in enumerate(options.runs) for f in landmark_files(options, run)]
+    targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
+    if len(set(targets)) < len(targets):
+        raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
+    report = (options.output or targets[0]).with_suffix(".json")
     demand_free([*targets, report], overwrite=options.force)
-    recording, centre = read_run_of(options)
+    runs = recordings_of(options)
+    recording = joined(runs)
+    centre = camera_xy_of(recording, options.run, options.camera)
     camera_xy = (float(centre[0]), float(centre[1]))
 
-    runs: list[dict[str, Any]] = []
+    tries: list[dict[str, Any]] = []
     for factor in (0.0, *options.noise):
         noisy = with_relative_noise(recording, factor, options.seed) if factor else recording
         # The rows' own gate grows with their covariances.
@@ -64,7 +75,7 @@ def perform(options: Associate) -> int:
         seconds = time.perf_counter() - began
         _progress("")
         scores = score_run(recording, found)
-        runs.append(
+        tries.append(
             {
                 "noise": factor,
                 "seconds": round(seconds, 2),
@@ -80,36 +91,28 @@ def perform(options: Associate) -> int:
         if factor == 0.0:
             result = found
 
-    for source, target in zip(sources, targets):
-        rows = list(read_rows(source))
-        write_rows(target, identified_rows(rows, result, source), overwrite=options.force)
-        print(f"{target}: {_counted(rows, result)}")
+    of_discs = np.split(result.circle_labels, np.cumsum([len(run.circles) for run in runs]))
+    of_lines = np.split(result.line_labels, np.cumsum([len(run.lines) for run in runs]))
+    for (k, source), target in zip(sources, targets):
+        rows, labels = list(read_rows(source)), (of_discs[k], of_lines[k])
+        write_rows(target, identified_rows(rows, *labels, source), overwrite=options.force)
+        print(f"{target}: {_counted(rows, *labels)}")
     content = {
         "version": slam.__version__,
         "run": str(options.run),
+        "more": [str(run) for run in options.more],
         "settings": asdict(settings),
         "seed": options.seed,
-        "runs": runs,
+        "runs": tries,
     }
     write_json(report, content, overwrite=options.force)
     return 0
 
 
 def score_run(recording: Recording, found: RunAssociation) -> Scores:
-    """Score the association with the file's own IDs.
+    """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run with its IDs.
-    found : RunAssociation
-        Of the same rows.
-
-    Returns
-    -------
-    dict
-        ``scores["circles"]["local"]`` and so on, for kinds of which a row has an ID; the stages
-        are ``local`` and, after the map level, ``map``.
+    Kinds are those of which a row has an ID; stages ``local`` and, after the map level, ``map``.
     """
     discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
     scores: Scores = {}
@@ -138,10 +141,12 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
     return lines
 
 
-def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) -> Iterator[Row]:
+def identified_rows(
+    rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray, source: Path
+) -> Iterator[Row]:
     """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was."""
     numbers: dict[type, Iterator[int]] = {}
-    for kind, labels in ((CircleLandmark, found.circle_labels), (LineLandmark, found.line_labels)):
+    for kind, labels in ((CircleLandmark, circle_labels), (LineLandmark, line_labels)):
         count = sum(isinstance(row.record, kind) for row in rows)
         if count not in (0, len(labels)):
             raise SlamError(
@@ -156,23 +161,27 @@ def identified_rows(rows: Sequence[Row], found: RunAssociation, source: Path) ->
             yield row
 
 
-def _counted(rows: Sequence[Row], found: RunAssociation) -> str:
+def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray) -> str:
     """How many landmarks of each kind in a file were found."""
     parts = []
     for kind, labels, name in (
-        (CircleLandmark, found.circle_labels, "discs"),
-        (LineLandmark, found.line_labels, "lines"),
+        (CircleLandmark, circle_labels, "discs"),
+        (LineLandmark, line_labels, "lines"),
     ):
         if any(isinstance(row.record, kind) for row in rows):
-            parts.append(f"{labels.max() + 1} {name}")
+            parts.append(f"{len(np.unique(labels[labels >= 0]))} {name}")
             if np.any(labels < 0):
                 parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that show none of them"
     return ", ".join(parts) or "no landmarks"
 
 
-def _target(output: Path | None, source: Path, several: bool) -> Path:
+def _target(options: Associate, run: int, source: Path, several: bool) -> Path:
+    """The file to write for one of a run's."""
+    output = options.output
     if output is None:
         return source.with_name(f"associated{source.suffix}")
+    if options.more:
+        output = output.with_stem(f"{output.stem}_{run + 1}")
     return output.with_suffix(source.suffix) if several else output
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -15,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from redetect import slam
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
+from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import camera_of_run, demand_free, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
-from redetect.storage import write_whole
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
@@ -54,8 +52,8 @@ def perform(options: Options) -> int:
     )
     rows = list(read_rows(source))
     write_rows(target, audited_rows(rows, audit, options.apply), overwrite=options.force)
-    with write_whole(target.with_suffix(".csv"), overwrite=options.force) as stream:
-        stream.write(_table(recording, audit, rows, source.name).encode("utf-8", "surrogateescape"))
+    listed, head = _table(recording, audit, rows), f"slam audit {slam.__version__}: {source.name}"
+    write_table(target.with_suffix(".csv"), _COLUMNS, listed, [head], overwrite=options.force)
     for line in _report(recording, audit):
         print(line)
     print(f"{target}, {target.with_suffix('.csv').name}")
@@ -92,23 +90,20 @@ def _with_id(row: Row, record: CircleLandmark, number: int) -> Row:
     return Row(changed, source, row.line)
 
 
-def _table(recording: Recording, audit: Audit, rows: Iterable[Row], name: str) -> str:
-    """The list of rows that contradict, as CSV."""
+def _table(recording: Recording, audit: Audit, rows: Iterable[Row]) -> list[list[object]]:
+    """The rows that contradict, with columns as `_COLUMNS`."""
     line = [row.line for row in rows if isinstance(row.record, CircleLandmark)]
-    text = io.StringIO()
-    text.write(f"# slam audit {slam.__version__}: {name}\n")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
+    table: list[list[object]] = []
     for group in audit.groups:
         for k, (x, y), own in zip(group.rows, group.xy, group.row_chi_squared):
             frame = int(recording.circles.frame[k])
             numbers = (group.own_m, own, group.chi_squared, group.mended_chi_squared)
-            writer.writerow(
+            table.append(
                 [frame, recording.prefixes[frame], line[k], group.id, group.kind, group.new_id]
                 + [f"{value:.3f}" for value in (x, y)]
                 + ["" if np.isnan(value) else f"{value:.2f}" for value in numbers]
             )
-    return text.getvalue()
+    return table
 
 
 def _frames_of(recording: Recording, group: Group) -> str:

@@ -8,33 +8,50 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from camera import Camera, read_camera
+from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Path2D, read_path
+from redetect.landmarks.map_file import LandmarkMap, read_path, write_path
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA, FilterRun
+from redetect.slam.filters.report import path_distance, summary, table
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import FilterFlags, RunFlags
 from redetect.slam.pictures import draw_errors, draw_map
-from redetect.slam.recording import Recording, demand_landmarks, landmark_file, read_recording
+from redetect.slam.recording import (
+    Recording,
+    demand_landmarks,
+    joined,
+    landmark_file,
+    read_recording,
+)
 from redetect.storage import OutputExistsError, write_whole
 
 
+def recordings_of(flags: RunFlags) -> list[Recording]:
+    """Read the rows of the runs that a command names; assumptions on their odometry are printed."""
+    recordings = [
+        read_recording(
+            run,
+            circles=flags.circles or not flags.lines,
+            lines=flags.lines,
+            stem=flags.stem,
+            noise=flags.odometry_noise,
+        )
+        for run in flags.runs
+    ]
+    for recording in recordings:
+        print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
+    return recordings
+
+
 def recording_of(flags: RunFlags) -> Recording:
-    """Read the rows of the run that a command names; assumptions on its odometry are printed."""
-    recording = read_recording(
-        flags.run,
-        circles=flags.circles or not flags.lines,
-        lines=flags.lines,
-        stem=flags.stem,
-        noise=flags.odometry_noise,
-    )
-    print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
-    return recording
+    """`recordings_of` the runs that a command names, as one."""
+    return joined(recordings_of(flags))
 
 
 def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
@@ -48,26 +65,10 @@ def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
 
 
 def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
-    """Read the calibration that belongs to a run.
+    """Read the calibration that belongs to a run, a folder or a file in one.
 
-    Parameters
-    ----------
-    run : Path
-        Run folder, or a file in one.
-    camera : Path, optional
-        The calibration; by default the one ``.cam`` in the folder, ``<run>.cam`` if there are
-        several.
-
-    Returns
-    -------
-    Camera
-
-    Raises
-    ------
-    SlamError
-        If there is none, or it is not clear which.
-    camera.CameraError
-        If the file is malformed.
+    By default it is the one ``.cam`` in the folder, ``<run>.cam`` if there are several. Raises
+    `SlamError` if there is none, or it is not clear which.
     """
     if camera is not None:
         return read_camera(camera)
@@ -102,31 +103,20 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
     return np.array([mounting[0][3], mounting[1][3]])
 
 
-def read_reference(path: Path, poses: Path2D) -> Path2D:
-    """A path to compare with, which must be of the same run."""
-    reference = read_path(path)
-    if len(reference.poses) != len(poses.poses):
-        raise SlamError(
-            f"{path}: {len(reference.poses)} poses: expected {len(poses.poses)}, the start and one "
-            "after each step of the run"
-        )
-    return reference
-
-
 def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
 
 
-def landmark_files(flags: RunFlags) -> list[Path]:
-    """The landmark files of the kinds that a command names."""
-    if not flags.run.is_dir():
-        return [demand_landmarks(flags.run)]
+def landmark_files(flags: RunFlags, run: Path) -> list[Path]:
+    """The landmark files of a run, of the kinds that a command names."""
+    if not run.is_dir():
+        return [demand_landmarks(run)]
     kinds = (".circles", flags.circles or not flags.lines), (".lines", flags.lines)
-    return [landmark_file(flags.run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
+    return [landmark_file(run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
-PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "path.csv", "map.png", "errors.png"
+MAP_NAME, PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "map.csv", "path.csv", "map.png", "errors.png"
 
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
@@ -139,13 +129,19 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
     """A command's flags as a JSON file has them."""
     return {
-        name: str(value) if isinstance(value, Path) else value
+        name: json.loads(json.dumps(value, default=str))
         for name, value in asdict(cast(Any, command)).items()
         if name not in but
     }
 
 
-def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
+def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
+    """Write a summary."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def filtered(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
     """Take a filter through a run; also returned is what to print of its time."""
     began, began_working = time.perf_counter(), time.thread_time()
     run = work()
@@ -157,36 +153,59 @@ def timed(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
     )
 
 
-def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write a summary."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+def filter_output(command: FilterFlags, name: str, more: tuple[str, ...] = ()) -> Path:
+    """The folder for a filter's results, in which nothing of their names may be."""
+    output = command.output or default_output(command.run, name)
+    names = [PATH_NAME, f"{name}.json", MAP_PICTURE, *more]
+    names += [ERROR_PICTURE] * (command.reference is not None)
+    demand_free([output / name for name in names], overwrite=command.force)
+    return output
 
 
-def draw_results(
-    output: Path,
-    landmark_map: LandmarkMap,
-    path: Path2D,
-    reference: Path2D | None,
-    title: str,
-    flags: FilterFlags,
-) -> None:
-    """Draw the map with the path and, beside a reference, the distance from it."""
+class FilterResults(NamedTuple):
+    """What a filter's command writes and prints."""
+
+    name: str  # of the command
+    run: FilterRun
+    landmark_map: LandmarkMap
+    source: str  # of the path, for its head
+    title: str  # of the pictures
+    figures: dict[str, Any]  # for the JSON file
+    lines: list[str]  # for the terminal
+
+
+def write_filtered(command: FilterFlags, output: Path, results: FilterResults) -> None:
+    """Write a filter's path, figures and pictures, and print its table."""
+    run, reference, distance = results.run, None, None
+    if command.reference:
+        reference = read_path(command.reference)
+        if len(reference.poses) != len(run.path.poses):
+            raise SlamError(
+                f"{command.reference}: {len(reference.poses)} poses: expected "
+                f"{len(run.path.poses)}, the start and one after each step of the run"
+            )
+        distance = path_distance(run.path, reference.poses)
+    output.mkdir(parents=True, exist_ok=True)
+    head = [f"slam {results.name} {slam.__version__}: {results.source}"]
+    write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
+    content = summary(run, flags_of(command), distance) | results.figures
+    write_json(output / f"{results.name}.json", content, overwrite=command.force)
+    print("\n".join([*table(run, distance), *results.lines]))
     draw_map(
         output / MAP_PICTURE,
-        landmark_map,
-        path,
+        results.landmark_map,
+        run.path,
         reference=reference,
-        title=title,
-        overwrite=flags.force,
-        interactive=flags.interactive,
+        title=results.title,
+        overwrite=command.force,
+        interactive=command.interactive,
     )
     if reference is not None:
         draw_errors(
             output / ERROR_PICTURE,
-            path,
+            run.path,
             reference.poses,
-            title=title,
-            overwrite=flags.force,
-            interactive=flags.interactive,
+            title=results.title,
+            overwrite=command.force,
+            interactive=command.interactive,
         )

@@ -4,71 +4,53 @@ from __future__ import annotations
 
 import numpy as np
 
-from redetect import slam
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import (
     LandmarkMap,
     covariance_file,
     read_joint_covariance,
     read_map,
-    write_path,
 )
 from redetect.slam.association.waking import wake_up
 from redetect.slam.commands.files import (
-    ERROR_PICTURE,
-    MAP_PICTURE,
-    PATH_NAME,
+    FilterResults,
     camera_xy_of,
-    default_output,
-    demand_free,
-    draw_results,
-    flags_of,
-    read_reference,
-    read_run_of,
-    timed,
-    write_json,
+    filter_output,
+    filtered,
+    recording_of,
+    write_filtered,
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import Associator, FilterRun, run_filter
 from redetect.slam.filters.localizer import Localizer, MapErrors
-from redetect.slam.filters.report import path_distance, summary, table
 from redetect.slam.options import Localize
 from redetect.slam.recording import Recording
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 
-JSON_NAME = "localize.json"
-
 
 def perform(command: Localize) -> int:
     """Localise in a run; returns the exit code."""
-    output = command.output or default_output(command.run, "localize")
-    names = (PATH_NAME, JSON_NAME, MAP_PICTURE, *([ERROR_PICTURE] if command.reference else []))
     landmark_map = read_map(command.map)
     map_errors = _map_errors(command)
     considered = map_errors == "considered"
     joint = read_joint_covariance(command.map, landmark_map) if considered else None
-    recording, _ = read_run_of(command)
-    demand_free([output / name for name in names], overwrite=command.force)
-    run, time_line = timed(lambda: localized_run_of(command, recording, landmark_map, joint))
-    reference = read_reference(command.reference, run.path) if command.reference else None
-    distance = path_distance(run.path, reference.poses) if reference else None
-    output.mkdir(parents=True, exist_ok=True)
-    write_path(
-        output / PATH_NAME,
-        run.path,
-        [f"slam localize {slam.__version__}: {command.run} in {command.map}"],
-        overwrite=command.force,
-    )
-    content = summary(run, flags_of(command), distance)
-    content["map_errors"] = map_errors if joint is None else f"{map_errors}, jointly"
-    write_json(output / JSON_NAME, content, overwrite=command.force)
-    print("\n".join(table(run, distance)))
+    recording = recording_of(command)
+    output = filter_output(command, "localize")
+    run, time_line = filtered(lambda: localized_run_of(command, recording, landmark_map, joint))
+    said = [time_line]
     if considered and joint is None:
-        print(f"errors of the map taken as independent: no {covariance_file(command.map).name}")
-    print(time_line)
-    draw_results(
-        output, landmark_map, run.path, reference, f"{command.run.name}: localised", command
+        name = covariance_file(command.map).name
+        said.insert(0, f"errors of the map taken as independent: no {name}")
+    results = FilterResults(
+        "localize",
+        run,
+        landmark_map,
+        f"{command.run} in {command.map}",
+        f"{command.run.name}: localised",
+        {"map_errors": map_errors if joint is None else f"{map_errors}, jointly"},
+        said,
     )
+    write_filtered(command, output, results)
     return 0
 
 

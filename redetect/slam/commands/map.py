@@ -20,11 +20,14 @@ from redetect.landmarks.map_file import (
     write_path,
 )
 from redetect.slam.commands.files import (
+    MAP_NAME,
+    MAP_PICTURE,
+    PATH_NAME,
     camera_of_run,
     default_output,
     demand_free,
     flags_of,
-    recording_of,
+    recordings_of,
     write_json,
 )
 from redetect.slam.errors import SlamError
@@ -42,10 +45,10 @@ from redetect.slam.mapping.run_map import (
 from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import Recording
-from redetect.storage.bounds import FINITE, demand
+from redetect.slam.recording import Recording, first_poses, joined
+from redetect.storage.bounds import ABOVE_0, FINITE, demand, from_to
 
-MAP_NAME, PATH_NAME, TABLE_NAME, PICTURE_NAME = "map.csv", "path.csv", "table.json", "map.png"
+TABLE_NAME = "table.json"
 
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
@@ -56,15 +59,20 @@ def perform(command: Map) -> int:
     """Carry the command out; 0 if all went well."""
     output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
-    names = (MAP_NAME, joint_name, PATH_NAME, TABLE_NAME, PICTURE_NAME)
+    paths = [PATH_NAME]
+    if command.more:
+        paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
+    names = (MAP_NAME, joint_name, *paths, TABLE_NAME, MAP_PICTURE)
     demand_free([output / name for name in names], overwrite=command.force)
-    recording = recording_of(command)
+    runs = recordings_of(command)
+    recording = joined(runs)
     begin = time.perf_counter()
     mapped = mapped_run_of(command, recording)
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam map {slam.__version__}: {command.run.resolve().name}"]
+    name = ", ".join(run.resolve().name for run in command.runs)
+    head = [f"slam map {slam.__version__}: {name}"]
     final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
     path = path_of(recording, mapped.estimate, mapped.covariance)
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
@@ -75,7 +83,9 @@ def perform(command: Map) -> int:
     else:
         # One of another map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
-    write_path(output / PATH_NAME, path, head, overwrite=command.force)
+    ends = first_poses(runs)
+    for first, end, own in zip(ends, ends[1:], paths):
+        write_path(output / own, path.part(first, end), head, overwrite=command.force)
     write_json(output / TABLE_NAME, _results(mapped, command), overwrite=command.force)
     for line in _report(mapped, seconds):
         print(line)
@@ -87,21 +97,23 @@ def perform(command: Map) -> int:
     first = landmark_map(mapped.graph, mapped.start, None)
     start = LandmarkMap(discs=first.discs, lines=no_landmarks())
     draw_map(
-        output / PICTURE_NAME,
+        output / MAP_PICTURE,
         final,
         path,
         before=(start, path_of(recording, mapped.start, None)),
-        title=command.run.resolve().name,
+        title=name,
         overwrite=command.force,
         interactive=command.interactive,
     )
-    print(f"{output}: {MAP_NAME}, {PATH_NAME}, {TABLE_NAME}, {PICTURE_NAME}")
+    print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE))}")
     return 0
 
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     """The map of a run's rows that a command asks for."""
-    _check(command)
+    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0, tilt_deg=from_to(0.0, 45.0))
+    if command.tilt_deg and command.row_errors != "recorded":
+        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
     camera = None
     if command.calibrate or command.tilt_deg or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
@@ -124,16 +136,6 @@ def weighting_of(command: Map) -> Weighting:
         row_errors=command.row_errors,
         tilt_sigma_rad=math.radians(command.tilt_deg),
     )
-
-
-def _check(command: Map) -> None:
-    demand(command, SlamError, start=FINITE)
-    if not (math.isfinite(command.loss_scale) and command.loss_scale > 0.0):
-        raise SlamError(f"--loss-scale {command.loss_scale:g}: expected above 0")
-    if not (0.0 <= command.tilt_deg < 45.0):
-        raise SlamError(f"--tilt-deg {command.tilt_deg:g}: expected from 0 to below 45")
-    if command.tilt_deg and command.row_errors != "recorded":
-        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
 
 
 def _report(mapped: MappedRun, seconds: float) -> list[str]:

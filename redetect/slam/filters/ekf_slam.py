@@ -90,7 +90,7 @@ class EkfSlam:
     @property
     def pose_covariance(self) -> FloatArray:
         """(3, 3)."""
-        return self.covariance.pose()
+        return self.covariance.block(_POSE)
 
     @property
     def state(self) -> FloatArray:
@@ -305,29 +305,11 @@ class EkfSlam:
 
 
 def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
-    """Take a filter through a run.
+    """`run_filter` with EKF-SLAM, which holds the map afterwards.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    ekf : EkfSlam
-        A filter at the start; holds the map afterwards.
-    associator : Associator, optional
-        How rows are paired with landmarks; by default by their identifiers. If it is found out,
-        discs that are far from all others are new ones, numbered from 1 in the order of their
-        first sight; lines have no place before there is parallax, so that they can't be found
-        again by it: their rows must be known.
-
-    Returns
-    -------
-    FilterRun
-
-    Raises
-    ------
-    SlamError
-        If an update is not possible, the message names the step; or if lines without identifiers
-        are to be mapped.
+    If identities are found out, discs that are far from all others are new ones, numbered from 1 in
+    the order of their first sight; lines have no place before there is parallax, so that they can't
+    be found again by it: their rows must be known, else `SlamError` is raised.
     """
     pairing = associator or Associator()
     if pairing.method != "known" and len(recording.lines):

@@ -6,41 +6,35 @@ each other, each frame for itself, by `redetect.slam.association.compatibility`.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
+from redetect.plane import rotation
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
     Pairing,
     chi_squared_gates,
+    individual_distances,
     joint_compatible,
     nearest_compatible,
 )
 from redetect.slam.errors import SlamError
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 
 class MeasuredDiscs(NamedTuple):
-    """Rows of d discs.
+    """Rows of d discs."""
 
-    Attributes
-    ----------
-    slot : (d,) int64
-        Where in the state the disc of each row begins.
-    xy, covariance : (d, 2), (d, 2, 2) float64
-        Measured, in the robot frame (m).
-    """
-
-    slot: IntArray
+    slot: IntArray  # (d,): where in the state the disc of each row begins
+    # (d, 2), (d, 2, 2): measured, in the robot frame (m).
     xy: FloatArray
     covariance: FloatArray
 
@@ -56,7 +50,6 @@ class MeasuredLines(NamedTuple):
     sigma_rad: FloatArray
 
 
-@njit(cache=True, error_model="numpy")
 def frame_innovation(
     state: FloatArray,
     linearised_at: FloatArray,
@@ -69,56 +62,31 @@ def frame_innovation(
     Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
     `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
     """
-    disc_count, line_count = len(discs.slot), len(lines.bearing_rad)
-    rows = 2 * disc_count + line_count
-    numbers = 3 + 2 * disc_count + 2 * len(lines.slot)
-    innovation = np.zeros(rows)
-    jacobian = np.zeros((rows, numbers))
-    noise = np.zeros((rows, rows))
-    index = np.empty(numbers, dtype=np.int64)
-    index[0], index[1], index[2] = 0, 1, 2
-    cos, sin = math.cos(state[2]), math.sin(state[2])
-    for k in range(disc_count):
-        slot, row, column = discs.slot[k], 2 * k, 3 + 2 * k
-        index[column], index[column + 1] = slot, slot + 1
-        dx, dy = state[slot] - state[0], state[slot + 1] - state[1]
-        innovation[row] = discs.xy[k, 0] - (cos * dx + sin * dy)
-        innovation[row + 1] = discs.xy[k, 1] - (-sin * dx + cos * dy)
-        dx = linearised_at[slot] - linearised_at[0]
-        dy = linearised_at[slot + 1] - linearised_at[1]
-        jacobian[row, 0], jacobian[row, 1] = -cos, -sin
-        jacobian[row + 1, 0], jacobian[row + 1, 1] = sin, -cos
-        jacobian[row, 2] = -sin * dx + cos * dy
-        jacobian[row + 1, 2] = -cos * dx - sin * dy
-        jacobian[row, column], jacobian[row, column + 1] = cos, sin
-        jacobian[row + 1, column], jacobian[row + 1, column + 1] = -sin, cos
-        for i in range(2):
-            for j in range(2):
-                noise[row + i, row + j] = discs.covariance[k, i, j]
-    for k in range(line_count):
-        row = 2 * disc_count + k
-        share = 1.0 / (lines.start[k + 1] - lines.start[k])
-        difference = 0.0
-        for entry in range(lines.start[k], lines.start[k + 1]):
-            slot, column = lines.slot[entry], 3 + 2 * disc_count + 2 * entry
-            index[column], index[column + 1] = slot, slot + 1
-            dx, dy = state[slot] - state[0], state[slot + 1] - state[1]
-            seen_x = cos * dx + sin * dy - camera_xy[0]
-            seen_y = -sin * dx + cos * dy - camera_xy[1]
-            angle = lines.bearing_rad[k] - math.atan2(seen_x, -seen_y)
-            difference += share * ((angle + math.pi) % (2.0 * math.pi) - math.pi)
-            weight = share / (seen_x**2 + seen_y**2)
-            by_x = (-seen_y * cos - seen_x * sin) * weight
-            by_y = (-seen_y * sin + seen_x * cos) * weight
-            jacobian[row, column], jacobian[row, column + 1] = by_x, by_y
-            jacobian[row, 0] -= by_x
-            jacobian[row, 1] -= by_y
-            dx = linearised_at[slot] - linearised_at[0]
-            dy = linearised_at[slot + 1] - linearised_at[1]
-            jacobian[row, 2] += by_x * dy - by_y * dx
-        innovation[row] = difference
-        noise[row, row] = lines.sigma_rad[k] ** 2
-    return innovation, jacobian, noise, index
+    d, rows = len(discs.slot), 2 * len(discs.slot) + len(lines.bearing_rad)
+    slots = np.concatenate([discs.slot, lines.slot])
+    places = slots[:, None] + np.arange(2)
+    pose, xy, every_disc = state[:3], state[places], np.arange(d)
+    turn = rotation(pose[2]).T
+    innovation, by_place = np.empty(rows), np.zeros((rows, len(slots), 2))
+    innovation[: 2 * d] = (discs.xy - (xy[:d] - pose[:2]) @ turn.T).ravel()
+    by_place[: 2 * d].reshape(d, 2, len(slots), 2)[every_disc, :, every_disc] = turn
+    if len(lines.slot):
+        count = np.diff(lines.start)
+        row = np.repeat(np.arange(len(count)), count)  # of each line
+        off = wrap_angle(lines.bearing_rad[row] - bearing_of_vertical(pose, xy[d:], camera_xy))
+        innovation[2 * d :] = np.bincount(row, off / count[row], minlength=len(count))
+        _, by_line = bearing_jacobians(pose, xy[d:], camera_xy)
+        by_place[2 * d + row, np.arange(d, len(slots))] = by_line / count[row, None]
+    # Turning the robot is turning the landmarks about it the other way.
+    offset = linearised_at[places] - linearised_at[:2]
+    by_heading = by_place[:, :, 0] @ offset[:, 1] - by_place[:, :, 1] @ offset[:, 0]
+    by_landmarks = by_place.reshape(rows, 2 * len(slots))
+    jacobian = np.concatenate([-by_place.sum(axis=1), by_heading[:, None], by_landmarks], axis=1)
+
+    noise = np.diag(np.concatenate([np.zeros(2 * d), lines.sigma_rad**2]))
+    at = 2 * every_disc[:, None] + np.arange(2)
+    noise[at[:, :, None], at[:, None, :]] = discs.covariance
+    return innovation, jacobian, noise, np.concatenate([np.arange(3), places.ravel()])
 
 
 NO_CAMERA = np.zeros(2)
@@ -134,12 +102,6 @@ class FrameRows:
     line_ids: tuple[tuple[int, ...], ...]  # all lines that a row shows; empty where unknown
     bearing_rad: FloatArray  # (l,)
     sigma_rad: FloatArray  # (l,)
-
-    def identified(
-        self, disc_ids: tuple[int, ...], line_ids: tuple[tuple[int, ...], ...]
-    ) -> FrameRows:
-        """The same rows under other identifiers."""
-        return replace(self, disc_ids=disc_ids, line_ids=line_ids)
 
     def innovation(
         self,
@@ -190,23 +152,13 @@ class RowCount:
 
 @dataclass(frozen=True, eq=False)
 class FilterRun:
-    """Poses of a run as a filter had them at the time, and what became of the rows.
+    """Poses of a run as a filter had them at the time, and what became of the rows."""
 
-    Attributes
-    ----------
-    path : Path2D
-        The start, and the pose after each step and its frame, with covariances; theta is not
-        wrapped.
-    count : RowCount
-    disc_ids : (n,) int64
-        The disc that each row was taken to show, -1 where none: the file's, or what association
-        found.
-    line_ids : tuple of tuples of int
-        The same of lines; empty where none.
-    """
-
+    # The start, and the pose after each step and its frame, with covariances; theta is not wrapped.
     path: Path2D
     count: RowCount
+    # (n,): the disc that each row was taken to show, -1 where none: the file's, or what association
+    # found; the same of lines, empty where none.
     disc_ids: IntArray
     line_ids: tuple[tuple[int, ...], ...]
 
@@ -290,7 +242,7 @@ class Associator:
             return rows
         discs = self._discs(rows, estimate, new_id) if rows.disc_ids else ()
         lines = self._lines(rows, estimate) if rows.line_ids else ()
-        return rows.identified(discs, lines)
+        return replace(rows, disc_ids=discs, line_ids=lines)
 
     def _discs(
         self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None
@@ -311,7 +263,9 @@ class Associator:
             pairing = self._paired(innovation, predicted, rows.disc_covariance)
             paired = pairing.landmark >= 0
             found[paired] = names[pairing.landmark[paired]]
-            closest = _closest(innovation, predicted, rows.disc_covariance)
+            closest = np.min(
+                individual_distances(innovation, predicted, rows.disc_covariance), axis=1
+            )
         if new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
@@ -351,22 +305,11 @@ def run_filter(
     associator: Associator | None = None,
     new_id: Callable[[], int] | None = None,
 ) -> FilterRun:
-    """Take a filter through a run.
+    """Take a filter, which is at the start, through a run.
 
-    Parameters
-    ----------
-    recording : Recording
-    estimate : Filter
-        At the start; changed.
-    associator : Associator, optional
-        How rows are paired with landmarks; by default by their identifiers.
-    new_id : callable, optional
-        Gives the next identifier for a row that is found to show a new disc.
-
-    Raises
-    ------
-    SlamError
-        If an update is not possible; the message names the step.
+    Rows are paired with landmarks by their identifiers, unless an associator says otherwise;
+    `new_id` gives the next one for a row that is found to show a new disc. Raises `SlamError`,
+    which names the step, if an update is not possible.
     """
     pairing = associator or Associator()
     disc_ids: list[int] = []
@@ -406,13 +349,6 @@ def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArr
     reach = np.sqrt(pose[0, 0] + pose[1, 1]) + np.sqrt(pose[2, 2]) * np.hypot(*seen_xy.T)
     near = np.any(np.hypot(*offset.transpose(2, 0, 1)) < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
     return names[near], slots[near]
-
-
-def _closest(innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    """Squared Mahalanobis distance of each row of a disc from the landmark closest to it: (n,)."""
-    pairs = np.arange(innovation.shape[1])
-    own = predicted.reshape(len(pairs), 2, len(pairs), 2)[pairs, :, pairs, :]
-    return np.asarray(np.min(squared_mahalanobis(innovation, own + noise[:, None]), axis=1))
 
 
 def innovation_root(covariance: FloatArray) -> FloatArray:

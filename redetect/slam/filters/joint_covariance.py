@@ -57,11 +57,6 @@ class JointCovariance:
         low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
         return np.asarray(self._base[high, low] - factor @ factor.T)
 
-    def pose(self) -> FloatArray:
-        """Covariance of the pose: (3, 3)."""
-        factor = self._factor[:POSE_SIZE, : self._pending]
-        return np.asarray(self._base[:POSE_SIZE, :POSE_SIZE] - factor @ factor.T)
-
     def blocks(self, slots: IntArray) -> FloatArray:
         """Covariances of pairs of numbers that begin at `slots`: (k, 2, 2)."""
         self._settle()
@@ -70,12 +65,6 @@ class JointCovariance:
         found[:, 1, 1] = self._base[slots + 1, slots + 1]
         found[:, 0, 1] = found[:, 1, 0] = self._base[slots + 1, slots]
         return found
-
-    def dense(self) -> FloatArray:
-        """The whole covariance: (size, size)."""
-        self._settle()
-        lower = np.tril(self._base[: self.size, : self.size])
-        return np.asarray(lower + np.tril(lower, -1).T)
 
     def projected(self, index: IntArray, jacobian: FloatArray) -> FloatArray:
         """Covariance of the state with a measurement: P[:, index] @ jacobian.T, (size, m)."""

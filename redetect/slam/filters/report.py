@@ -16,20 +16,10 @@ from redetect.slam.filters.frames import FilterRun
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
-    """How far a path is from another one of the same run in the same map.
+    """How far a path is from another one of the same run in the same map, `reference` (N, 3).
 
-    Parameters
-    ----------
-    path : Path2D
-        N poses.
-    reference : (N, 3) array_like
-        The other's poses.
-
-    Returns
-    -------
-    dict of str to float
-        Root mean square, median and largest distance of positions (m) and headings (rad), and those
-        of the last pose.
+    Root mean square, median and largest distance of positions (m) and headings (rad), and those of
+    the last pose.
     """
     other = np.asarray(reference, dtype=np.float64)
     position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)

@@ -24,12 +24,13 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import CircleLandmark, Frame, Step
+from redetect.landmarks import Frame
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.text import finite, text_rows, to_dataset
 from redetect.slam.models import chain_steps
+from redetect.slam.recording import CircleRows, frames_of_discs
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -69,18 +70,9 @@ class RangeBearing:
 def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame]:
     """The run as frames, whose steps state no covariance; landmarks as discs."""
     xy, covariance = discs_of_ranges(run.range_m, run.bearing_rad, sigma_m, sigma_rad)
-    starts = np.searchsorted(run.frame, np.arange(len(run.times) + 1))
-    frames = []
-    for k, (prefix, step) in enumerate(zip(run.prefixes, run.steps.tolist())):
-        rows = range(starts[k], starts[k + 1])
-        seen = tuple(_disc(xy[row], covariance[row], int(run.ids[row])) for row in rows)
-        frames.append(Frame(Step(prefix, *step, *([0.0] * 6)), seen))
-    return frames
-
-
-def _disc(xy: FloatArray, covariance: FloatArray, number: int) -> CircleLandmark:
-    (x, y), (cxx, cxy, _, cyy) = xy.tolist(), covariance.ravel().tolist()
-    return CircleLandmark(x, y, 1.0, cxx, cxy, cyy, (number,))
+    unstated = np.zeros((len(run.steps), 3, 3))
+    rows = CircleRows(run.frame, xy, covariance, run.ids)
+    return frames_of_discs(run.prefixes, run.steps, unstated, rows, np.ones(len(xy)))
 
 
 def discs_of_ranges(

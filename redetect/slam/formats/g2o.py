@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,6 @@ from redetect.landmarks import (
     CircleLandmark,
     Frame,
     Step,
-    circle_landmarks,
     format_record,
     parse_record,
 )
@@ -44,7 +43,13 @@ from redetect.slam.formats.text import (
     write_text,
 )
 from redetect.slam.models import OdometryNoise, chain_steps
-from redetect.slam.recording import ASSUMED, CircleRows, Recording, recording_of_frames
+from redetect.slam.recording import (
+    ASSUMED,
+    CircleRows,
+    Recording,
+    frames_of_discs,
+    recording_of_frames,
+)
 
 #: Begins the comment with a frame's name and the qualities of its rows.
 FRAME_COMMENT = "# FRAME"
@@ -244,22 +249,10 @@ def frames_of_graph(graph: RunGraph) -> list[Frame]:
     """The rows of a graph's steps and measurements; a quality that is unknown becomes 1."""
     spread = graph.step_covariance.copy()
     spread[np.abs(spread) < _LEAST_STEP_COVARIANCE] = 0.0
-    rows = graph.circles
-    of_frame = np.searchsorted(rows.frame, np.arange(len(graph.steps) + 1))
     quality = np.where(np.isfinite(graph.quality), graph.quality, 1.0)
-    frames = []
-    for k, (step, c) in enumerate(zip(graph.steps.tolist(), spread.tolist())):
-        dx, dy, dphi = step
-        record = Step(
-            *(graph.prefixes[k + 1], dx, dy, dphi),
-            *(c[0][0], c[0][1], c[1][1], c[0][2], c[1][2], c[2][2]),
-        )
-        some = slice(of_frame[k], of_frame[k + 1])
-        # Of a zero, information matrices do not keep the sign.
-        spread_of_rows = rows.covariance[some] + 0.0
-        seen = circle_landmarks(rows.xy[some], quality[some], spread_of_rows, rows.ids[some])
-        frames.append(Frame(record, seen))
-    return frames
+    # Of a zero, information matrices do not keep the sign.
+    rows = replace(graph.circles, covariance=graph.circles.covariance + 0.0)
+    return frames_of_discs(graph.prefixes[1:], graph.steps, spread, rows, quality)
 
 
 def demand_readable(frames: Sequence[Frame], name: str) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from itertools import pairwise
+from collections import Counter
+from itertools import pairwise, repeat
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,33 +21,28 @@ from redetect.slam.formats.g2o import (
 from redetect.slam.formats.text import Axes, demand_axes, finite, text_rows, to_dataset, whole
 from redetect.slam.recording import CircleRows
 
-_TRIANGLE_3 = ("I11", "I12", "I13", "I22", "I23", "I33")
+_POSE, _DISC, _STEP, _SIGHT, _FIX = "VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX"
 # Of each kind of row: how many vertices it names, and its numbers.
-_KINDS: Mapping[str, tuple[int, tuple[str, ...]]] = {
-    "VERTEX_SE2": (1, ("x", "y", "theta")),
-    "VERTEX_XY": (1, ("x", "y")),
-    "EDGE_SE2": (2, ("dx", "dy", "dphi", *_TRIANGLE_3)),
-    "EDGE_SE2_XY": (2, ("x", "y", "I11", "I12", "I22")),
+_KINDS = {
+    _POSE: (1, ("x", "y", "theta")),
+    _DISC: (1, ("x", "y")),
+    _STEP: (2, ("dx", "dy", "dphi", "I11", "I12", "I13", "I22", "I23", "I33")),
+    _SIGHT: (2, ("x", "y", "I11", "I12", "I22")),
+}
+# Which vertices rows name.
+_NAMED = {
+    _STEP: (_POSE, _POSE),
+    _SIGHT: (_POSE, _DISC),
+    FRAME_COMMENT: (_POSE,),
+    _FIX: repeat("vertex"),
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
+class _Row(NamedTuple):
     line: int
     vertices: tuple[int, ...]
-    numbers: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """The rows of a file; vertices by their numbers."""
-
-    poses: dict[int, _Row] = field(default_factory=dict)
-    discs: dict[int, _Row] = field(default_factory=dict)
-    steps: dict[tuple[int, ...], _Row] = field(default_factory=dict)
-    sights: list[_Row] = field(default_factory=list)
-    fixed: list[_Row] = field(default_factory=list)
-    frames: dict[int, tuple[int, str, tuple[float, ...]]] = field(default_factory=dict)
+    numbers: tuple[float, ...] = ()
+    name: str = ""  # of a frame
 
 
 def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGraph:
@@ -75,20 +70,31 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
         number, or the file says that its axes are others; the message names file and line.
     """
     rows = _read_rows(path, axes)
-    _demand_vertices(path, rows)
-    order = _chain(path, rows)
+    _once(path, [*rows[_POSE], *rows[_DISC]], "there is a vertex {} already")
+    steps_between = _once(path, rows[_STEP], "there is an EDGE_SE2 between these poses already")
+    frames = _once(path, rows[FRAME_COMMENT], "vertex {} has a frame already")
+    poses, discs = ({row.vertices[0]: row for row in rows[kind]} for kind in (_POSE, _DISC))
+    known = {_POSE: {*poses}, _DISC: {*discs}, "vertex": {*poses, *discs}}
+    for kind, named in _NAMED.items():
+        for row in rows[kind]:
+            for vertex, what in zip(row.vertices, named):
+                if vertex not in known[what]:
+                    raise SlamError(f"{path}:{row.line}: no {what} {vertex}")
+    order = _chain(path, poses, steps_between)
     rank = {vertex: k for k, vertex in enumerate(order)}
-    for sight in rows.sights:
-        if rank[sight.vertices[0]] == 0:
+    sights = sorted(rows[_SIGHT], key=lambda row: rank[row.vertices[0]])
+    for row in sights:
+        if rank[row.vertices[0]] == 0:
             raise SlamError(
-                f"{path}:{sight.line}: a disc seen from the first pose: expected measurements "
-                "after a step"
+                f"{path}:{row.line}: a disc seen from the first pose: expected measurements after "
+                "a step"
             )
-    sights = sorted(rows.sights, key=lambda row: rank[row.vertices[0]])
-    _demand_positive_definite(path, list(rows.steps.values()), 3)
-    _demand_positive_definite(path, sights, 2)
-
-    chain = [rows.steps[edge] for edge in pairwise(order)]
+    chain = [steps_between[edge] for edge in pairwise(order)]
+    for some, size in ((chain, 3), (sights, 2)):
+        for bad in np.flatnonzero(~is_positive_definite(_symmetric(some, size)))[:1]:
+            raise SlamError(
+                f"{path}:{some[bad].line}: the information matrix is not positive definite"
+            )
     steps = _table([row.numbers[:3] for row in chain], 3)
     step_covariance, covariance = covariances_of_graph(
         steps, _symmetric(chain, 3), _symmetric(sights, 2), axes
@@ -97,15 +103,14 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
         for bad in np.flatnonzero(~np.all(np.isfinite(spread), axis=(1, 2)))[:1]:
             raise SlamError(f"{path}:{some[bad].line}: the information matrix has no inverse")
     base = first_disc_vertex(order[-1])
-    if any(vertex < base for vertex in rows.discs):
+    if any(vertex < base for vertex in discs):
         base = 0
-    discs = sorted(rows.discs)
-    prefixes, quality = _frames(path, rows, order, sights)
+    prefixes, quality = _named(path, frames, order, sights)
     return RunGraph(
         prefixes=prefixes,
-        poses=to_dataset(_table([rows.poses[vertex].numbers for vertex in order], 3), axes),
-        disc_ids=np.array([vertex - base for vertex in discs], dtype=np.int64),
-        discs=to_dataset(_table([rows.discs[vertex].numbers for vertex in discs], 2), axes),
+        poses=to_dataset(_table([poses[vertex].numbers for vertex in order], 3), axes),
+        disc_ids=np.array([vertex - base for vertex in sorted(discs)], dtype=np.int64),
+        discs=to_dataset(_table([discs[vertex].numbers for vertex in sorted(discs)], 2), axes),
         steps=to_dataset(steps, axes),
         step_covariance=step_covariance,
         circles=CircleRows(
@@ -118,123 +123,99 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
     )
 
 
-def _read_rows(path: str | os.PathLike[str], axes: Axes) -> _Rows:
-    rows = _Rows()
+def _read_rows(path: str | os.PathLike[str], axes: Axes) -> dict[str, list[_Row]]:
+    rows: dict[str, list[_Row]] = {kind: [] for kind in (*_KINDS, _FIX, FRAME_COMMENT)}
     for line, text in text_rows(path):
-        if text.startswith("#"):
-            demand_axes(path, line, text, axes)
-            if text.startswith(FRAME_COMMENT + " "):
-                _read_frame(path, line, text, rows)
-            continue
         tag, *words = text.split()
-        if tag == "FIX":
-            vertices = tuple(whole(path, line, "vertex", word) for word in words)
-            rows.fixed.append(_Row(line, vertices, ()))
+        if text.startswith(FRAME_COMMENT + " "):
+            tag, words = FRAME_COMMENT, text[len(FRAME_COMMENT) :].split()
+            if len(words) < 2:
+                raise SlamError(
+                    f"{path}:{line}: {FRAME_COMMENT}: expected a vertex number and a name"
+                )
+            qualities = tuple(finite(path, line, "quality", word) for word in words[2:])
+            row = _Row(line, (whole(path, line, "vertex", words[0]),), qualities, words[1])
+        elif text.startswith("#"):
+            demand_axes(path, line, text, axes)
             continue
-        if tag not in _KINDS:
+        elif tag == _FIX:
+            row = _Row(line, tuple(whole(path, line, "vertex", word) for word in words))
+        elif tag in _KINDS:
+            count, names = _KINDS[tag]
+            if len(words) != count + len(names):
+                raise SlamError(
+                    f"{path}:{line}: {tag} with {len(words)} values: expected "
+                    f"{count + len(names)}: {count} vertex number{'s' if count > 1 else ''} and "
+                    f"{' '.join(names)}"
+                )
+            row = _Row(
+                line,
+                tuple(whole(path, line, "vertex", word) for word in words[:count]),
+                tuple(finite(path, line, name, word) for name, word in zip(names, words[count:])),
+            )
+        else:
             raise SlamError(
                 f"{path}:{line}: row starts with {tag[:30]!a}: expected {', '.join(_KINDS)} or FIX"
             )
-        count, names = _KINDS[tag]
-        if len(words) != count + len(names):
-            raise SlamError(
-                f"{path}:{line}: {tag} with {len(words)} values: expected {count + len(names)}: "
-                f"{count} vertex number{'s' if count > 1 else ''} and {' '.join(names)}"
-            )
-        row = _Row(
-            line,
-            tuple(whole(path, line, "vertex", word) for word in words[:count]),
-            tuple(finite(path, line, name, word) for name, word in zip(names, words[count:])),
-        )
-        if tag == "EDGE_SE2_XY":
-            rows.sights.append(row)
-        elif tag == "EDGE_SE2":
-            if row.vertices in rows.steps:
-                raise SlamError(f"{path}:{line}: there is an EDGE_SE2 between these poses already")
-            rows.steps[row.vertices] = row
-        else:
-            vertex = row.vertices[0]
-            if vertex in rows.poses or vertex in rows.discs:
-                raise SlamError(f"{path}:{line}: there is a vertex {vertex} already")
-            (rows.poses if tag == "VERTEX_SE2" else rows.discs)[vertex] = row
+        rows[tag].append(row)
     return rows
 
 
-def _read_frame(path: str | os.PathLike[str], line: int, text: str, rows: _Rows) -> None:
-    words = text[len(FRAME_COMMENT) :].split()
-    if len(words) < 2:
-        raise SlamError(f"{path}:{line}: {FRAME_COMMENT}: expected a vertex number and a name")
-    vertex = whole(path, line, "vertex", words[0])
-    if vertex in rows.frames:
-        raise SlamError(f"{path}:{line}: vertex {vertex} has a frame already")
-    qualities = tuple(finite(path, line, "quality", word) for word in words[2:])
-    rows.frames[vertex] = (line, words[1], qualities)
+def _once(
+    path: str | os.PathLike[str], rows: list[_Row], already: str
+) -> dict[tuple[int, ...], _Row]:
+    """Rows by their vertices, which no two may have in common."""
+    found: dict[tuple[int, ...], _Row] = {}
+    for row in rows:
+        if found.setdefault(row.vertices, row) is not row:
+            raise SlamError(f"{path}:{row.line}: {already.format(row.vertices[0])}")
+    return found
 
 
-def _demand_vertices(path: str | os.PathLike[str], rows: _Rows) -> None:
-    """Every row names vertices of the right kind."""
-    for row in rows.fixed:
-        for vertex in row.vertices:
-            if vertex not in rows.poses and vertex not in rows.discs:
-                raise SlamError(f"{path}:{row.line}: no vertex {vertex}")
-    named = [(row.line, vertex) for row in rows.steps.values() for vertex in row.vertices]
-    named += [(row.line, row.vertices[0]) for row in rows.sights]
-    named += [(line, vertex) for vertex, (line, _, _) in rows.frames.items()]
-    for line, vertex in named:
-        if vertex not in rows.poses:
-            raise SlamError(f"{path}:{line}: no VERTEX_SE2 {vertex}")
-    for row in rows.sights:
-        if row.vertices[1] not in rows.discs:
-            raise SlamError(f"{path}:{row.line}: no VERTEX_XY {row.vertices[1]}")
-
-
-def _chain(path: str | os.PathLike[str], rows: _Rows) -> list[int]:
+def _chain(
+    path: str | os.PathLike[str], poses: dict[int, _Row], steps: dict[tuple[int, ...], _Row]
+) -> list[int]:
     """The poses' numbers in order, where edges lead from each to the next and nowhere else."""
-    order = sorted(rows.poses)
+    order = sorted(poses)
     if len(order) < 2:
         raise SlamError(
             f"{path}: {len(order)} VERTEX_SE2 rows: expected a run of at least one step"
         )
-    following = dict(pairwise(order))
-    for (first, second), row in rows.steps.items():
-        if following.get(first) != second:
+    wanted = set(pairwise(order))
+    for edge, row in steps.items():
+        if edge not in wanted:
             raise SlamError(
-                f"{path}:{row.line}: EDGE_SE2 from {first} to {second}: expected edges from each "
-                "pose to the next, as the steps of a run"
+                f"{path}:{row.line}: EDGE_SE2 from {edge[0]} to {edge[1]}: expected edges from "
+                "each pose to the next, as the steps of a run"
             )
-    for first, second in following.items():
-        if (first, second) not in rows.steps:
+    for first, second in pairwise(order):
+        if (first, second) not in steps:
             raise SlamError(
-                f"{path}:{rows.poses[second].line}: no EDGE_SE2 from {first} to {second}: expected "
-                "one from each pose to the next"
+                f"{path}:{poses[second].line}: no EDGE_SE2 from {first} to {second}: expected one "
+                "from each pose to the next"
             )
     return order
 
 
-def _demand_positive_definite(path: str | os.PathLike[str], rows: list[_Row], size: int) -> None:
-    usable = is_positive_definite(_symmetric(rows, size))
-    for bad in np.flatnonzero(~usable)[:1]:
-        raise SlamError(f"{path}:{rows[bad].line}: the information matrix is not positive definite")
-
-
-def _frames(
-    path: str | os.PathLike[str], rows: _Rows, order: list[int], sights: list[_Row]
+def _named(
+    path: str | os.PathLike[str],
+    frames: dict[tuple[int, ...], _Row],
+    order: list[int],
+    sights: list[_Row],
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Names of the poses, and qualities of the measurements in their order."""
-    counts = dict.fromkeys(order, 0)
-    for sight in sights:
-        counts[sight.vertices[0]] += 1
+    counts = Counter(sight.vertices[0] for sight in sights)
     prefixes = ["start"]
     quality: list[float] = []
     for vertex in order[1:]:
-        line, prefix, known = rows.frames.get(vertex, (0, f"vertex.{vertex}", ()))
-        if known and len(known) != counts[vertex]:
+        row = frames.get((vertex,), _Row(0, (vertex,), (), f"vertex.{vertex}"))
+        if row.numbers and len(row.numbers) != counts[vertex]:
             raise SlamError(
-                f"{path}:{line}: {len(known)} qualities: expected {counts[vertex]}, one for each "
-                f"EDGE_SE2_XY from {vertex}"
+                f"{path}:{row.line}: {len(row.numbers)} qualities: expected {counts[vertex]}, one "
+                f"for each EDGE_SE2_XY from {vertex}"
             )
-        prefixes.append(prefix)
-        quality.extend(known or [np.nan] * counts[vertex])
+        prefixes.append(row.name)
+        quality.extend(row.numbers or [np.nan] * counts[vertex])
     return tuple(prefixes), np.array(quality, dtype=np.float64)
 
 

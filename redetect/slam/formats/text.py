@@ -17,7 +17,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -26,6 +25,7 @@ from numpy.typing import ArrayLike
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 from redetect.storage import write_whole
+from redetect.storage.bounded import read_bounded
 
 Axes = Literal["robotics", "dataset"]
 
@@ -42,20 +42,9 @@ _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
 def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
-    """Vectors, poses or steps in the data set's axes, brought into others.
+    """Vectors, poses or steps in the data set's axes, brought into others, or `back`.
 
-    Parameters
-    ----------
-    values : (..., 2) or (..., 3) array_like
-        x, y and, of poses and steps, the angle.
-    axes : str
-        The axes to bring them into.
-    back : bool
-        From those axes into the data set's instead.
-
-    Returns
-    -------
-    float64 of the same shape
+    Takes (..., 2) or (..., 3): x, y and, of poses and steps, the angle; returns the same shape.
     """
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
@@ -90,7 +79,6 @@ AXES_COMMENT = "# AXES"
 LARGEST_NUMBER = 2**31 - 1
 
 _LARGEST_FILE_BYTES = 1 << 28
-_LONGEST_ROW_BYTES = 1 << 20
 # Narrower than `float` and `int`, which also take nan, infinity and 1_000.
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 _WHOLE = re.compile(r"[0-9]{1,10}", re.ASCII)
@@ -105,24 +93,14 @@ def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: 
 
 def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
     """Rows of a text file with their line numbers, without blank ones; comments are among them."""
-    place = Path(path)
     try:
-        if place.stat().st_size > _LARGEST_FILE_BYTES:
-            raise SlamError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
-        with place.open("rb") as stream:
-            number = 0
-            while source := stream.readline(_LONGEST_ROW_BYTES + 1):
-                number += 1
-                if len(source) > _LONGEST_ROW_BYTES:
-                    raise SlamError(
-                        f"{place}:{number}: longer than {_LONGEST_ROW_BYTES} bytes: expected a "
-                        "row of text"
-                    )
-                text = source.decode("utf-8", "surrogateescape").strip()
-                if text:
-                    yield number, text
+        content = read_bounded(path, _LARGEST_FILE_BYTES)
     except OSError as error:
-        raise SlamError(f"{place}: cannot be read: {error.strerror or error}") from None
+        raise SlamError(f"{path}: cannot be read: {error.strerror or error}") from None
+    for number, source in enumerate(content.split(b"\n"), 1):
+        text = source.decode("utf-8", "surrogateescape").strip()
+        if text:
+            yield number, text
 
 
 def finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:

@@ -210,10 +210,10 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
     new_id = min(others, key=others.__getitem__, default=UNKNOWN_ID)
     kind: Kind = "exchange"
     mended = others.get(new_id, np.inf)
-    if mended > _limit(2 * len(rows)):
+    if mended > chi2.isf(_LEAST_PROBABILITY, 2 * len(rows)):
         kind, new_id = "split", int(max(circles.ids.max(), graph.disc_ids.max())) + 1
         mended = _misfit(recording, fit, rows, new_id, place)
-        if len(rows) == 1 or mended > _limit(2 * len(rows) - 2):
+        if len(rows) == 1 or mended > chi2.isf(_LEAST_PROBABILITY, 2 * len(rows) - 2):
             kind, new_id, mended = "drop", UNKNOWN_ID, np.nan
     own = int(np.searchsorted(graph.disc_ids, number))
     return Group(
@@ -227,8 +227,3 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
         chi_squared=_misfit(recording, fit, rows, number),
         mended_chi_squared=float(mended),
     )
-
-
-def _limit(numbers: int) -> float:
-    """Largest squared error of rows that a landmark explains."""
-    return float(chi2.isf(_LEAST_PROBABILITY, numbers))

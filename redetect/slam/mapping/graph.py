@@ -25,50 +25,26 @@ class Graph:
 
     A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 that after
     step k.
-
-    Attributes
-    ----------
-    steps : (N, 3) float64
-        Odometry (m, m, rad).
-    step_whitening : (N, 3, 3) float64
-    disc_ids : (M,) int64
-        Ascending.
-    disc_pose, disc_index : (n,) int64
-        From which pose each row saw which disc (index into `disc_ids`).
-    disc_xy : (n, 2) float64
-        Where, in the robot frame (m).
-    disc_whitening : (n, 2, 2) float64
-    line_ids : (K,) int64
-        Vertical lines, ascending.
-    line_pose : (q,) int64
-        From which pose each row saw its lines.
-    bearing_rad, bearing_sigma_rad : (q,) float64
-        The rows' bearings and their standard deviations.
-    member_row, member_line : (e,) int64
-        Which rows show which lines (index into `line_ids`); a row may show several.
-    camera_xy : (2,) float64
-        Where in the robot frame bearings are taken from (m).
-    camera : Camera or None
-        As calibrated; it is needed where the mounting or a tilt is estimated.
-    line_prior : (K, 2) float64 or None
-        Where lines are believed to be (m): it bounds those that bearings leave open.
     """
 
-    steps: FloatArray
-    step_whitening: FloatArray
-    disc_ids: IntArray
+    steps: FloatArray  # (N, 3): odometry (m, m, rad)
+    step_whitening: FloatArray  # (N, 3, 3)
+    disc_ids: IntArray  # (M,): ascending
+    # (n,): from which pose each row saw which disc, by its index in `disc_ids`.
     disc_pose: IntArray
     disc_index: IntArray
-    disc_xy: FloatArray
-    disc_whitening: FloatArray
-    line_ids: IntArray
-    line_pose: IntArray
-    bearing_rad: FloatArray
-    bearing_sigma_rad: FloatArray
+    disc_xy: FloatArray  # (n, 2): where, in the robot frame (m)
+    disc_whitening: FloatArray  # (n, 2, 2)
+    line_ids: IntArray  # (K,): of vertical lines, ascending
+    line_pose: IntArray  # (q,): from which pose each row saw its lines
+    bearing_rad: FloatArray  # (q,)
+    bearing_sigma_rad: FloatArray  # (q,)
+    # (e,): which rows show which lines, by their index in `line_ids`; a row may show several.
     member_row: IntArray
     member_line: IntArray
-    camera_xy: FloatArray
-    camera: Camera | None = None
+    camera_xy: FloatArray  # (2,): where in the robot frame bearings are taken from (m)
+    camera: Camera | None = None  # as calibrated; needed where the mounting or a tilt is estimated
+    # (K, 2): where lines are believed to be (m), which bounds those that bearings leave open.
     line_prior: FloatArray | None = None
 
     @property
@@ -84,43 +60,22 @@ class Graph:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A value for each unknown.
+    """A value for each unknown."""
 
-    Attributes
-    ----------
-    poses : (N + 1, 3) float64
-        x, y (m), theta (rad) in the map; the first is given, not estimated.
-    disc_xy : (M, 2) float64
-        Discs in the map (m).
-    line_xy : (K, 2) float64
-        Vertical lines in the map (m).
-    mounting : (3, 4) float64 or None
-        robot_from_camera as mounted; None: as calibrated, and discs are taken as the rows say.
-    tilt : (N + 1, 2) float64 or None
-        Pitch and roll per pose (rad): x and y of a rotation vector in the robot frame; None: the
-        robot is upright.
-    """
-
-    poses: FloatArray
-    disc_xy: FloatArray
-    line_xy: FloatArray
+    poses: FloatArray  # (N + 1, 3): x, y (m), theta (rad); the first is given, not estimated
+    disc_xy: FloatArray  # (M, 2): discs in the map (m)
+    line_xy: FloatArray  # (K, 2): vertical lines in the map (m)
+    # (3, 4): robot_from_camera as mounted; None: as calibrated, and discs are taken as rows say.
     mounting: FloatArray | None = None
+    # (N + 1, 2): pitch and roll per pose (rad), x and y of a rotation vector in the robot frame;
+    # None: the robot is upright.
     tilt: FloatArray | None = None
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
     """The problem that a run's odometry and discs pose; lines come in by `with_lines`.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run. Rows without an identifier are left out.
-    camera : Camera, optional
-        As calibrated.
-
-    Returns
-    -------
-    Graph
+    Rows without an identifier are left out.
     """
     circles = recording.circles
     known = circles.ids >= 0
@@ -166,18 +121,9 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
 
 
 def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
-    """Poses as odometry chains them, discs where they were first seen, no lines.
+    """Poses as odometry chains them from the first (3,), discs where they were first seen.
 
-    Parameters
-    ----------
-    graph : Graph
-        Its lines are not placed: `line_xy` is NaN.
-    start : (3,) array_like
-        The first pose.
-
-    Returns
-    -------
-    Estimate
+    Lines are not placed: `line_xy` is NaN.
     """
     poses = chain_steps(graph.steps, start)
     _, first = np.unique(graph.disc_index, return_index=True)
@@ -188,26 +134,13 @@ def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
     )
 
 
-#: Beyond these standard deviations a step gives no information about the robot's motion.
-MOST_STEP_SIGMA_M = 100.0
-MOST_STEP_SIGMA_RAD = float(np.pi)
 #: Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 FEWEST_SHARED = 2
 
 
-def lost_steps(step_covariance: FloatArray) -> IntArray:
-    """Steps whose odometry gives no information.
-
-    Takes `step_covariance` (N, 3, 3); returns (L,).
-    """
-    way = np.linalg.eigvalsh(step_covariance[:, :2, :2])[:, -1]
-    lost = (way > MOST_STEP_SIGMA_M**2) | (step_covariance[:, 2, 2] > MOST_STEP_SIGMA_RAD**2)
-    return np.flatnonzero(lost)
-
-
 def check_connected(recording: Recording, name: str) -> None:
     """See that landmarks join the parts between which odometry is lost."""
-    lost = lost_steps(recording.step_covariance)
+    lost = recording.lost
     if len(lost) == 0:
         return
     seen: list[set[tuple[str, int]]] = [set() for _ in range(len(lost) + 1)]

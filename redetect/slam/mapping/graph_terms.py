@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -44,92 +44,50 @@ _SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, belo
 
 @dataclass(frozen=True)
 class Weighting:
-    """The cost function and the unknowns.
+    """The cost function and the unknowns."""
 
-    Attributes
-    ----------
-    loss : str
-        How much a landmark row counts; odometry always counts in full.
-    loss_scale : float
-        Standard deviations from which on rows pull less.
-    calibrate : bool
-        Whether the camera's rotation and height are unknowns.
-    row_errors : "corrected" or "recorded"
-        Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
-        is put on the floor by the camera as mounted, under the row's own covariance. `recorded`:
-        the row that the calibrated camera would have written is compared with the one it wrote,
-        which is where that covariance belongs.
-    tilt_sigma_rad : float
-        Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
-        are compared as recorded.
-    """
-
-    loss: LossKind = "none"
-    loss_scale: Positive = 3.0
-    calibrate: bool = False
+    loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
+    loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
+    calibrate: bool = False  # whether the camera's rotation and height are unknowns
+    # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
+    # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
+    # row that the calibrated camera would have written is compared with the one it wrote, which is
+    # where that covariance belongs.
     row_errors: RowErrors = "corrected"
+    # Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
+    # are compared as recorded.
     tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Layout of the vector of unknowns: poses except the first, tilt, discs, lines."""
+class Layout(NamedTuple):
+    """Where in the vector of unknowns each kind begins: poses except the first are first."""
 
-    poses: int
-    discs: int
-    lines: int
-    tilted: bool
-
-    @property
-    def first_tilt(self) -> int:
-        return 3 * (self.poses - 1)
-
-    @property
-    def first_disc(self) -> int:
-        return self.first_tilt + (2 * (self.poses - 1) if self.tilted else 0)
-
-    @property
-    def first_line(self) -> int:
-        return self.first_disc + 2 * self.discs
-
-    @property
-    def size(self) -> int:
-        return self.first_line + 2 * self.lines
+    first_tilt: int
+    first_disc: int
+    first_line: int
+    size: int
 
 
 def layout_of(graph: Graph, weighting: Weighting) -> Layout:
     """Layout of a problem's unknowns."""
-    return Layout(
-        poses=len(graph.steps) + 1,
-        discs=len(graph.disc_ids),
-        lines=len(graph.line_ids),
-        tilted=weighting.tilt_sigma_rad > 0.0,
-    )
+    steps = len(graph.steps)
+    first_disc = (5 if weighting.tilt_sigma_rad > 0.0 else 3) * steps
+    first_line = first_disc + 2 * len(graph.disc_ids)
+    return Layout(3 * steps, first_disc, first_line, first_line + 2 * len(graph.line_ids))
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Whitened errors by kind, not robustified.
+    """Whitened errors by kind, not robustified."""
 
-    Attributes
-    ----------
-    odometry : (N, 3) float64
-    discs : (n, 2) float64
-        NaN where a disc would be out of the camera's sight.
-    lines : (q,) float64
-    tilt : (N, 2) or (0, 2) float64
-    prior : (K, 2) or (0, 2) float64
-        Lines less where they are believed to be.
-    """
-
-    odometry: FloatArray
-    discs: FloatArray
-    lines: FloatArray
-    tilt: FloatArray
-    prior: FloatArray
+    odometry: FloatArray  # (N, 3)
+    discs: FloatArray  # (n, 2): NaN where a disc would be out of the camera's sight
+    lines: FloatArray  # (q,)
+    tilt: FloatArray  # (N, 2) or (0, 2)
+    prior: FloatArray  # (K, 2) or (0, 2): lines less where they are believed to be
 
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
@@ -176,7 +134,8 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     by_pose, by_tilt, by_disc, by_mounting = _disc_derivatives(graph, estimate, weighting)
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
-    if layout.tilted:
+    tilted, lines = weighting.tilt_sigma_rad > 0.0, len(graph.line_ids)
+    if tilted:
         seen.append((layout.first_tilt + 2 * (graph.disc_pose - 1), by_tilt))
     whiten = graph.step_whitening
     blocks = [
@@ -184,13 +143,13 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
         Block(error.discs, seen, by_mounting if weighting.calibrate else None, loss),
         *_line_blocks(graph, estimate, weighting, error.lines, loss),
     ]
-    if layout.tilted:
+    if tilted:
         every = np.arange(error.tilt.size, dtype=np.int64)
         level = np.full((len(every), 1, 1), 1.0 / weighting.tilt_sigma_rad)
         blocks.append(Block(error.tilt.reshape(-1, 1), [(layout.first_tilt + every, level)]))
     if len(error.prior):
-        of_line = layout.first_line + 2 * np.arange(layout.lines, dtype=np.int64)
-        near = np.tile(np.eye(2) / LINE_PRIOR_M, (layout.lines, 1, 1))
+        of_line = layout.first_line + 2 * np.arange(lines, dtype=np.int64)
+        near = np.tile(np.eye(2) / LINE_PRIOR_M, (lines, 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
     return stack(blocks, layout.size, MOUNTING_UNKNOWNS if weighting.calibrate else 0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.plane import apply
@@ -20,6 +21,8 @@ MOST_MEDIAN_MISS = 10.0
 MOST_SIGMA_M = 0.5
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
+# Information below which rays are as good as parallel (m^-2).
+_PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,35 +50,30 @@ def place_lines(
     Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
-    views: dict[int, list[int]] = {}
-    for k, ids in enumerate(rows.ids):
-        if len(ids) == 1:
-            views.setdefault(ids[0], []).append(k)
-    every = sorted({i for ids in rows.ids for i in ids})
-    placed: list[tuple[int, FloatArray]] = []
-    for number in every:
-        seen = np.array(views.get(number, []), dtype=np.int64)
-        if len(seen) < 2:
-            continue
-        pose = rows.frame[seen] + 1
-        near = way[pose] - way[pose[0]] <= _LOCAL_PATH_M
-        for some in (near, np.ones(len(seen), dtype=bool)):
-            xy = triangulate(
-                poses[pose[some]],
-                rows.bearing_rad[seen[some]],
-                rows.sigma_rad[seen[some]],
-                camera_xy,
-                least_parallax_rad,
-            )
-            if xy is not None:
-                placed.append((number, xy))
-                break
-    found = np.array([number for number, _ in placed], dtype=np.int64)
-    return InitialLines(
-        ids=found,
-        xy=np.array([xy for _, xy in placed], dtype=np.float64).reshape(-1, 2),
-        unplaced=np.setdiff1d(np.array(every, dtype=np.int64), found),
-    )
+    every = np.array(sorted({i for ids in rows.ids for i in ids}), dtype=np.int64)
+    seen = np.flatnonzero([len(ids) == 1 for ids in rows.ids])
+    label = np.searchsorted(every, [rows.ids[k][0] for k in seen])
+    pose = rows.frame[seen] + 1
+    _, first, view = np.unique(label, return_index=True, return_inverse=True)
+    near = way[pose] - way[pose[first[view]]] <= _LOCAL_PATH_M
+    xy = np.full((len(every), 2), np.nan)
+    for some in (near, np.ones(len(seen), dtype=bool)):
+        use = some & np.isnan(xy[label, 0])
+        found, ahead, miss = meeting_points(
+            *(poses[pose[use]], rows.bearing_rad[seen[use]], rows.sigma_rad[seen[use]]),
+            *(label[use], len(every), camera_xy),
+        )
+        course = (poses[pose, 2] + rows.bearing_rad[seen])[use]
+        for k in np.unique(label[use]):
+            own = label[use] == k
+            if (
+                _widest_crossing(course[own]) >= least_parallax_rad
+                and np.mean(ahead[own] > 0.0) > 0.5
+                and np.median(miss[own]) <= MOST_MEDIAN_MISS
+            ):
+                xy[k] = found[k]
+    placed = np.isfinite(xy[:, 0])
+    return InitialLines(every[placed], xy[placed], every[~placed])
 
 
 def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
@@ -97,36 +95,42 @@ def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
     return np.asarray(certain & (share > 0.5))
 
 
-def triangulate(
+def meeting_points(
     poses: FloatArray,
     bearing_rad: FloatArray,
     sigma_rad: FloatArray,
-    camera_xy: FloatArray,
-    least_parallax_rad: float,
-) -> FloatArray | None:
-    """The place nearest to rays.
+    labels: IntArray,
+    count: int,
+    camera_xy: ArrayLike,
+    least_information: float = _PARALLEL,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The places nearest to the rays of each line, a ray's miss counted as an angle.
 
-    Takes `poses` (n, 3), `bearing_rad, sigma_rad` (n,), `camera_xy` (2,); returns (2,).
+    Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). Returns places
+    (count, 2), NaN where the information (m^-2) is less in some direction; of each ray how far
+    along it its place is (n,) (m), and by how many standard deviations it misses it (n,).
     """
-    start = apply(poses, camera_xy)
-    # Bearing b in the robot frame is the direction (sin b, -cos b).
-    course = poses[:, 2] + bearing_rad
-    ray = np.stack([np.sin(course), -np.cos(course)], axis=1)
-    normal = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
-    if _widest_crossing(course) < least_parallax_rad:
-        return None
-    # Nearest point to all rays, then again with each ray's miss counted as an angle.
-    distance = np.ones(len(ray))
-    for _ in range(3):
-        weight = 1.0 / (sigma_rad * distance)
-        rows = normal * weight[:, None]
-        xy, *_ = np.linalg.lstsq(rows, np.sum(rows * start, axis=1), rcond=None)
-        distance = np.maximum(np.linalg.norm(xy - start, axis=1), 0.1)
-    ahead = np.sum((xy - start) * ray, axis=1) > 0.0
-    miss = np.abs(np.sum((xy - start) * normal, axis=1)) / (sigma_rad * distance)
-    if np.mean(ahead) <= 0.5 or np.median(miss) > MOST_MEDIAN_MISS:
-        return None
-    return np.asarray(xy)
+    centre = apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2)))
+    angle = (
+        bearing_rad + poses[:, 2]
+    )  # bearing b in the robot frame is the direction (sin b, -cos b)
+    along = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    offset = np.sum(normal * centre, axis=1)
+    distance = np.full(len(poses), 3.0)
+    for _ in range(4):  # the farther a line, the less its bearing says
+        weight = 1.0 / (sigma_rad * np.maximum(distance, 0.3)) ** 2
+        information = np.zeros((count, 2, 2))
+        np.add.at(information, labels, weight[:, None, None] * normal[:, :, None] * normal[:, None])
+        vector = np.zeros((count, 2))
+        np.add.at(vector, labels, (weight * offset)[:, None] * normal)
+        certain = np.linalg.eigvalsh(information)[:, 0] > least_information
+        places = np.full((count, 2), np.nan)
+        places[certain] = np.linalg.solve(information[certain], vector[certain][..., None])[..., 0]
+        ahead = np.sum(along * (places[labels] - centre), axis=1)
+        distance = np.where(np.isfinite(ahead), np.abs(ahead), distance)
+    miss = np.abs(np.sum((places[labels] - centre) * normal, axis=1)) * np.sqrt(weight)
+    return places, ahead, miss
 
 
 def _widest_crossing(course_rad: FloatArray) -> float:

@@ -17,8 +17,10 @@ from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.least_squares.solver import LossKind
+from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import (
+    FEWEST_SHARED,
     Estimate,
     Graph,
     check_connected,
@@ -56,7 +58,9 @@ class ChiSquared:
     root: float  # its root: the standard deviations' factor
 
 
-def chi_squared(graph: Graph, estimate: Estimate, weighting: Weighting) -> ChiSquared:
+def chi_squared(
+    graph: Graph, estimate: Estimate, weighting: Weighting, lost_steps: int = 0
+) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
     parts = [
@@ -69,7 +73,8 @@ def chi_squared(graph: Graph, estimate: Estimate, weighting: Weighting) -> ChiSq
     unknown = 3 * poses + 2 * landmarks + error.tilt.size
     if weighting.calibrate:
         unknown += MOUNTING_UNKNOWNS
-    expected = measured - unknown
+    # What a lost step says is as good as nothing.
+    expected = measured - unknown - 3 * lost_steps
     factor = sum(parts) / expected if expected > 0 else math.nan
     return ChiSquared(
         poses=poses,
@@ -143,31 +148,16 @@ class Mounting:
 
 @dataclass(frozen=True, eq=False)
 class MappedRun:
-    """A least-squares map and how it came about.
-
-    Attributes
-    ----------
-    graph : Graph
-    start, estimate : Estimate
-        Odometry and first sight; the minimum. Lines are placed in the second only.
-    covariance : Marginals
-    table : ChiSquared
-    left_out : LeftOut
-    cost : float
-        What was minimised: chi-squared, or less under a robust loss.
-    steps : int
-        Of all descents together.
-    mounting : Mounting or None
-    """
+    """A least-squares map and how it came about."""
 
     graph: Graph
-    start: Estimate
-    estimate: Estimate
+    start: Estimate  # odometry and first sight, without lines
+    estimate: Estimate  # the minimum
     covariance: Marginals
     table: ChiSquared
     left_out: LeftOut
-    cost: float
-    steps: int
+    cost: float  # what was minimised: chi-squared, or less under a robust loss
+    steps: int  # of all descents together
     mounting: Mounting | None
 
 
@@ -216,6 +206,8 @@ def map_run(
     graph = graph_of_recording(recording, camera)
     begin = first_sight(graph, start)
     plain = Weighting()
+    if len(recording.lost):
+        begin = _with_parts_in_place(recording, graph, begin)
     descend = _descent(solver, wanted.loss)
     trail: list[Solution] = []
 
@@ -256,12 +248,42 @@ def map_run(
         start=begin,
         estimate=estimate,
         covariance=covariance,
-        table=chi_squared(graph, estimate, wanted),
+        table=chi_squared(graph, estimate, wanted, len(recording.lost)),
         left_out=_left_out(recording, graph, placed),
         cost=trail[-1].cost,
         steps=sum(len(solution.costs) - 1 for solution in trail),
         mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].cost),
     )
+
+
+def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) -> Estimate:
+    """A start at which parts between which odometry is lost lie on each other, by their discs.
+
+    Each part is mapped by itself. The first stays; next is always the part that has most discs in
+    common with those that lie.
+    """
+    lost, discs = recording.lost, len(graph.disc_ids)
+    part = np.searchsorted(lost, graph.disc_pose - 1, side="right")
+    own, index = np.unique(part * discs + graph.disc_index, return_inverse=True)
+    alone = replace(graph, disc_ids=own, disc_index=index)
+    begun = first_sight(alone, begin.poses[0])
+    found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).estimate
+    places = np.full((len(lost) + 1, discs, 2), np.nan)
+    places[own // discs, own % discs] = found.disc_xy
+    poses, xy = found.poses, places[0]
+    waiting = set(range(1, len(places)))
+    while waiting:
+        shared = {k: np.isfinite(xy + places[k])[:, 0] for k in waiting}
+        k = max(waiting, key=lambda k: np.count_nonzero(shared[k]))
+        if np.count_nonzero(shared[k]) < FEWEST_SHARED:  # it is verticals that join it
+            break
+        waiting.remove(k)
+        motion = fitted(places[k, shared[k]], xy[shared[k]])
+        here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
+        poses[here, :2] = apply(motion, poses[here, :2])
+        poses[here, 2] += motion[2]
+        xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
+    return replace(begin, poses=poses, disc_xy=np.where(np.isfinite(xy), xy, begin.disc_xy))
 
 
 def landmark_map(graph: Graph, estimate: Estimate, covariance: Marginals | None) -> LandmarkMap:

@@ -95,28 +95,9 @@ def solve(
 ) -> Solution:
     """Minimise the sum of squared (or robust) whitened errors.
 
-    Parameters
-    ----------
-    graph : Graph
-        The measurements.
-    start : Estimate
-        Where to begin. Odometry and first sight do for thousands of poses.
-    weighting : Weighting
-        The cost function and the unknowns.
-    tolerance : float
-        Stop at a step that lowers the cost by less than this share of it.
-    most_steps : int
-        Largest number of steps before giving up.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    SlamError
-        If the start is not finite, the steps run out, or the measurements do not determine the
-        unknowns.
+    As a start, odometry and first sight do for thousands of poses. The descent ends at a step that
+    lowers the cost by less than `tolerance`, a share of it. Raises `SlamError` if the start is not
+    finite, the steps run out, or the measurements do not determine the unknowns.
     """
     estimate = _with_unknowns(graph, start, weighting)
     problem = _MapProblem(graph, weighting)
@@ -176,26 +157,9 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
 
 
 def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
-    """Joint covariance of all landmarks at a least-squares solution.
+    """Joint covariance of all landmarks at a minimum of `solve`, as `marginals` has their own.
 
-    Parameters
-    ----------
-    graph : Graph
-        The measurements.
-    estimate : Estimate
-        Where their sum of squares is least.
-    weighting : Weighting
-        As it was minimised.
-
-    Returns
-    -------
-    (2 M, 2 M) float64
-        Discs, then lines (m^2).
-
-    Raises
-    ------
-    SlamError
-        If the measurements do not determine the unknowns.
+    Returns (2 M, 2 M): discs, then lines (m^2).
     """
     layout = layout_of(graph, weighting)
     landmarks = np.arange(layout.first_disc, layout.size)
@@ -214,7 +178,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
         disc_xy=estimate.disc_xy + discs.reshape(-1, 2),
         line_xy=estimate.line_xy + lines.reshape(-1, 2),
     )
-    if layout.tilted and estimate.tilt is not None:
+    if tilt.size and estimate.tilt is not None:
         turned = np.concatenate([np.zeros((1, 2)), tilt.reshape(-1, 2)])
         after = replace(after, tilt=estimate.tilt + turned)
     if mounting.size and estimate.mounting is not None:

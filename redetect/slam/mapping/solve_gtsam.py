@@ -63,13 +63,7 @@ def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Solution
 
 
 def load_gtsam() -> Any:
-    """GTSAM.
-
-    Raises
-    ------
-    SlamError
-        If it is not installed.
-    """
+    """GTSAM; `SlamError` if it is not installed."""
     try:
         import gtsam
     except ImportError:
@@ -78,18 +72,9 @@ def load_gtsam() -> Any:
 
 
 def gtsam_problem(graph: Graph, start: Estimate, weighting: Weighting) -> tuple[Any, Any]:
-    """GTSAM's graph and initial values.
+    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`.
 
     Pose k has key k, disc j key N + 1 + j, line j the keys after those.
-
-    Parameters
-    ----------
-    graph, start, weighting
-        As for `solve_gtsam`.
-
-    Returns
-    -------
-    gtsam.NonlinearFactorGraph, gtsam.Values
     """
     gtsam = load_gtsam()
     noise = gtsam.noiseModel
