@@ -16,7 +16,7 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
 from redetect.slam.filters.frames import FilterRun, run_filter
 from redetect.slam.filters.localizer import Localizer, MapErrors
-from tests.slam.ekf_rows import NOTHING
+from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 pytestmark = pytest.mark.long
@@ -24,6 +24,7 @@ pytestmark = pytest.mark.long
 RUNS = 50
 #: Enough for what is far outside the band.
 FEW_RUNS = 20
+NO_LINES = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
 
 Estimate = Callable[[SmallRun, int], FilterRun]
 
@@ -66,7 +67,7 @@ def mean_nees(
     for seed in range(runs):
         run = _run(seed, noise, turn)
         if not lines:
-            run = replace(run, recording=replace(run.recording, lines=NOTHING))
+            run = replace(run, recording=replace(run.recording, lines=NO_LINES))
         path = estimate(run, seed).path
         assert path.covariance is not None
         error = path.poses[1:] - run.poses[1:]
