@@ -24,7 +24,7 @@ pytestmark = pytest.mark.long
 RUNS = 50
 #: Enough for what is far outside the band.
 FEW_RUNS = 20
-NO_LINES = LineRows(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+NO_LINES = LineRows.of()
 
 Estimate = Callable[[SmallRun, int], FilterRun]
 
