@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
+import math
 import os
-from collections.abc import Mapping
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -13,11 +19,13 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded
-from redetect.storage.messages import excerpt
+from redetect.storage.bounds import FINITE, Bounds
+from redetect.storage.messages import excerpt, one_line
 
 _LARGEST_FILE_BYTES = 1 << 26
 _LARGEST_NUMBER = 1e100
 _ROUNDING = 1e-6
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -42,20 +50,121 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     return content
 
 
+class JsonObject:
+    """An object of a JSON file, whose values are read by their names.
+
+    What is missing or wrong raises a `GroundTruthError` that says where, what is there and what was
+    expected.
+    """
+
+    def __init__(self, place: str, value: Any) -> None:
+        if not isinstance(value, dict):
+            raise GroundTruthError(f"{place}: expected an object")
+        self.place, self.values = place, value
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> JsonObject:
+        """The object that a file holds."""
+        return cls(os.fspath(path), read_json(path))
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def wrong(self, key: str, expected: str) -> GroundTruthError:
+        """The error of a value that is not as expected."""
+        found = excerpt(self.values.get(key))
+        return GroundTruthError(f"{self.place}: {key} is {found}: expected {expected}")
+
+    def demand_version(self) -> None:
+        """Refuse files of another version than 1."""
+        if self.values.get("version") != 1:
+            raise self.wrong("version", "1")
+
+    def text(self, key: str, expected: str = "a text") -> str:
+        """A text that is not empty."""
+        value = self.values.get(key)
+        if not isinstance(value, str) or not value:
+            raise self.wrong(key, expected)
+        return value
+
+    def number(self, key: str, bounds: Bounds = FINITE) -> float:
+        """A number within bounds."""
+        value = self.values.get(key)
+        if not is_number(value) or not bounds.hold(value):
+            raise self.wrong(key, bounds.expected)
+        return float(value)
+
+    def whole(self, key: str) -> int:
+        """A whole number."""
+        value = self.values.get(key)
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise self.wrong(key, "a whole number")
+        return value
+
+    def numbers(self, key: str, *shape: int | None) -> FloatArray:
+        """Nested lists of numbers as an array; None: any length."""
+        value = self.values.get(key)
+        if not _has_shape(value, shape):
+            expected = " x ".join("rows" if size is None else str(size) for size in shape)
+            raise self.wrong(key, f"{expected} finite numbers")
+        return np.array(value, dtype=np.float64)
+
+    def inner(self, key: str) -> JsonObject:
+        """An object."""
+        return JsonObject(f"{self.place}: {key}", self.values.get(key))
+
+    def rows(self, key: str) -> list[JsonObject]:
+        """A list of objects that is not empty."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or not value or not all(isinstance(v, dict) for v in value):
+            raise self.wrong(key, "a list of objects")
+        return [JsonObject(f"{self.place}: {key}[{i}]", row) for i, row in enumerate(value)]
+
+    def objects(self, key: str) -> dict[str, JsonObject]:
+        """Objects by their names, at least one."""
+        value = self.values.get(key)
+        if not isinstance(value, dict) or not value:
+            raise GroundTruthError(
+                f"{self.place}: {key}: expected an object with at least one entry"
+            )
+        kind = f"{self.place}: {key.removesuffix('s')}"
+        return {name: JsonObject(f"{kind} {one_line(name, 60)}", v) for name, v in value.items()}
+
+    def covariance(self, key: str, size: int) -> FloatArray:
+        """A covariance (size, size)."""
+        place = f"{self.place}: {key}"
+        matrix = self.numbers(key, size, size)
+        scale = np.sqrt(np.clip(np.diagonal(matrix), 0.0, None))
+        safe = np.where(scale > 0.0, scale, 1.0)
+        correlation = matrix / safe[:, None] / safe[None, :]
+        if np.abs(correlation - correlation.T).max() > _ROUNDING:
+            raise GroundTruthError(f"{place}: expected a symmetric matrix")
+        if np.linalg.eigvalsh(correlation)[0] < -_ROUNDING:
+            raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
+        return np.asarray(0.5 * (matrix + matrix.T))
+
+    def uncertainty(self, size: int, sigmas: str = "sigmas") -> FloatArray:
+        """(size, size) covariance by `covariance` or standard deviations; else zeros.
+
+        The latter are named by `sigmas`; both are in the order of the covariance's rows.
+        """
+        if "covariance" in self and sigmas in self:
+            raise GroundTruthError(
+                f"{self.place}: has covariance and {sigmas}: expected one of them"
+            )
+        if "covariance" in self:
+            return self.covariance("covariance", size)
+        values = self.numbers(sigmas, size) if sigmas in self else np.zeros(size)
+        if np.any(values < 0.0):
+            raise GroundTruthError(f"{self.place}: {sigmas}: expected 0 or more")
+        return np.diag(values**2)
+
+
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value from JSON is a number that can be worked with."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     return abs(value) <= _LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
-
-
-def numbers(place: str, value: Any, *shape: int | None) -> FloatArray:
-    """Numbers, or nested lists of them, as an array; None: any length."""
-    if not _has_shape(value, shape):
-        expected = " x ".join("rows" if size is None else str(size) for size in shape)
-        what = f"{expected} finite numbers" if shape else "a finite number"
-        raise GroundTruthError(f"{place} is {excerpt(value)}: expected {what}")
-    return np.array(value, dtype=np.float64)
 
 
 def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
@@ -66,42 +175,13 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
     return all(_has_shape(part, shape[1:]) for part in value)
 
 
-def covariance_of(place: str, value: Any, size: int) -> FloatArray:
-    """A covariance (size, size) from JSON."""
-    matrix = numbers(place, value, size, size)
-    scale = np.sqrt(np.clip(np.diagonal(matrix), 0.0, None))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    correlation = matrix / safe[:, None] / safe[None, :]
-    if np.abs(correlation - correlation.T).max() > _ROUNDING:
-        raise GroundTruthError(f"{place}: expected a symmetric matrix")
-    if np.linalg.eigvalsh(correlation)[0] < -_ROUNDING:
-        raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
-    return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def covariance_entry(
-    place: str, entry: Mapping[str, Any], size: int, sigmas: str = "sigmas"
-) -> FloatArray:
-    """(size, size) covariance of an object with ``covariance`` or standard deviations; else zeros.
-
-    The latter are named by `sigmas`; both are in the order of the covariance's rows.
-    """
-    if "covariance" in entry and sigmas in entry:
-        raise GroundTruthError(f"{place}: has covariance and {sigmas}: expected one of them")
-    if sigmas in entry:
-        values = numbers(f"{place}: {sigmas}", entry[sigmas], size)
-        if np.any(values < 0.0):
-            raise GroundTruthError(f"{place}: {sigmas}: expected 0 or more")
-        return np.diag(values**2)
-    if "covariance" in entry:
-        return covariance_of(f"{place}: covariance", entry["covariance"], size)
-    return np.zeros((size, size))
-
-
 def write_json(
     path: str | os.PathLike[str], content: Mapping[str, Any], *, overwrite: bool = False
 ) -> None:
-    """Write a JSON object with a line per entry of its objects, whole or not at all."""
+    """Write a JSON object with a line per entry of its objects, whole or not at all.
+
+    Numbers that are not finite, which JSON does not have, are null.
+    """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write((_laid_out(content) + "\n").encode())
 
@@ -114,20 +194,51 @@ def _laid_out(value: Any, indent: str = "") -> str:
         return "{\n" + ",\n".join(items) + f"\n{indent}}}"
     if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple | Mapping):
         return "[\n" + ",\n".join(deeper + _laid_out(v, deeper) for v in value) + f"\n{indent}]"
-    return json.dumps(value, allow_nan=False)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_laid_out, value))}]"
+    finite = not isinstance(value, float) or math.isfinite(value)
+    return json.dumps(value if finite else None, allow_nan=False)
 
 
 def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
-    """The text of a file (UTF-8, perhaps with a byte order mark).
+    """The text of a file (UTF-8, perhaps with a byte order mark), packed (``.gz``) or not.
 
     `largest_bytes`: a larger file is refused. `expected`: what should be in it, for the message
     about a file that is no text.
     """
     try:
-        return read_bounded(path, largest_bytes).decode("utf-8-sig")
+        content = read_bounded(path, largest_bytes)
+        if Path(path).suffix == ".gz":
+            # Never more than is wanted, however well it is packed.
+            content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(largest_bytes + 1)
+            if len(content) > largest_bytes:
+                raise StreamError(path, None, f"unpacked, it has more than {largest_bytes} bytes")
+        return content.decode("utf-8-sig")
     except FileNotFoundError:
         raise StreamError(path, None, "no such file") from None
+    except (gzip.BadGzipFile, EOFError, zlib.error):
+        raise StreamError(path, None, "is no complete gzip file") from None
     except UnicodeDecodeError:
         raise StreamError(path, None, f"is no text: expected {expected}") from None
     except OSError as error:
         raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+
+
+def read_rows(
+    path: str | os.PathLike[str], largest_bytes: int = 1 << 28
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield line numbers and words between commas or blanks, without comments and blank lines."""
+    text = read_text(path, largest_bytes, "rows of numbers")
+    for number, line in enumerate(text.split("\n"), 1):
+        content = line.partition("#")[0].strip()
+        if content:
+            yield number, re.split(r"\s*,\s*|\s+", content)
+
+
+def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[float]:
+    """The finite numbers that the words of a row are."""
+    values = [float(word) if _NUMBER.fullmatch(word) else math.nan for word in words]
+    for word, value in zip(words, values):
+        if not math.isfinite(value):
+            raise StreamError(path, line, f"{excerpt(word)}: expected a finite number")
+    return values

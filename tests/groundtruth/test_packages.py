@@ -17,7 +17,7 @@ BELOW = {
         "trajectories", "markers", "lasers", "fusion", "clocks", "validation", "report",
     },
 }  # fmt: skip
-FOR_ALL = {"errors", "files"}
+FOR_ALL = {"errors", "files", "settings"}
 
 
 def imported(module: Path) -> set[str]:

@@ -15,11 +15,11 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,14 +27,11 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import read_json
+from redetect.groundtruth.files import JsonObject
 from redetect.storage.bounded import read_bounded
+from redetect.storage.bounds import NOT_NEGATIVE, from_to, inside
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
-
-_MOST_SEGMENTS = 100_000
-_LARGEST_RATE_ERROR = 0.5
-_LARGEST_NUMBER = 1e15
 
 
 @dataclass(frozen=True)
@@ -59,6 +56,10 @@ class ClockSegment:
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
+    # `own_offset_s`, `own_sigma_s`: Offset and standard deviation by the segment alone, where one
+    # line through all segments replaced them
+    own_offset_s: float | None = None
+    own_sigma_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -115,17 +116,6 @@ def _extended(
     return np.asarray(np.interp(at, knots, values) + beyond)
 
 
-def clock_document(segments: Sequence[ClockSegment]) -> list[dict[str, Any]]:
-    """Segments as written in a clock file: infinite deviations are null."""
-    return [
-        {
-            name: None if isinstance(value, float) and math.isinf(value) else value
-            for name, value in asdict(segment).items()
-        }
-        for segment in segments
-    ]
-
-
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
 
@@ -134,43 +124,36 @@ def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     GroundTruthError
         If the file cannot be read or a value is missing or impossible; the message names it.
     """
-    place = Path(path)
-    rows = read_json(place).get("segments")
-    if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SEGMENTS:
-        raise GroundTruthError(f"{place}: no list of segments: expected what `sync` writes")
-    segments = tuple(_segment(place, k, row) for k, row in enumerate(rows, 1))
-    for k, (before, after) in enumerate(pairwise(segments), 2):
+    rows = JsonObject.read(path).rows("segments")
+    segments = tuple(map(_segment, rows))
+    for row, (before, after) in zip(rows[1:], pairwise(segments)):
         if after.from_s < before.to_s:
-            raise GroundTruthError(f"{place}: segment {k} begins before segment {k - 1} ends")
+            raise GroundTruthError(f"{row.place}: begins before the one before it ends")
     return ClockModel(segments)
 
 
-def _segment(place: Path, number: int, row: Any) -> ClockSegment:
-    if not isinstance(row, dict):
-        raise GroundTruthError(f"{place}: segment {number} is no object")
-    values: dict[str, float] = {}
-    names = [name for name in ClockSegment.__dataclass_fields__ if name not in ("status", "note")]
-    for name in names:
-        value = row.get(name)
-        if value is None and name.startswith("sigma_"):
-            value = math.inf
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise GroundTruthError(f"{place}: segment {number}: {name} is not a number")
-        endless = value == math.inf and name.startswith("sigma_")
-        # NaN fails this; a whole number may fit no double.
-        if not (endless or abs(value) <= _LARGEST_NUMBER):
-            raise GroundTruthError(f"{place}: segment {number}: {name} is not finite")
-        values[name] = float(value)
-    if not abs(values["rate"] - 1.0) < _LARGEST_RATE_ERROR:
-        raise GroundTruthError(
-            f"{place}: segment {number}: rate is {values['rate']:g}: expected nearly 1"
-        )
+#: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.
+_RATE, _SECONDS, _SIGMA = inside(0.5, 1.5), from_to(-1e15, 1e15), NOT_NEGATIVE
+
+
+def _segment(row: JsonObject) -> ClockSegment:
+    values: dict[str, Any] = {}
+    for name in ClockSegment.__dataclass_fields__:
+        if name.startswith("own_"):
+            if row.values.get(name) is not None:
+                values[name] = row.number(name)
+        elif name.startswith("sigma_"):
+            # Infinite where the segment does not determine it, which JSON cannot say.
+            known = row.values.get(name) not in (None, math.inf)
+            values[name] = row.number(name, _SIGMA) if known else math.inf
+        elif name not in ("status", "note"):
+            values[name] = row.number(name, _RATE if name == "rate" else _SECONDS)
     if values["to_s"] < values["from_s"]:
-        raise GroundTruthError(f"{place}: segment {number}: it ends before it begins")
-    status = row.get("status")
-    if status not in ("ok", "no turns", "jump", "at a bound"):
-        raise GroundTruthError(f"{place}: segment {number}: its status is unknown")
-    note = row.get("note", "")
+        raise row.wrong("to_s", "it not to end before it begins")
+    status: Any = row.text("status")
+    if status not in get_args(Status):
+        raise row.wrong("status", f"one of {', '.join(get_args(Status))}")
+    note = row.values.get("note", "")
     return ClockSegment(**values, status=status, note=note if isinstance(note, str) else "")
 
 
@@ -216,6 +199,8 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
                 sigma_offset_s=math.sqrt(at @ covariance @ at),
                 sigma_rate=math.sqrt(covariance[1, 1]),
                 note=note,
+                own_offset_s=segment.offset_s,
+                own_sigma_s=segment.sigma_offset_s,
             )
         result.append(segment)
     return result

@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
 from scipy.optimize import Bounds, direct, minimize
@@ -43,12 +42,12 @@ from redetect.groundtruth.clocks.headings import (
     without_turns,
 )
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import likeliest_noise, noise_of
-from redetect.groundtruth.fusion.inputs import FuseSettings
+from redetect.groundtruth.fusion.fuse import likeliest_noise
+from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
-from redetect.storage.bounds import Positive, demand_fields, inside
 
 _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
@@ -64,21 +63,6 @@ _FEWEST_SAMPLES = 20
 _SIMPLEX_SIZE = 0.02
 # Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
 _MUCH_LESS_CERTAIN = 4.0
-
-
-@dataclass(frozen=True)
-class SyncSettings:
-    """Bounds of the search."""
-
-    largest_offset_s: Positive = 1.0  # Of the time offset, either way (s)
-    # The clocks' rates differ by at most this share
-    largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
-    segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s)
-    # Refine the estimate by headings with the whole movement if the ground truth has covariances
-    use_movement: bool = True
-
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
 
 
 def synchronise(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.commands.options import Fuse
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, leave_out
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.fuse import fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
@@ -23,20 +24,12 @@ from redetect.groundtruth.trajectories.streams import (
 def perform(options: Fuse) -> int:
     """Carry out ``groundtruth fuse``; returns the exit code."""
     account = options.output.with_suffix(".json")
-    check_outputs([options.output, account], options.force)
+    check_outputs([options.output, account, options.filtered], options.force)
     named = {"laser": options.laser, "camera": options.camera}
     files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
     if not files:
         raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
-    settings = FuseSettings(
-        distance_sigma=options.distance_sigma,
-        lateral_sigma=options.lateral_sigma,
-        turn_sigma=options.turn_sigma,
-        turn_per_metre_sigma=options.turn_per_metre_sigma,
-        learn_noise=options.learn_noise,
-        gate_probability=options.gate_probability,
-        covariance_scale=dict(zip(named, options.covariance_scale)),
-    )
+    settings, scales = options.settings, dict(zip(named, options.covariance_scale))
     odometry = read_planar_poses(options.odometry)
     if options.clock is not None:
         times = read_clock(options.clock).groundtruth_times(odometry.times_s)
@@ -47,11 +40,12 @@ def perform(options: Fuse) -> int:
             raise GroundTruthError(
                 f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
             )
+        streams[name] = replace(stream, covariances=scales[name] * stream.covariances)
     fusion = fuse(odometry, streams, settings)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     document = {
         **provenance(
-            settings,
+            {**asdict(settings), "covariance_scale": scales},
             [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
         ),
         "used": fusion.used,
@@ -65,7 +59,9 @@ def perform(options: Fuse) -> int:
         "rejected": [asdict(rejected) for rejected in fusion.rejected],
     }
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
-    write_account(account, document, overwrite=options.force)
+    if options.filtered is not None:
+        write_planar_poses(options.filtered, fusion.filtered, overwrite=options.force)
+    write_json(account, document, overwrite=options.force)
     assert fusion.poses.covariances is not None
     sigma = 1e3 * np.sqrt(
         np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))

@@ -10,8 +10,8 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
-from redetect.groundtruth.lasers.acquisition import LaserSettings
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
@@ -36,7 +36,6 @@ _DISTURBED = 3
 
 def perform(options: Laser) -> int:
     """Carry the command out; returns the exit code: 1 without a single pose."""
-    settings = LaserSettings(gate_m=options.gate_m, kept=options.keep)
     output = options.output or options.session / "laser.csv"
     account, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
     check_outputs([output, account, summary], options.force)
@@ -44,7 +43,7 @@ def perform(options: Laser) -> int:
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
     scanners, robot, tables, sets = load_session(options.session, calibration)
-    track, left_out = track_without_suspects(sets, tables, robot, scanners, settings)
+    track, left_out = track_without_suspects(sets, tables, robot, scanners, options.settings)
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
@@ -52,8 +51,8 @@ def perform(options: Laser) -> int:
         stream.write(("\n".join(account_lines(track)) + "\n").encode())
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
-    content = {**provenance(settings, files), "sets_per_pose": options.average, **described}
-    write_account(summary, content, overwrite=options.force)
+    content = {**provenance(options.settings, files), "sets_per_pose": options.average, **described}
+    write_json(summary, content, overwrite=options.force)
 
     expected = int(np.sum(track.status != LOST))
     determined = int(np.isin(track.status, (OK, REACQUIRED)).sum())

@@ -9,7 +9,7 @@ import numpy as np
 
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
-from redetect.groundtruth.lasers.alignment import AlignmentSettings, align_scanners, still_scan
+from redetect.groundtruth.lasers.alignment import align_scanners, icp_by_step, still_scan
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import (
     Scanner,
@@ -24,6 +24,8 @@ from redetect.storage import write_whole
 
 #: Scanners this many standard deviations from their measured pose are reported.
 _FAR_OFF_SIGMA = 5.0
+#: Steps of the ICP that the picture shows.
+_ICP_STEPS = 30
 
 
 def perform(options: Lasers) -> int:
@@ -32,13 +34,12 @@ def perform(options: Lasers) -> int:
     output = options.output or session / "aligned.json"
     picture = options.picture or output.with_suffix(".png")
     check_outputs([output, picture], options.force)
-    settings = AlignmentSettings(gate_m=options.gate_m, kept=options.keep)
     by_hand = session / "scanners.json"
     measured = read_scanners(by_hand)
     map_file = options.building or find_building(session)
     building = read_building(map_file)
     empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
-    alignment = align_scanners(measured, empties, building, settings)
+    alignment = align_scanners(measured, empties, building, options.settings)
 
     far_off = [
         a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
@@ -49,7 +50,7 @@ def perform(options: Lasers) -> int:
         for (i, j), share in sorted(alignment.pairs.items())
     ]
     extra: dict[str, Any] = {
-        **{k: v for k, v in provenance(settings, [by_hand, map_file]).items() if k != "version"},
+        **provenance(options.settings, [by_hand, map_file]),
         "steps": steps,
         "pairs": pairs,
         "beams_on_map": alignment.matched.tolist(),
@@ -58,10 +59,15 @@ def perform(options: Lasers) -> int:
         "undetermined": list(alignment.undetermined),
         "inconsistent": list(alignment.inconsistent),
     }
+    del extra["version"]  # that of the file's form is there
     write_scanners(output, alignment.scanners, extra, overwrite=options.force)
     scans = [still_scan(a, b) for a, b in zip(measured, empties)]
+    by_step = [
+        icp_by_step(scan, building, scanner.pose, options.settings, _ICP_STEPS)
+        for scan, scanner in zip(scans, measured)
+    ]
     with write_whole(picture, overwrite=options.force) as stream:
-        stream.write(draw_alignment(measured, alignment, scans, building))
+        stream.write(draw_alignment(measured, alignment, scans, building, by_step))
 
     for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
         shift = after.pose - before.pose

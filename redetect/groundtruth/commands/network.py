@@ -29,15 +29,12 @@ def perform(command: NetworkCommand) -> int:
     boards = read_boards(command.boards)
     shots: dict[int, list[BoardView]] = {}
     failures = []
-    with progress("boards") as (count, advance):
-        count(len(boards.images))
-        for image in boards.images:
-            try:
-                view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
-                shots.setdefault(image.placement, []).append(view)
-            except GroundTruthError as error:
-                failures.append(str(error))
-            advance()
+    for image in progress(boards.images, "boards"):
+        try:
+            view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
+            shots.setdefault(image.placement, []).append(view)
+        except GroundTruthError as error:
+            failures.append(str(error))
     for line in failures:
         print(f"left out: {line}", file=sys.stderr)
     double = boards.double

@@ -8,7 +8,16 @@ from typing import Annotated, Literal, Optional
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from redetect.groundtruth.markers.settings import NetworkSettings, PoseSettings, RigSettings
+from redetect.groundtruth.settings import (
+    AlignmentSettings,
+    FuseSettings,
+    LaserSettings,
+    NetworkSettings,
+    PoseSettings,
+    RigSettings,
+    SyncSettings,
+)
+from redetect.storage.bounds import Positive
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -120,9 +129,7 @@ class Lasers:
     # building.csv or building.dxf.
     session: Positional[Path]
     building: MaybePath = None  # The building map, if it is not the one in the session.
-    # Farthest that a reading may lie from what it is matched with at first (m).
-    gate_m: float = 0.5
-    keep: float = 0.95  # Share of the best matches that counts.
+    settings: OmitArgPrefixes[AlignmentSettings] = field(default_factory=AlignmentSettings)
     # The picture to write; by default the output's name with the ending .png.
     picture: MaybePath = None
     # The scanners file to write; by default aligned.json in the session.
@@ -140,8 +147,7 @@ class Laser:
     session: Positional[Path]  # Folder with robot.json, the scans, and the scans of the empty area.
     # Poses of the fixed scanners; by default aligned.json in the session, else scanners.json.
     scanners: MaybePath = None
-    gate_m: float = 0.2  # Farthest that a reading may lie from the robot's outline (m).
-    keep: float = 0.95  # Share of the best matches that counts.
+    settings: OmitArgPrefixes[LaserSettings] = field(default_factory=LaserSettings)
     average: int = 6  # Sets of scans that each written pose rests on; no set is used twice.
     # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. An
     # account of every set of scans goes into a .jsonl, settings and version into a .json beside it.
@@ -159,12 +165,7 @@ class Sync:
     odometry: Positional[Path]  # The robot's own poses (t, x, y, theta) on its clock.
     # Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
     groundtruth: Positional[Path]
-    largest_offset_s: float = 1.0  # Bound of the time offset, either way (s).
-    # Bound of the drift: the clocks' rates differ by at most this share.
-    largest_drift: float = 0.01
-    segment_gap_s: float = 5.0  # A longer pause in the ground truth begins a new segment (s).
-    # Refine the estimate by headings with the whole movement if the ground truth has covariances.
-    use_movement: bool = True
+    settings: OmitArgPrefixes[SyncSettings] = field(default_factory=SyncSettings)
     ptpd: MaybePath = None  # Log of ptpd, to compare with.
     apply: MaybePath = None  # Write the odometry on the ground truth's clock to this file.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")  # The clock file to write.
@@ -183,20 +184,14 @@ class Fuse:
     camera: MaybePath = None  # Ground truth from the markers, in the same columns.
     # Output of `groundtruth sync`; without it all clocks are assumed to be one.
     clock: MaybePath = None
-    # Standard deviation of odometry's distance per square root of a metre driven (m).
-    distance_sigma: float = 0.02
-    # How far the robot slips sideways per square root of a metre driven (m).
-    lateral_sigma: float = 0.01
-    # Standard deviation of odometry's heading per square root of a radian turned (rad).
-    turn_sigma: float = 0.02
-    turn_per_metre_sigma: float = 0.01  # The same per square root of a metre driven (rad).
-    learn_noise: bool = True  # Scale these to maximise the likelihood of the measurements.
-    gate_probability: float = 0.9999  # Share of right poses that pass the gate.
+    settings: OmitArgPrefixes[FuseSettings] = field(default_factory=FuseSettings)
     # Factors on the covariances of laser and camera.
-    covariance_scale: tuple[float, float] = (1.0, 1.0)
+    covariance_scale: tuple[Positive, Positive] = (1.0, 1.0)
     # Leave each segment of the ground truth between two others out as well, predict it, and print
     # how far off the prediction is (pauses of more than 5 s begin another segment).
     leave_out: bool = False
+    # Write the poses of the filter alone, each from what was measured until then, to this file.
+    filtered: MaybePath = None
     # The file to write (t, x, y, theta and 9 of covariance). What was rejected, settings and
     # version go into a .json beside it.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")

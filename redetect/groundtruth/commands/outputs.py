@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from redetect.groundtruth import __version__
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError
+
+T = TypeVar("T")
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
@@ -47,30 +47,13 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     }
 
 
-def write_account(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write the metadata of a result as JSON."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
-
-
-@contextmanager
-def progress(label: str) -> Iterator[tuple[Callable[[int], None], Callable[[], None]]]:
-    """A progress bar on a terminal; yields a function to set the total and one to advance."""
+def progress(items: Sequence[T], label: str) -> Iterable[T]:
+    """The items one after the other, on a terminal with a bar of their progress."""
     # The file is checked: environment variables can make rich take a log for a terminal, and of a
     # disabled bar, older versions of it print the line's end.
     if not sys.stderr.isatty():
-        yield lambda total: None, lambda: None
-        return
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    )
-    with bar:
-        task = bar.add_task(label, total=None)
-        yield lambda total: bar.update(task, total=total), lambda: bar.advance(task)
+        return items
+    return track(items, label, console=Console(stderr=True))
 
 
 def residual_figures(adjusted: Any, views: Sequence[int]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from redetect.groundtruth.markers.session import (
     RIG_NAME,
     MarkerFrame,
     find_runs,
+    group_by_time,
     read_marker_frames,
 )
 from redetect.groundtruth.markers.track import report_entry, track_robot
@@ -37,10 +38,8 @@ def perform(command: Poses) -> int:
     network = read_network(network_path)
     rig = read_rig(rig_path)
     frames = read_all_frames(runs, network)
-    with progress("poses") as (count, advance):
-        track = track_robot(
-            frames, rig, network, command.settings, on_progress=advance, on_count=count
-        )
+    groups = group_by_time(frames, command.settings.time_tolerance_s)
+    track = track_robot(progress(groups, "poses"), rig, network, command.settings)
     poses = track.planar()
     print(
         f"{len(poses)} poses of {len(track.times)} times: "

@@ -16,7 +16,6 @@ from redetect.groundtruth.commands.outputs import (
     check_outputs,
     print_sigmas,
     print_table,
-    progress,
     provenance,
     residual_figures,
 )
@@ -45,17 +44,16 @@ def perform(command: RigCommand) -> int:
     check_outputs((command.output, picture), command.force)
     cameras, poses, groups, network = _input(command)
     dictionary, widths = _markers(command, groups)
-    with progress("rig"):
-        estimate = estimate_rig(
-            groups,
-            cameras,
-            poses,
-            widths,
-            dictionary,
-            command.settings,
-            reference=command.reference,
-            camera_covariance=None if network is None else network.covariance,
-        )
+    estimate = estimate_rig(
+        groups,
+        cameras,
+        poses,
+        widths,
+        dictionary,
+        command.settings,
+        reference=command.reference,
+        camera_covariance=None if network is None else network.covariance,
+    )
     estimate, frame = _in_robot_frame(command, estimate)
     rig = estimate.rig
     table = [

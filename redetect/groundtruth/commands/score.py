@@ -66,7 +66,7 @@ def perform(command: Score) -> int:
             f"rmse {math.degrees(figures.angle_rmse_rad):.3f} deg"
         )
     if command.json is not None:
-        values: dict[str, Any] = {k: v if v == v else None for k, v in asdict(score).items()}
+        values: dict[str, Any] = asdict(score)
         if alignment is not None:
             values["alignment"] = alignment.tolist()
         if relative:

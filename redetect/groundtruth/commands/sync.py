@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,12 @@ from redetect.groundtruth.clocks.clock import (
     ClockModel,
     ClockSegment,
     PtpdLog,
-    clock_document,
     read_ptpd,
 )
-from redetect.groundtruth.clocks.sync import SyncSettings, synchronise
+from redetect.groundtruth.clocks.sync import synchronise
 from redetect.groundtruth.commands.options import Sync
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, write_account
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.files import write_json
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
@@ -29,16 +30,10 @@ _CONFIDENCE = 1.959964
 def perform(options: Sync) -> int:
     """Carry out ``groundtruth sync``; returns the exit code: 1 if no segment could be aligned."""
     check_outputs([options.output, options.apply], options.force)
-    settings = SyncSettings(
-        largest_offset_s=options.largest_offset_s,
-        largest_drift=options.largest_drift,
-        segment_gap_s=options.segment_gap_s,
-        use_movement=options.use_movement,
-    )
     odometry = read_planar_poses(options.odometry)
     truth = read_planar_poses(options.groundtruth)
     log = None if options.ptpd is None else read_ptpd(options.ptpd)
-    segments = synchronise(odometry, truth, settings)
+    segments = synchronise(odometry, truth, options.settings)
     determined = [segment for segment in segments if segment.status != "no turns"]
     for segment in segments:
         print(_line(segment))
@@ -47,13 +42,13 @@ def perform(options: Sync) -> int:
         return 1
     model = ClockModel(segments)
     document: dict[str, Any] = {
-        **provenance(settings, [options.odometry, options.groundtruth]),
-        "segments": clock_document(segments),
+        **provenance(options.settings, [options.odometry, options.groundtruth]),
+        "segments": [asdict(segment) for segment in segments],
     }
     if log is not None:
         document["ptpd"] = compare_with_ptpd(model, determined, log)
         print(_ptpd_line(document["ptpd"]))
-    write_account(options.output, document, overwrite=options.force)
+    write_json(options.output, document, overwrite=options.force)
     if options.apply is not None:
         aligned = PlanarPoses(
             model.groundtruth_times(odometry.times_s), odometry.poses, odometry.covariances

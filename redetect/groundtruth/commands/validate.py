@@ -2,46 +2,55 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
-from redetect.groundtruth.report.pictures import draw_errors
+from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
+from redetect.groundtruth.validation.onboard import (
+    INCIDENCES_DEG,
+    range_errors,
+    refine_mounts,
+)
 from redetect.groundtruth.validation.reference_poses import (
     poses_from_distances,
     read_distances,
     read_survey,
 )
-from redetect.groundtruth.validation.reference_poses_scans import Onboard
+from redetect.groundtruth.validation.reference_poses_scans import (
+    Onboard,
+    ReferencePose,
+    Refused,
+    reference_poses,
+)
+from redetect.groundtruth.validation.scoring import sigma_of
 from redetect.groundtruth.validation.validate import (
     PUBLISHED,
     Figures,
-    ReferencePose,
-    Refused,
-    document,
     figures_of,
-    finite_or_none,
     pose_errors,
-    reference_poses,
     stream_of,
     table_rows,
 )
 from redetect.storage import write_whole
 
 #: Files written to the folder.
-OUTPUTS = ("table.csv", "reference.csv", "errors.png", "validation.json")
+OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.json")
 
 
 def perform(options: Validate) -> int:
@@ -82,7 +91,7 @@ def perform(options: Validate) -> int:
     errors, without = pose_errors(references, poses)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
-    if not errors:
+    if not errors.references:
         print("error: no ground truth at the time of any reference pose", file=sys.stderr)
         return 1
     figures = figures_of(errors)
@@ -91,26 +100,27 @@ def perform(options: Validate) -> int:
         **provenance({"refine": options.refine}, files),
         "poses": str(options.poses.name),
         "clock": None if clock_path is None else clock_path.name,
-        **document(figures, [*refused, *without]),
+        "figures": asdict(figures),
+        "published": [asdict(published) for published in PUBLISHED],
+        "refused": [asdict(r) for r in (*refused, *without)],
         "distances": _distance_figures(solved, survey.sigma_m),
         "rows": [
-            {**row, "note": r.note, "points": r.points, "rms_m": finite_or_none(r.rms_m)}
+            {**row, "note": r.note, "points": r.points, "rms_m": r.rms_m}
             for row, r in zip(rows, references)
         ],
         "sigma": [
-            {"pose": e.index, "linear_m": finite_or_none(e.sigma_linear_m),
-             "angular_rad": finite_or_none(e.sigma_angular_rad)}
-            for e in errors
+            {"pose": r.index, "linear_m": linear, "angular_rad": angular}
+            for r, (linear, angular) in zip(errors.references, errors.sigma.tolist())
         ],
     }  # fmt: skip
-    picture = draw_errors(references, errors, figures, segments)
+    pictures = {"errors.png": draw_errors(errors, figures, segments)}
+    if segments is not None and any(r.still is not None for r in errors.references):
+        content |= _scanners_on_board(references, segments)
+        pictures["scans.png"] = draw_scans(errors, segments)
     folder.mkdir(parents=True, exist_ok=True)
     write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
-    for name, data in (
-        ("table.csv", table_text(rows).encode()),
-        ("errors.png", picture),
-        ("validation.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()),
-    ):
+    write_json(outputs["validation.json"], content, overwrite=options.force)
+    for name, data in (("table.csv", table_text(rows).encode()), *pictures.items()):
         with write_whole(outputs[name], overwrite=options.force) as stream:
             stream.write(data)
     for line in account(references, refused, figures, content["distances"]):
@@ -119,12 +129,35 @@ def perform(options: Validate) -> int:
     return 0
 
 
+def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray) -> dict[str, Any]:
+    """Errors of the ranges by their incidence on walls, and where the scanners are mounted."""
+    angles, errors = range_errors(references, segments)
+    rows: list[dict[str, Any]] = []
+    for low, high in pairwise(INCIDENCES_DEG):
+        inside = errors[(np.degrees(angles) >= low) & (np.degrees(angles) <= high)]
+        mean = float(inside.mean()) if len(inside) else math.nan
+        rows.append(
+            {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean,
+             "sigma_m": sigma_of(inside)}
+        )  # fmt: skip
+    found = refine_mounts(references, segments)
+    if found is None:
+        return {"incidence": rows}
+    sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
+    scanners = next(r.still.scanners for r in references if r.still is not None)
+    mounts = [
+        {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
+        for s, m, e in zip(scanners, found.poses, sigma)
+    ]
+    return {"incidence": rows, "mounts": mounts}
+
+
 def table_text(rows: Sequence[dict[str, Any]]) -> str:
     """Rows as lines between commas, with a head; empty where there is no value."""
     decimals = {"t": 6, "nees": 4, "angular_deg": 5}
 
     def word(name: str, value: Any) -> str:
-        if value is None:
+        if isinstance(value, float) and math.isnan(value):
             return ""
         return f"{value:.{decimals.get(name, 6)}f}" if isinstance(value, float) else str(value)
 

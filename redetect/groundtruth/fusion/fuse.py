@@ -19,10 +19,11 @@ from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.inputs import FuseSettings, pauses_of
+from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
@@ -47,18 +48,6 @@ _DOUBT = 0.001
 _COST_OF_TERM = 2.0
 # Share of its deviation before anything was measured below which an estimate counts as measured.
 _MEASURED = 0.5
-
-
-def noise_of(settings: FuseSettings) -> FloatArray:
-    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
-    return np.array(
-        [
-            settings.distance_sigma,
-            settings.lateral_sigma,
-            settings.turn_sigma,
-            settings.turn_per_metre_sigma,
-        ]
-    )
 
 
 def likeliest_noise(problem: MovementProblem) -> FloatArray:
@@ -140,7 +129,7 @@ def terms_that_pay(
 
     best = surprise(kept)
     # What was hardly measured stays as uncertain as it is.
-    measured = deviations < _MEASURED * problem.settings.systematic_sigmas()
+    measured = deviations < _MEASURED * systematic_sigmas(problem.settings)
     while np.any(kept & measured):
         fewer = [kept & (np.arange(3) != term) for term in np.flatnonzero(kept & measured)]
         tried = [surprise(terms) for terms in fewer]
@@ -148,9 +137,6 @@ def terms_that_pay(
             break
         best, kept = min(tried), fewer[int(np.argmin(tried))]
     return kept
-
-
-__all__ = ["FuseSettings", "Fusion", "OdometryErrors", "Rejected", "fuse"]
 
 
 @dataclass(frozen=True)
@@ -194,6 +180,8 @@ class Fusion:
     # At the odometry's times from the first measurement to the last, with covariances; headings
     # within +-pi.
     poses: PlanarPoses
+    # The same by the filter alone: each from what was measured until then
+    filtered: PlanarPoses
     rejected: tuple[Rejected, ...]  # In order of time
     # When the filter was restarted because no measurement fitted any more
     restarts_s: tuple[float, ...]
@@ -248,13 +236,19 @@ def fuse(
     over_seconds = math.sqrt(looser) * noise
     kept = terms_that_pay(problem, over_seconds, smoothed[-1, 3:], deviations)
     if not np.all(kept):
-        problem = replace(problem, settings=chosen.with_terms(kept))
+        turn, bend, way = np.where(kept, systematic_sigmas(chosen), 0.0).tolist()
+        fewer = replace(
+            chosen,
+            turn_scale_sigma=turn,
+            turn_bias_per_metre_sigma=bend,
+            distance_scale_sigma=way,
+        )
+        problem = replace(problem, settings=fewer)
         smoothed, spread, account = problem.smooth(noise, looser)
 
     at = np.searchsorted(problem.times_s, inside)
-    poses = smoothed[at, :3]
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    path = PlanarPoses(inside, poses, spread[at][:, :3, :3].copy())
+    path = _path(inside, smoothed[at], spread[at])
+    states, spreads = problem.filtered(noise)
     squared, accepted, restarted = account.squared, account.accepted, account.restarted > 0
     localisation = None
     if chosen.learn_noise:
@@ -266,6 +260,7 @@ def fuse(
     last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
         poses=path,
+        filtered=_path(inside, states[at], spreads[at]),
         rejected=tuple(
             Rejected(
                 problem.streams[i],
@@ -291,6 +286,13 @@ def fuse(
             if end > first and begin < last
         ),
     )
+
+
+def _path(times_s: FloatArray, states: FloatArray, covariances: FloatArray) -> PlanarPoses:
+    """The poses of states, headings within +-pi."""
+    poses = states[:, :POSE].copy()
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return PlanarPoses(times_s, poses, covariances[:, :POSE, :POSE].copy())
 
 
 # A longer pause in the ground truth begins another segment; fused poses and odometry are not

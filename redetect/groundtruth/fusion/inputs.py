@@ -3,65 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
 from redetect.plane import between, log_motion
-from redetect.storage.bounds import ABOVE_0, PROBABILITY, NotNegative, demand_fields
 
 
-@dataclass(frozen=True)
-class FuseSettings:
-    """How odometry errs, and how far a measurement may be off."""
+def systematic_sigmas(settings: FuseSettings) -> FloatArray:
+    """(3,) deviations of the turns' share, the turn per metre (rad) and the ways' share."""
+    return np.array(
+        [
+            settings.turn_scale_sigma,
+            settings.turn_bias_per_metre_sigma,
+            settings.distance_scale_sigma,
+        ]
+    )
 
-    # Standard deviation of odometry's distance after a metre (m); it grows with the root.
-    distance_sigma: NotNegative = 0.02
-    # How far the robot slips sideways within a metre (m), its standard deviation; it grows with the
-    # root. The lateral error by a wrong heading is not part of it.
-    lateral_sigma: NotNegative = 0.01
-    # Standard deviation of its heading after turning a radian (rad)
-    turn_sigma: NotNegative = 0.02
-    turn_per_metre_sigma: NotNegative = 0.01  # The same after a metre driven (rad)
-    # Scale these deviations (distance's, the sideways one, and both of the heading together) by
-    # what makes the measurements likeliest; they only begin the search then.
-    learn_noise: bool = True
-    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Standard deviations,
-    # before anything was measured, of what odometry is off by: the share of each turn, the turn per
-    # metre (rad), the share of each way. Terms that make no better predictions are left out.
-    turn_scale_sigma: NotNegative = 0.03
-    turn_bias_per_metre_sigma: NotNegative = 0.01
-    distance_scale_sigma: NotNegative = 0.03
-    # Share of right poses that pass the gate
-    gate_probability: Annotated[float, PROBABILITY] = 0.9999
-    # Factors on the measurements' covariances, by the stream's name; others count as 1.
-    covariance_scale: Mapping[str, float] | None = None
 
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
-        for name, value in (self.covariance_scale or {}).items():
-            if not ABOVE_0.hold(value):
-                raise GroundTruthError(f"covariance scale of {name} is {value}: expected above 0")
-
-    def systematic_sigmas(self) -> FloatArray:
-        """(3,) of the turns' share, the turn per metre (rad) and the ways' share."""
-        return np.array(
-            [self.turn_scale_sigma, self.turn_bias_per_metre_sigma, self.distance_scale_sigma]
-        )
-
-    def with_terms(self, kept: BoolArray) -> FuseSettings:
-        """With some of these three alone; the others are taken to be 0."""
-        turn, bend, way = np.where(kept, self.systematic_sigmas(), 0.0).tolist()
-        return replace(
-            self,
-            turn_scale_sigma=turn,
-            turn_bias_per_metre_sigma=bend,
-            distance_scale_sigma=way,
-        )
+def noise_of(settings: FuseSettings) -> FloatArray:
+    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
+    return np.array(
+        [
+            settings.distance_sigma,
+            settings.lateral_sigma,
+            settings.turn_sigma,
+            settings.turn_per_metre_sigma,
+        ]
+    )
 
 
 # A robot at rest may still move a little; without this noise, rest would give singular covariances.
@@ -175,7 +147,7 @@ def variances_of(
     known, and what a wrong heading leads aside is taken to be that of a way out and back.
 
     `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
-    `redetect.groundtruth.fusion.fuse.noise_of`.
+    `noise_of`.
     """
     along, across, by_turn, by_way = np.square(noise)
     way = np.hypot(controls[:, 0], controls[:, 1])
@@ -197,7 +169,7 @@ def variances_of(
 
 
 def gather(
-    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
 ) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
@@ -216,11 +188,10 @@ def gather(
         repeated[name] = int(np.count_nonzero(again))
         inside &= ~again
         usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
-        scale = (settings.covariance_scale or {}).get(name, 1.0)
         names += [name] * int(np.count_nonzero(inside))
         times.append(stream.times_s[inside])
         poses.append(stream.poses[inside])
-        covariances.append(usable * scale)
+        covariances.append(usable)
     if not names:
         raise GroundTruthError(
             "no measured pose within the odometry's time "

@@ -22,7 +22,12 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.fusion.inputs import FuseSettings, gather, movements, variances_of
+from redetect.groundtruth.fusion.inputs import (
+    gather,
+    movements,
+    systematic_sigmas,
+    variances_of,
+)
 from redetect.groundtruth.fusion.kernels import (
     AFTER_REJECTIONS,
     POSE,
@@ -36,6 +41,7 @@ from redetect.groundtruth.fusion.kernels import (
     filter_forward,
     smooth_backward,
 )
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
 from redetect.landmarks import wrap_angle
 
@@ -320,12 +326,19 @@ class MovementProblem:
             streams=tuple(self.streams[i] for i in np.flatnonzero(kept)),
         )
 
+    def filtered(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (N, 6) and covariances (N, 6, 6) by the filter alone: from what was before."""
+        history = empty_history(len(self.times_s))
+        no_cuts = np.zeros(len(self.times_s), dtype=np.bool_)
+        self._forward(self._variances(noise), np.empty((1, STATE)), no_cuts, history)
+        return history.filtered, history.filtered_covariance
+
     def smooth(
         self, noise: FloatArray, looser_in_gaps: float = 1.0
     ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
         """Smoothed states, their covariances, and what became of the measurements.
 
-        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.fuse.noise_of`.
+        `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.inputs.noise_of`.
         `looser_in_gaps`: factor on the variances they make where nothing is measured. Returns
         `states`, `covariances` (N, 6), (N, 6, 6).
         """
@@ -419,7 +432,7 @@ class MovementProblem:
         history: FilterHistory | None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:
-        means, deviations = systematic or (np.zeros(3), self.settings.systematic_sigmas())
+        means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
         return MeasurementAccount(
             *filter_forward(
                 Odometry(self.controls, variances),
@@ -446,7 +459,7 @@ def movement_problem(
 
     From the first measurement within the odometry's time to the last, on the measurements' clock.
     """
-    names, times, measured, covariances, repaired, repeated = gather(odometry, streams, settings)
+    names, times, measured, covariances, repaired, repeated = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
     node_times = np.union1d(inside, times)

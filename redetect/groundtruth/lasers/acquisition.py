@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,53 +24,9 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     new_points,
     refine_outline,
 )
+from redetect.groundtruth.settings import LaserSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert, rotation
-from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
-
-
-@dataclass(frozen=True)
-class LaserSettings:
-    """Settings of laser tracking."""
-
-    gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m)
-    kept: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best
-
-    # The ICP ends when its root mean square error changes by less, or after as many steps.
-    threshold_m: ClassVar[float] = 1e-5
-    most_steps: ClassVar[int] = 60
-    # Standard deviation of a reading's distance from the outline that does not depend on the
-    # scanner's noise: the outline is drawn to millimetres.
-    floor_m: ClassVar[float] = 0.001
-    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
-    # their distances from the face are small whatever the pose.
-    least_slope: ClassVar[float] = 0.35
-    # The final pose uses readings up to this many standard deviations off.
-    gate_sigma: ClassVar[float] = 3.5
-    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
-    # by what it does to the farthest corner).
-    weak_sigma_m: ClassVar[float] = 0.03
-    # Readings that a pose needs, and that a robot needs which is found again.
-    least_readings: ClassVar[int] = 8
-    acquire_readings: ClassVar[int] = 16
-    # The robot is lost after so long without a pose; then it is searched this often.
-    coast_s: ClassVar[float] = 0.25
-    acquire_s: ClassVar[float] = 0.05
-    # Headings that the search begins from.
-    headings: ClassVar[int] = 24
-    # New readings nearer to each other than this may be of one object.
-    link_m: ClassVar[float] = 0.3
-    # Share of the beams that should see the robot, or see something beside it, that must agree.
-    least_agreement: ClassVar[float] = 0.75
-    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
-    symmetry_m: ClassVar[float] = 0.12
-    # The readings identify the front if the residuals differ by this many standard errors; else it
-    # is known after the robot has driven this much farther forward than backward.
-    front_sigma: ClassVar[float] = 5.0
-    forward_m: ClassVar[float] = 0.3
-
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:
@@ -289,7 +244,7 @@ def _search(
         start = np.array([*(place - rotation(theta) @ body.middle), theta])
         pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
         pose, _, count = fit_outline(
-            seen.points, body.faces, pose, settings.gate_m, settings.kept, 1e-4, settings.most_steps
+            seen.points, body.faces, pose, settings.gate_m, settings.keep, 1e-4, settings.most_steps
         )
         if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue

@@ -21,6 +21,7 @@ from redetect.groundtruth.lasers.icp import (
     Scan,
     align_scans,
     explained,
+    fit_outline,
     icp_to_segments,
     rigid_fit,
     scan_normals,
@@ -32,9 +33,9 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     Seen,
     refine_outline,
 )
+from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, between, compose, invert
-from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
 
 #: Steps of the published order, by which results are named.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
@@ -51,18 +52,6 @@ _LONE_STEPS = 30
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 # A scanner whose place on the map is farther from that among the other scanners is named.
 _INCONSISTENT_M = 0.05
-
-
-@dataclass(frozen=True)
-class AlignmentSettings:
-    """Settings of the scanners' alignment."""
-
-    # Farthest that a reading may lie from what it is matched with at first (m)
-    gate_m: Positive = 0.5
-    kept: ShareAbove0 = 0.95  # Share of the matches that counts: the best
-
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +176,7 @@ def _pairs(
         best = (0.0, apart)
         for turn in np.radians(_TURNS_DEG):
             start = apart + np.array([0.0, 0.0, turn])
-            pose = align_scans(points, target, start, gates, s.kept, 1e-6)
+            pose = align_scans(points, target, start, gates, s.keep, 1e-6)
             if np.isfinite(pose).all():
                 share = explained(points, target, pose, _JUDGED_M)
                 best = max(best, (share, pose), key=lambda entry: entry[0])
@@ -243,7 +232,7 @@ def _merged(
     while len(members) < len(scans):
         outside = [k for k in range(len(scans)) if k not in members]
         k = max(outside, key=lambda k: max(shares[min(k, m), max(k, m)] for m in members))
-        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, members), gates, s.kept)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, members), gates, s.keep)
         members.append(k)
     return poses
 
@@ -254,7 +243,7 @@ def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> F
     gates = np.geomspace(0.15, 0.06, 4)
     for k in range(1, len(scans)):
         others = [m for m in range(len(scans)) if m != k]
-        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, others), gates, s.kept)
+        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, others), gates, s.keep)
     return poses
 
 
@@ -279,8 +268,23 @@ def _whole_to_map(
         body = compose(measured[0], invert(poses[0]))
     everything = _merge(scans, poses, range(len(scans))).points
     for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
-        body = icp_to_segments(everything, building, body, IcpSettings(gate, s.kept, 1e-5)).pose
+        body = icp_to_segments(everything, building, body, IcpSettings(gate, s.keep, 1e-5)).pose
     return compose(np.broadcast_to(body, poses.shape), poses)
+
+
+def icp_by_step(
+    scan: StillScan, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
+) -> FloatArray:
+    """(steps + 1,) root mean square distances (m) from the map of the readings that count.
+
+    Those of an ICP of a scanner's readings to the map, from a start (3,), after each of its steps.
+    """
+    return np.array(
+        [
+            fit_outline(scan.points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
+            for k in range(steps + 1)
+        ]
+    )
 
 
 def _to_map(

@@ -12,14 +12,12 @@
 
 from __future__ import annotations
 
-import gzip
 import os
 import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -29,12 +27,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import covariance_entry, numbers, read_json, write_json
+from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.storage.bounded import read_plain_array
+from redetect.storage.bounds import ABOVE_0
 from redetect.storage.messages import excerpt, one_line
 
 MOST_READINGS = 4096
-MOST_SCANNERS = 256
 
 _MILLIMETRE = 1e-3
 
@@ -115,15 +113,6 @@ class Robot:
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
-    def __post_init__(self) -> None:
-        if len(self.outline) < 3:
-            raise GroundTruthError(
-                f"outline of {len(self.outline)} corners: expected three or more corners (x, y)"
-            )
-        for limit in (self.largest_speed_m_s, self.largest_turn_rad_s):
-            if not 0.0 < limit < float("inf"):
-                raise GroundTruthError(f"largest speed or turn {limit!r}: expected above 0")
-
 
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
     """Read a ``scanners.json``: the scanners, in the file's order.
@@ -133,7 +122,7 @@ def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
     GroundTruthError
         If the file cannot be read, or an entry is missing, impossible or of a name given twice.
     """
-    return _scanners(path, read_json(path))
+    return _scanners(JsonObject.read(path))
 
 
 def write_scanners(
@@ -156,16 +145,16 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
     GroundTruthError
         If the file cannot be read, or an entry is missing or impossible.
     """
-    content = read_json(path)
-    limits = []
-    for key in ("largest_speed_m_s", "largest_turn_rad_s"):
-        limits.append(float(numbers(f"{path}: {key}", content.get(key))))
-    outline = numbers(f"{path}: outline", content.get("outline"), None, 2).reshape(-1, 2)
-    scanners = _scanners(path, content) if "scanners" in content else ()
-    try:
-        return Robot(outline, limits[0], limits[1], scanners)
-    except GroundTruthError as error:
-        raise GroundTruthError(f"{path}: {error}") from None
+    content = JsonObject.read(path)
+    outline = content.numbers("outline", None, 2)
+    if len(outline) < 3:
+        raise content.wrong("outline", "three or more corners (x, y)")
+    return Robot(
+        outline,
+        content.number("largest_speed_m_s", ABOVE_0),
+        content.number("largest_turn_rad_s", ABOVE_0),
+        _scanners(content) if content.values.get("scanners") else (),
+    )
 
 
 def scanner_entry(scanner: Scanner) -> dict[str, Any]:
@@ -174,44 +163,31 @@ def scanner_entry(scanner: Scanner) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
-def _scanners(path: str | os.PathLike[str], content: dict[str, Any]) -> tuple[Scanner, ...]:
-    if content.get("version") != 1:
-        raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
-    entries = content.get("scanners")
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise GroundTruthError(f"{path}: scanners: expected a list of objects")
-    if len(entries) > MOST_SCANNERS:
-        raise GroundTruthError(f"{path}: {len(entries)} scanners: expected at most {MOST_SCANNERS}")
-    scanners = tuple(_scanner(f"{path}: scanners[{i}]", e) for i, e in enumerate(entries))
+def _scanners(content: JsonObject) -> tuple[Scanner, ...]:
+    content.demand_version()
+    scanners = tuple(_scanner(entry) for entry in content.rows("scanners"))
     names = [scanner.name for scanner in scanners]
     for name in names:
         if names.count(name) > 1:
-            raise GroundTruthError(f"{path}: scanner {excerpt(name)} is listed more than once")
+            raise GroundTruthError(
+                f"{content.place}: scanner {excerpt(name)} is listed more than once"
+            )
     return scanners
 
 
-def _scanner(place: str, entry: dict[str, Any]) -> Scanner:
-    name, readings = entry.get("name"), entry.get("readings")
-    if not isinstance(name, str):
-        raise GroundTruthError(f"{place}: name is {excerpt(name)}: expected a text")
-    if not isinstance(readings, int) or isinstance(readings, bool):
-        raise GroundTruthError(f"{place}: readings is {excerpt(readings)}: expected a whole number")
-    pose = numbers(f"{place}: pose", entry.get("pose"), 3)
-    first, step, most, sigma = (
-        float(numbers(f"{place}: {key}", entry.get(key)))
-        for key in ("first_angle_rad", "angle_step_rad", "max_range_m", "sigma_m")
-    )
+def _scanner(entry: JsonObject) -> Scanner:
+    keys = ("first_angle_rad", "angle_step_rad", "max_range_m", "sigma_m")
+    first, step, most, sigma = (entry.number(key) for key in keys)
+    name, readings = entry.text("name"), entry.whole("readings")
+    pose, covariance = entry.numbers("pose", 3), entry.uncertainty(3, "pose_sigma")
     try:
-        covariance = covariance_entry(place, entry, 3, "pose_sigma")
         return Scanner(name, pose, covariance, first, step, readings, most, sigma)
     except GroundTruthError as error:
-        raise GroundTruthError(f"{place}: {error}") from None
+        raise GroundTruthError(f"{entry.place}: {error}") from None
 
 
 _LARGEST_FILE_BYTES = 1 << 30
-_LONGEST_LINE = 1 << 17
 _FARTHEST_M = 1e3
-_ROW = re.compile(r"[-+0-9.eE,\s]+")
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
@@ -290,7 +266,12 @@ def read_scans(
         If the file cannot be read, holds pickled objects, arrays of other shapes or types than
         expected, times that step back, or more than a GiB.
     """
-    scans = _read_npz(path) if Path(path).suffix == ".npz" else _read_rows(path, readings)
+    packed = Path(path).suffix == ".npz"
+    times, ranges = _read_npz(path) if packed else _read_rows(path, readings)
+    try:
+        scans = Scans(times, ranges)
+    except GroundTruthError as error:
+        raise StreamError(path, None, str(error)) from None
     if readings is not None and scans.ranges_mm.shape[1] != readings:
         raise GroundTruthError(
             f"{path}: {scans.ranges_mm.shape[1]} readings per scan: expected {readings}"
@@ -305,12 +286,12 @@ def read_scans(
     return scans
 
 
-def _read_npz(path: str | os.PathLike[str]) -> Scans:
+def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
     """Read the two arrays, checking sizes that the file claims and without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
-            ranges = _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
+            return times, _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
     except GroundTruthError:
         raise
     except FileNotFoundError:
@@ -324,10 +305,6 @@ def _read_npz(path: str | os.PathLike[str]) -> Scans:
     ) as error:  # fmt: skip
         said = one_line(str(error), 200)
         raise GroundTruthError(f"{path}: is no .npz that can be read: {said}") from None
-    try:
-        return Scans(times, ranges)
-    except GroundTruthError as error:
-        raise GroundTruthError(f"{path}: {error}") from None
 
 
 def _member(
@@ -351,69 +328,27 @@ def _member(
         raise GroundTruthError(f"{place}: {error}") from None
 
 
-def _read_rows(path: str | os.PathLike[str], readings: int | None) -> Scans:
-    times: list[float] = []
-    rows: list[NDArray[np.uint16]] = []
-    columns: int | None = None
-    for number, line in _lines(path):
-        words = line.split(",") if "," in line else line.split()
-        if number == 1 and words[0].strip().lower() in ("t", "t_s", "time"):
+def _read_rows(
+    path: str | os.PathLike[str], readings: int | None
+) -> tuple[FloatArray, NDArray[np.uint16]]:
+    rows: list[FloatArray] = []
+    columns = None if readings is None else readings + 1
+    for line, words in read_rows(path, _LARGEST_FILE_BYTES):
+        if not rows and words[0].lower() in ("t", "t_s", "time"):
             continue
-        values = _row(path, number, line, words)
+        values = np.array(parse_numbers(path, line, words))
         if readings is not None and len(values) == readings + 2:
             values = values[1:]
-        if columns is None:
-            columns = len(values) if readings is None else readings + 1
+        columns = columns or len(values)
         if len(values) != columns or columns < 2:
             wanted = "a time and readings" if columns < 2 else f"{columns}: time and readings"
-            raise StreamError(path, number, f"{len(words)} numbers: expected {wanted}")
+            raise StreamError(path, line, f"{len(words)} numbers: expected {wanted}")
         if np.any(values[1:] < 0.0):
-            raise StreamError(path, number, "a reading below 0: expected metres")
-        millimetres = np.rint(np.minimum(values[1:], _FARTHEST_M) / _MILLIMETRE)
-        times.append(float(values[0]))
-        rows.append(np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16))
+            raise StreamError(path, line, "a reading below 0: expected metres")
+        rows.append(values)
     if not rows:
         raise StreamError(path, None, "no scans in it")
-    try:
-        return Scans(np.array(times), np.stack(rows))
-    except GroundTruthError as error:
-        raise StreamError(path, None, str(error)) from None
-
-
-def _row(path: str | os.PathLike[str], number: int, line: str, words: list[str]) -> FloatArray:
-    try:
-        values = np.array(words, dtype=np.float64) if _ROW.fullmatch(line) else None
-    except ValueError:
-        values = None
-    if values is None or not np.isfinite(values).all():
-        raise StreamError(path, number, f"{excerpt(line)}: expected finite numbers")
-    return values
-
-
-def _lines(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
-    """Yield numbers and lines, without comments and blank lines; bounded, however well packed."""
-    packed = Path(path).suffix == ".gz"
-    try:
-        with Path(path).open("rb") as file, ExitStack() as stack:
-            stream = stack.enter_context(gzip.GzipFile(fileobj=file)) if packed else file
-            number = total = 0
-            while line := stream.readline(_LONGEST_LINE + 1):
-                number += 1
-                total += len(line)
-                if len(line) > _LONGEST_LINE or total > _LARGEST_FILE_BYTES:
-                    raise StreamError(
-                        path, number,
-                        f"a line of more than {_LONGEST_LINE} bytes, or a file of more than "
-                        f"{_LARGEST_FILE_BYTES}",
-                    )  # fmt: skip
-                content = line.decode("utf-8-sig").partition("#")[0].strip()
-                if content:
-                    yield number, content
-    except FileNotFoundError:
-        raise StreamError(path, None, "no such file") from None
-    except UnicodeDecodeError:
-        raise StreamError(path, None, "is no text: expected rows of numbers") from None
-    except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise StreamError(path, None, "is no complete gzip file") from None
-    except OSError as error:
-        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+    table = np.stack(rows)
+    millimetres = np.rint(np.minimum(table[:, 1:], _FARTHEST_M) / _MILLIMETRE)
+    ranges = np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16)
+    return table[:, 0].copy(), ranges

@@ -16,7 +16,6 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     Body,
-    LaserSettings,
     acquire,
     explain,
     refine,
@@ -26,6 +25,7 @@ from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose, Seen, new_points
+from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, compose
@@ -198,7 +198,7 @@ class Tracker:
         """Pose by the trimmed ICP from a start, and how many readings it rests on."""
         s = self.settings
         pose, _, count = fit_outline(
-            seen.points, self.body.faces, start, s.gate_m, s.kept, s.threshold_m, s.most_steps
+            seen.points, self.body.faces, start, s.gate_m, s.keep, s.threshold_m, s.most_steps
         )
         return pose, count
 

@@ -20,88 +20,49 @@ even and one odd number of corners only one way to hold it is like that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.boards.points import find_board
-from camera.calibration.images import grey_of_content
+from camera.calibration.images import read_grey
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray
-from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.files import covariance_entry, is_number, numbers, read_json
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.files import JsonObject
 from redetect.groundtruth.markers.calibration import parse_pose
-from redetect.storage.bounded import claimed_size, path_inside, read_bounded
-from redetect.storage.messages import excerpt, one_line
+from redetect.storage.bounded import path_inside
+from redetect.storage.messages import excerpt
 
 #: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
 #: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
 _WINDOW = 0.4
 
 
-@dataclass(frozen=True)
-class Checkerboard:
-    """A board's inner corners.
+def checkerboard(columns: int, rows: int, square_m: float) -> Board:
+    """A board by its numbers of inner corners, one even and one odd, and the side of a square.
 
     Raises
     ------
     GroundTruthError
         If the board is symmetric under rotation by 180 degrees, or is too small.
     """
-
-    # `columns`, `rows`: Numbers of inner corners; one even, one odd.
-    columns: int
-    rows: int
-    square_m: float  # Side of a square
-
-    def __post_init__(self) -> None:
-        try:
-            board = self.board
-        except CalibrationError as error:
-            raise GroundTruthError(str(error)) from None
-        if board.looks_turned:
-            raise GroundTruthError(
-                f"board of {self.columns} x {self.rows} inner corners looks the same turned by 180 "
-                "degrees: expected one even and one odd number"
-            )
-
-    @property
-    def board(self) -> Board:
-        """The board as used in the package `camera`."""
-        return Board("checkerboard", self.columns, self.rows, self.square_m)
-
-    @property
-    def points(self) -> FloatArray:
-        """(rows * columns, 3) inner corners in the board's frame, row by row from top left (m)."""
-        return self.board.points
-
-
-def find_checkerboard(image: NDArray[np.uint8], board: Checkerboard) -> FloatArray:
-    """A board's inner corners (rows * columns, 2) in an image (H, W) (OpenCV).
-
-    Pixels (the top left pixel's centre is 0, 0) in the order of `Checkerboard.points`.
-
-    Raises
-    ------
-    GeometryError
-        If there is no such board in the image.
-    """
     try:
-        _, pixels = find_board(image, board.board, window=_WINDOW)
-    except CalibrationError:
-        raise GeometryError(
-            f"no checkerboard of {board.columns} x {board.rows} inner corners in the image"
-        ) from None
-    return pixels
+        board = Board("checkerboard", columns, rows, square_m)
+    except CalibrationError as error:
+        raise GroundTruthError(str(error)) from None
+    if board.looks_turned:
+        raise GroundTruthError(
+            f"board of {columns} x {rows} inner corners looks the same turned by 180 degrees: "
+            "expected one even and one odd number"
+        )
+    return board
 
 
 BOARDS_NAME = "boards.json"
-_LARGEST_IMAGE_BYTES = 1 << 28
 FIRST, SECOND, WORLD = "first", "second", "world"
 
 
@@ -111,7 +72,7 @@ class BoardView:
 
     camera: str
     board: str
-    corners: FloatArray  # (K, 2): pixels, in the order of `Checkerboard.points`
+    corners: FloatArray  # (K, 2): pixels, in the order of `Board.points`
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +100,7 @@ class BoardImage:
 class BoardsFile:
     """Content of a ``boards.json``."""
 
-    boards: dict[str, Checkerboard]
+    boards: dict[str, Board]
     world_from_board: FloatArray  # (4, 4)
     double: DoubleBoard | None
     cameras: dict[str, Camera]
@@ -161,47 +122,35 @@ def read_boards(path: Path) -> BoardsFile:
         If a file cannot be read or an entry is missing or impossible.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
-    content = read_json(path)
-    boards = {
-        name: _board(f"{path}: board {one_line(name, 60)}", entry)
-        for name, entry in _objects(f"{path}: boards", content.get("boards")).items()
-    }
+    content = JsonObject.read(path)
+    boards = {name: _board(entry) for name, entry in content.objects("boards").items()}
     unknown = sorted(set(boards) - {FIRST, SECOND, WORLD})
     if unknown or WORLD not in boards or (FIRST in boards) != (SECOND in boards):
         raise GroundTruthError(
             f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first "
             "and second or neither"
         )
-    world = parse_pose(f"{path}: world_from_board", content.get("world_from_board"))
+    world = parse_pose(content.inner("world_from_board"))
     double = None
     if FIRST in boards:
-        entry = content.get("first_from_second")
-        place = f"{path}: first_from_second"
-        double = DoubleBoard(
-            FIRST,
-            SECOND,
-            None if entry is None else parse_pose(place, entry),
-            np.zeros((6, 6)) if entry is None else covariance_entry(place, entry, 6),
-        )
-    rows = content.get("images")
-    if not isinstance(rows, list) or not rows:
-        raise GroundTruthError(f"{path}: images: expected a list of at least one")
-    images = tuple(
-        _image(f"{path}: image {i + 1}", row, path.parent, boards) for i, row in enumerate(rows)
-    )
+        double = DoubleBoard(FIRST, SECOND, None, np.zeros((6, 6)))
+        if content.values.get("first_from_second") is not None:
+            entry = content.inner("first_from_second")
+            double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))
+    images = tuple(_image(row, path, boards) for row in content.rows("images"))
     names = sorted({image.camera for image in images})
     calibrations = {name: f"{name}/{name}.cam" for name in names}
     return BoardsFile(
         boards,
         world,
         double,
-        {name: read_camera(_inside(str(path), path.parent, calibrations[name])) for name in names},
+        {name: read_camera(_inside(path, calibrations[name])) for name in names},
         calibrations,
         images,
     )
 
 
-def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> BoardView:
+def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """The corners of the board in an image.
 
     Raises
@@ -213,85 +162,48 @@ def find_boards(image: BoardImage, board: Checkerboard, camera: Camera) -> Board
         return BoardView(image.camera, image.board, image.corners)
     assert image.image is not None
     try:
-        content = read_bounded(image.image, _LARGEST_IMAGE_BYTES)
-    except OSError as error:
-        raise GroundTruthError(f"{image.image}: cannot be read: {error.strerror}") from None
-    size = claimed_size(content)
-    if size is None:
-        raise GroundTruthError(f"{image.image}: cannot be decoded: expected an image")
-    # Larger claims are not decoded: memory is allocated for the expected size only.
-    _demand_size(image.image, size, camera)
-    try:
-        grey = grey_of_content(content, image.image)
+        grey = read_grey(image.image)
     except CalibrationError as error:
         raise GroundTruthError(str(error)) from None
-    _demand_size(image.image, (grey.shape[1], grey.shape[0]), camera)
+    if grey.shape != (camera.height, camera.width):
+        raise GroundTruthError(
+            f"{image.image}: is {grey.shape[1]}x{grey.shape[0]} px: expected "
+            f"{camera.width}x{camera.height}, the calibration's size"
+        )
     try:
-        corners = find_checkerboard(grey, board)
-    except GeometryError as error:
-        raise GroundTruthError(f"{image.image}: {error}") from None
+        _, corners = find_board(grey, board, window=_WINDOW)
+    except CalibrationError:
+        raise GroundTruthError(
+            f"{image.image}: no checkerboard of {board.columns} x {board.rows} inner corners in it"
+        ) from None
     return BoardView(image.camera, image.board, corners)
 
 
-def _demand_size(path: Path, size: tuple[int, int], camera: Camera) -> None:
-    if size != (camera.width, camera.height):
-        raise GroundTruthError(
-            f"{path}: is {size[0]}x{size[1]} px: expected {camera.width}x{camera.height}, the "
-            "calibration's size"
-        )
-
-
-def _inside(place: str, folder: Path, name: str) -> Path:
+def _inside(path: Path, name: str) -> Path:
+    """The file that a file names, in its folder."""
     try:
-        return path_inside(folder, name)
+        return path_inside(path.parent, name)
     except ValueError as error:
-        raise GroundTruthError(f"{place}: {excerpt(name)} {error}: expected a file in it") from None
+        raise GroundTruthError(f"{path}: {excerpt(name)} {error}: expected a file in it") from None
 
 
-def _objects(place: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict) or not value:
-        raise GroundTruthError(f"{place}: expected an object with at least one entry")
-    return value
-
-
-def _is_whole(value: Any) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _board(place: str, entry: Any) -> Checkerboard:
-    columns, rows, square = (
-        entry.get(key) if isinstance(entry, dict) else None
-        for key in ("columns", "rows", "square_m")
-    )
-    if not (_is_whole(columns) and _is_whole(rows) and is_number(square)):
-        raise GroundTruthError(f"{place}: expected whole columns and rows, and square_m")
+def _board(entry: JsonObject) -> Board:
+    columns, rows = entry.whole("columns"), entry.whole("rows")
     try:
-        return Checkerboard(columns, rows, float(square))
+        return checkerboard(columns, rows, entry.number("square_m"))
     except GroundTruthError as error:
-        raise GroundTruthError(f"{place}: {error}") from None
+        raise GroundTruthError(f"{entry.place}: {error}") from None
 
 
-def _image(place: str, row: Any, folder: Path, boards: dict[str, Checkerboard]) -> BoardImage:
-    entry = row if isinstance(row, dict) else {}
-    camera, board, placement = entry.get("camera"), entry.get("board"), entry.get("placement")
-    if not isinstance(camera, str) or not camera:
-        raise GroundTruthError(f"{place}: camera is {excerpt(camera)}: expected its name")
-    if not isinstance(board, str) or board not in boards:
-        raise GroundTruthError(
-            f"{place}: board is {excerpt(board)}: expected one of {sorted(boards)}"
-        )
-    if not _is_whole(placement):
-        raise GroundTruthError(
-            f"{place}: placement is {excerpt(placement)}: expected a whole number"
-        )
-    image, corners = entry.get("image"), entry.get("corners")
-    if (image is None) == (corners is None):
-        raise GroundTruthError(f"{place}: expected either image or corners")
-    if image is not None:
-        if not isinstance(image, str):
-            raise GroundTruthError(f"{place}: image is {excerpt(image)}: expected a file's name")
-        path = _inside(place, folder, image)
-        return BoardImage(camera, board, placement, path, None)
-    count = boards[board].rows * boards[board].columns
-    array = numbers(f"{place}: corners", corners, count, 2)
-    return BoardImage(camera, board, placement, None, array)
+def _image(row: JsonObject, path: Path, boards: dict[str, Board]) -> BoardImage:
+    camera, board = row.text("camera", "its name"), row.text("board")
+    if board not in boards:
+        raise row.wrong("board", f"one of {sorted(boards)}")
+    if ("image" in row) == ("corners" in row):
+        raise GroundTruthError(f"{row.place}: expected either image or corners")
+    placement = row.whole("placement")
+    if "image" in row:
+        image = _inside(path, row.text("image", "a file's name"))
+        return BoardImage(camera, board, placement, image, None)
+    corners = row.numbers("corners", boards[board].rows * boards[board].columns, 2)
+    return BoardImage(camera, board, placement, None, corners)

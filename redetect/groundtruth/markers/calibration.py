@@ -13,22 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from camera import Camera, read_camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import (
-    covariance_entry,
-    covariance_of,
-    is_number,
-    numbers,
-    read_json,
-    write_json,
-)
+from redetect.groundtruth.files import JsonObject, write_json
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
-from redetect.storage.messages import excerpt, one_line
+from redetect.storage.bounds import Bounds
+from redetect.storage.messages import excerpt
 
 _QUATERNION_TOLERANCE = 1e-3
+_WIDTH = Bounds("metres above 0", 0.0, above=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +79,9 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     GroundTruthError
         If the file cannot be read, or an entry is missing or impossible.
     """
-    content = read_json(path)
-    dictionary = content.get("dictionary")
-    if not isinstance(dictionary, str) or not dictionary:
-        raise GroundTruthError(f"{path}: dictionary is {excerpt(dictionary)}: expected its name")
-    markers = _entries(path, content, "markers")
+    content = JsonObject.read(path)
+    dictionary = content.text("dictionary", "its name")
+    markers = content.objects("markers")
     try:
         by_id = {int(key): entry for key, entry in markers.items()}
     except ValueError:
@@ -95,20 +89,10 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     ids = tuple(sorted(by_id))
     if len(ids) != len(markers) or (ids and ids[0] < 0):
         raise GroundTruthError(f"{path}: markers: expected different IDs of 0 or more")
-    widths = []
-    for marker in ids:
-        width = by_id[marker].get("width_m")
-        if not is_number(width) or not width > 0.0:
-            raise GroundTruthError(
-                f"{path}: marker {marker}: width_m is {excerpt(width)}: expected metres above 0"
-            )
-        widths.append(float(width))
-    poses = np.stack([parse_pose(f"{path}: marker {m}", by_id[m]) for m in ids])
-    names = [str(marker) for marker in ids]
-    covariance = _joint_covariance(
-        str(path), content, "markers", names, [by_id[marker] for marker in ids]
-    )
-    return Rig(dictionary, ids, np.array(widths), poses, covariance)
+    entries = {str(marker): by_id[marker] for marker in ids}
+    widths = np.array([entry.number("width_m", _WIDTH) for entry in entries.values()])
+    poses = np.stack([parse_pose(entry) for entry in entries.values()])
+    return Rig(dictionary, ids, widths, poses, _joint_covariance(content, "markers", entries))
 
 
 def read_network(path: str | os.PathLike[str]) -> Network:
@@ -124,37 +108,20 @@ def read_network(path: str | os.PathLike[str]) -> Network:
     GroundTruthError, camera.CameraError
         If a file cannot be read, or an entry is missing or impossible.
     """
-    content = read_json(path)
-    cameras = _entries(path, content, "cameras")
-    names = tuple(sorted(cameras))
-    calibrations = []
-    paths = []
-    for name in names:
-        calibration = cameras[name].get("calibration")
-        if not isinstance(calibration, str) or not calibration:
-            raise GroundTruthError(
-                f"{path}: camera {one_line(name, 60)}: calibration is {excerpt(calibration)}: "
-                "expected a file"
-            )
+    content = JsonObject.read(path)
+    cameras = dict(sorted(content.objects("cameras").items()))
+    calibrations = tuple(entry.text("calibration", "a file") for entry in cameras.values())
+    for calibration, entry in zip(calibrations, cameras.values()):
         # It may well lie beside the network's folder; but only a calibration is ever opened.
         relative = not Path(calibration).is_absolute() and "\0" not in calibration
         if not relative or not calibration.endswith(".cam"):
-            raise GroundTruthError(
-                f"{path}: camera {one_line(name, 60)}: calibration {excerpt(calibration)} "
-                "is no .cam file by a relative path: expected one"
-            )
-        paths.append(Path(path).parent / calibration)
-        calibrations.append(calibration)
+            raise entry.wrong("calibration", "a .cam file by a relative path")
     return Network(
-        names,
-        tuple(read_camera(place) for place in paths),
-        tuple(calibrations),
-        np.stack(
-            [parse_pose(f"{path}: camera {one_line(name, 60)}", cameras[name]) for name in names]
-        ),
-        _joint_covariance(
-            str(path), content, "cameras", list(names), [cameras[name] for name in names]
-        ),
+        tuple(cameras),
+        tuple(read_camera(Path(path).parent / calibration) for calibration in calibrations),
+        calibrations,
+        np.stack([parse_pose(entry) for entry in cameras.values()]),
+        _joint_covariance(content, "cameras", cameras),
     )
 
 
@@ -208,56 +175,38 @@ def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     }
 
 
-def _entries(
-    path: str | os.PathLike[str], content: dict[str, Any], key: str
-) -> dict[str, dict[str, Any]]:
-    entries = content.get(key)
-    if not isinstance(entries, dict) or not entries:
-        raise GroundTruthError(f"{path}: {key}: expected an object with at least one entry")
-    for name, entry in entries.items():
-        if not isinstance(entry, dict):
-            raise GroundTruthError(f"{path}: {key}: {one_line(name, 60)}: expected an object")
-    return entries
-
-
-def parse_pose(place: str, entry: Any) -> FloatArray:
+def parse_pose(entry: JsonObject) -> FloatArray:
     """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw."""
-    if not isinstance(entry, dict):
-        raise GroundTruthError(f"{place}: expected translation_m and quaternion_xyzw")
-    translation = numbers(f"{place}: translation_m", entry.get("translation_m"), 3)
-    quaternion = numbers(f"{place}: quaternion_xyzw", entry.get("quaternion_xyzw"), 4)
+    translation = entry.numbers("translation_m", 3)
+    quaternion = entry.numbers("quaternion_xyzw", 4)
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) <= _QUATERNION_TOLERANCE:
         raise GroundTruthError(
-            f"{place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
+            f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
     return transform_from_quaternion(quaternion / length, translation)
 
 
 def _joint_covariance(
-    path: str, content: dict[str, Any], key: str, names: list[str], entries: list[dict[str, Any]]
+    content: JsonObject, key: str, entries: Mapping[str, JsonObject]
 ) -> FloatArray:
-    size = 6 * len(names)
-    joint = content.get("covariance")
-    single = key.removesuffix("s")
-    if joint is None:
-        covariance = np.zeros((size, size))
-        for i, (name, entry) in enumerate(zip(names, entries)):
-            block = slice(6 * i, 6 * i + 6)
-            place = f"{path}: {single} {one_line(name, 60)}"
-            covariance[block, block] = covariance_entry(place, entry, 6)
-        return covariance
-    if any("covariance" in entry or "sigmas" in entry for entry in entries):
+    """(6 N, 6 N) covariance of all entries' poses, in their order."""
+    if "covariance" not in content:
+        return np.asarray(block_diag(*(entry.uncertainty(6) for entry in entries.values())))
+    if any("covariance" in entry or "sigmas" in entry for entry in entries.values()):
         raise GroundTruthError(
-            f"{path}: covariance for all {key} together and for one of them: expected one of both"
+            f"{content.place}: covariance for all {key} together and for one of them: expected one "
+            "of both"
         )
+    joint = content.values["covariance"]
     if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
-        raise GroundTruthError(f"{path}: covariance: expected an object with {key} and matrix")
-    order = [str(name) for name in joint[key]]
+        raise content.wrong("covariance", f"an object with {key} and matrix")
+    order, names = [str(name) for name in joint[key]], list(entries)
     if sorted(order) != sorted(names):
         raise GroundTruthError(
-            f"{path}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
+            f"{content.place}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
         )
-    matrix = covariance_of(f"{path}: covariance", joint.get("matrix"), size)
+    place = f"{content.place}: covariance"
+    matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera import Camera
+from camera.boards.board import Board
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
@@ -21,9 +22,9 @@ from redetect.groundtruth.markers.adjustment import (
     PosePrior,
     adjust_bundle,
 )
-from redetect.groundtruth.markers.boards import BoardView, Checkerboard, DoubleBoard
+from redetect.groundtruth.markers.boards import BoardView, DoubleBoard
 from redetect.groundtruth.markers.poses import solve_camera
-from redetect.groundtruth.markers.settings import NetworkSettings
+from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
 
 
@@ -41,7 +42,7 @@ class NetworkEstimate:
 
 def estimate_network(
     cameras: Mapping[str, Camera],
-    boards: Mapping[str, Checkerboard],
+    boards: Mapping[str, Board],
     world_from_board: Mapping[str, FloatArray],
     double: DoubleBoard | None,
     shots: Sequence[Sequence[BoardView]],
@@ -96,15 +97,14 @@ _Seen = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
 def _camera_from_board(
-    view: BoardView, cameras: Mapping[str, Camera], boards: Mapping[str, Checkerboard]
+    view: BoardView, cameras: Mapping[str, Camera], boards: Mapping[str, Board]
 ) -> FloatArray:
     try:
-        found = solve_camera(
+        return solve_camera(
             cameras[view.camera], boards[view.board].points, view.corners, "iterative"
-        )
+        )[0]
     except GeometryError as error:
         raise GroundTruthError(f"camera {view.camera}, board {view.board}: {error}") from None
-    return found[0].pose
 
 
 def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
@@ -203,7 +203,7 @@ def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
 
 def _bundle(
     cameras: Mapping[str, Camera],
-    boards: Mapping[str, Checkerboard],
+    boards: Mapping[str, Board],
     world_from_board: Mapping[str, FloatArray],
     parts: Mapping[str, FloatArray],
     double: DoubleBoard | None,

@@ -8,7 +8,7 @@ that most others agree with decides which markers are wrong.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ from redetect.groundtruth.markers.refinement import (
     predicted_errors,
     refine_pose,
 )
-from redetect.groundtruth.markers.settings import PoseSettings, Solver
+from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
@@ -39,18 +39,9 @@ SOLVERS: tuple[Solver, ...] = ("sqpnp", "epnp", "iterative", "ippe", "pycolmap")
 _RANSAC_PX = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class PnpSolution:
-    """A pose that explains the corners."""
-
-    # (4, 4): `camera_from_object`, or `world_from_robot` where there are several cameras
-    pose: FloatArray
-    rms_px: float  # Root mean square of the residuals per coordinate, in the image as it is
-
-
 def solve_camera(
     camera: Camera, points: FloatArray, pixels: FloatArray, solver: Solver = "sqpnp"
-) -> list[PnpSolution]:
+) -> list[FloatArray]:
     """Pose of points seen by one camera.
 
     Parameters
@@ -68,8 +59,8 @@ def solve_camera(
 
     Returns
     -------
-    list of PnpSolution
-        The best first; two for `ippe` where the square has them.
+    list of (4, 4) arrays
+        `camera_from_object`, the best first; two for `ippe` where the square has them.
 
     Raises
     ------
@@ -86,18 +77,21 @@ def solve_camera(
         poses = _pycolmap(camera, points, normalised)
     else:
         poses = _opencv(points, normalised, solver)
-    found = [PnpSolution(pose, _rms_px(camera, pose, points, pixels)) for pose in poses]
-    return _finite(found, f"{solver} found no pose with all points in front of the camera")
+    return _best_first(
+        poses,
+        lambda pose: _rms(camera.project(apply(pose, points)) - pixels),
+        f"{solver} found no pose with all points in front of the camera",
+    )
 
 
-def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolution]:
+def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
     """Pose of a robot seen by one or several cameras.
 
     `pycolmap` works on all cameras at once; the others on one camera, so there is a solution for
     each camera, and for `ippe` two for each marker in each image.
 
-    `solver`: as in `solve_camera`. Returns `world_from_robot`, with residuals over all cameras; the
-    best first. Solutions in which a corner is behind its camera are left out.
+    `solver`: as in `solve_camera`. Returns `world_from_robot`, those with the least residuals over
+    all cameras first. Solutions in which a corner is behind its camera are left out.
     """
     used = np.unique(problem.seen.camera)
     if solver == "pycolmap" and len(used) > 1:
@@ -117,17 +111,23 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[PnpSolut
                 )
             except GeometryError:
                 continue
-            poses += [problem.world_from_camera[index] @ solution.pose for solution in found]
-    solutions = [PnpSolution(pose, robot_rms_px(problem, pose)) for pose in poses]
-    return _finite(solutions, f"{solver} found no pose with all corners in front of their cameras")
+            poses += [problem.world_from_camera[index] @ pose for pose in found]
+    return _best_first(
+        poses,
+        lambda pose: robot_rms_px(problem, pose),
+        f"{solver} found no pose with all corners in front of their cameras",
+    )
 
 
-def _finite(solutions: list[PnpSolution], problem: str) -> list[PnpSolution]:
-    """The solutions with finite residuals, the best first; none is a problem."""
-    finite = [solution for solution in solutions if np.isfinite(solution.rms_px)]
+def _best_first(
+    poses: list[FloatArray], rms_px: Callable[[FloatArray], float], problem: str
+) -> list[FloatArray]:
+    """The poses with finite residuals, the least first; none is a problem."""
+    scored = [(rms_px(pose), pose) for pose in poses]
+    finite = [entry for entry in scored if np.isfinite(entry[0])]
     if not finite:
         raise GeometryError(problem)
-    return sorted(finite, key=lambda solution: solution.rms_px)
+    return [pose for _, pose in sorted(finite, key=lambda entry: entry[0])]
 
 
 def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
@@ -144,21 +144,15 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
     except GeometryError:
         return []
     marker_from_robot = inverse(problem.robot_from_marker[marker])
-    return [
-        problem.world_from_camera[camera] @ solution.pose @ marker_from_robot for solution in found
-    ]
+    return [problem.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
 
 
 def robot_rms_px(problem: PoseProblem, world_from_robot: FloatArray) -> float:
     """Root mean square residual per coordinate; infinite with a corner behind its camera."""
-    return _root_mean_square(problem.pixels(world_from_robot) - problem.seen.pixels)
+    return _rms(problem.pixels(world_from_robot) - problem.seen.pixels)
 
 
-def _rms_px(camera: Camera, pose: FloatArray, points: FloatArray, pixels: FloatArray) -> float:
-    return _root_mean_square(camera.project(apply(pose, points)) - pixels)
-
-
-def _root_mean_square(residuals: FloatArray) -> float:
+def _rms(residuals: FloatArray) -> float:
     value = float(np.sqrt(np.mean(residuals**2)))
     return value if np.isfinite(value) else float("inf")
 
@@ -335,7 +329,7 @@ def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:
 
 def _starts(problem: PoseProblem, settings: PoseSettings) -> list[FloatArray]:
     try:
-        return [solution.pose for solution in solve_robot(problem, settings.solver)]
+        return solve_robot(problem, settings.solver)
     except GeometryError:
         return []
 

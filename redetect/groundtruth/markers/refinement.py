@@ -28,7 +28,7 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.settings import Loss
+from redetect.groundtruth.settings import Loss
 from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
 from redetect.landmarks import squared_mahalanobis
 

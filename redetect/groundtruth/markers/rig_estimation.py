@@ -34,7 +34,7 @@ from redetect.groundtruth.markers.pairs import (
 from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
-from redetect.groundtruth.markers.settings import RigSettings
+from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
 

@@ -12,7 +12,7 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.adjustment import ChainPoints
 from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
-from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.storage.messages import excerpt

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -16,11 +16,10 @@ from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, esti
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
     View,
-    group_by_time,
     pose_problem,
     rig_views,
 )
-from redetect.groundtruth.markers.settings import PoseSettings
+from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
 from redetect.landmarks import squared_mahalanobis
@@ -94,35 +93,25 @@ class Track:
 
 
 def track_robot(
-    frames: Sequence[MarkerFrame],
+    groups: Iterable[tuple[MarkerFrame, ...]],
     rig: Rig,
     network: Network,
     settings: PoseSettings,
-    on_progress: Callable[[], None] | None = None,
-    on_count: Callable[[int], None] | None = None,
 ) -> Track:
     """Work out the robot's poses from the markers found in a session's images.
 
     Parameters
     ----------
-    frames : sequence of MarkerFrame
-        Of all cameras, their indices those of `network`.
-    on_progress : callable, optional
-        Called after each time.
-    on_count : callable, optional
-        Called first, with the number of times.
+    groups : iterable of tuples of MarkerFrame
+        The images of each time (`redetect.groundtruth.markers.session.group_by_time`), their
+        cameras' indices those of `network`.
     """
-    groups = group_by_time(frames, settings.time_tolerance_s)
-    if on_count is not None:
-        on_count(len(groups))
     tracked: list[TrackedTime] = []
     unknown = 0
     for group in groups:
         views = tuple(rig_views(group, rig))
         unknown += sum(len(frame.markers) for frame in group) - len(views)
         tracked.append(_estimated(group, views, rig, network, settings))
-        if on_progress is not None:
-            on_progress()
     open_times = [i for i, t in enumerate(tracked) if t.estimate is not None]
     choices = choose_candidates(
         [tracked[i].time_s for i in open_times],

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel, read_clock
+from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_json
 from redetect.groundtruth.lasers.building import find_building, read_building
@@ -24,12 +24,22 @@ from redetect.groundtruth.trajectories.streams import (
     planar_alignment,
     read_planar_poses,
 )
+from redetect.groundtruth.validation.dimensions import (
+    Dimension,
+    SurveyedFiducials,
+    read_dimensions,
+    read_fiducial_distances,
+    survey_fiducials,
+)
+from redetect.groundtruth.validation.reference_poses import read_survey
 from redetect.storage.bounded import read_bounded
 
 T = TypeVar("T")
 
 #: Streams in the order of the page, with what they are called there.
-STREAMS = {"laser": "laser", "camera": "cameras", "fused": "fused"}
+STREAMS = {"laser": "laser", "camera": "cameras", "filtered": "filter alone", "fused": "fused"}
+#: Pictures that commands wrote, by where they are in the session.
+PICTURES = ("aligned.png", "validation/errors.png", "validation/scans.png")
 
 _GAP_S = 5.0
 _MOST_LINES_BYTES = 1 << 28
@@ -55,7 +65,7 @@ class Inputs:
     building: FloatArray | None = None  # (S, 4)
     # By the names in `STREAMS`, as far as they are there
     streams: dict[str, PlanarPoses] = field(default_factory=dict)
-    # On the ground truth's clock, moved rigidly onto the truth in each visit
+    # On the ground truth's clock, moved rigidly onto the truth (else what was fused) in each visit
     odometry: PlanarPoses | None = None
     truth: PlanarPoses | None = None
     clock: ClockModel | None = None
@@ -64,7 +74,11 @@ class Inputs:
     sets: dict[str, int] = field(default_factory=dict)  # Numbers of sets of scans by status
     # Where the laser's track was not determined within visits
     intervals: list[Interval] = field(default_factory=list)
-    picture: bytes | None = None  # Plots of the validation (PNG)
+    pictures: dict[str, bytes] = field(default_factory=dict)  # By the names in `PICTURES` (PNG)
+    # What was measured in the building by tape
+    dimensions: list[Dimension] = field(default_factory=list)
+    fiducials: SurveyedFiducials | None = None
+    ptpd: PtpdLog | None = None
     # Times between which the robot was in the covered area
     visits: list[tuple[float, float]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # Missing files
@@ -81,7 +95,8 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     inputs = Inputs(session.resolve().name)
     inputs.building = _building(session, inputs)
     for name in STREAMS:
-        stream = _read(inputs, session / f"{name}.csv", read_planar_poses)
+        optional = name == "filtered"
+        stream = _read(inputs, session / f"{name}.csv", read_planar_poses, optional=optional)
         if stream is not None:
             inputs.streams[name] = stream
     if truth is not None:
@@ -96,7 +111,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         session / "fused.json",
         session / "validation" / "validation.json",
     ):
-        document = _read(inputs, path, read_json, quiet=path.name == "clock.json")
+        document = _read(inputs, path, read_json, optional=path.name == "clock.json")
         if document is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
@@ -104,7 +119,13 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     if lines is not None:
         inputs.sets, inputs.intervals = lines
         inputs.intervals = [i for i in inputs.intervals if _within(i, inputs.visits)]
-    inputs.picture = _read(inputs, session / "validation" / "errors.png", _picture)
+    for name in PICTURES:
+        picture = _read(inputs, session / name, _picture)
+        if picture is not None:
+            inputs.pictures[name] = picture
+    inputs.dimensions = _read(inputs, session / "dimensions.csv", read_dimensions) or []
+    inputs.fiducials = _read(inputs, session / "fiducial_distances.csv", _surveyed)
+    inputs.ptpd = _read(inputs, session / "ptpd.log", read_ptpd)
     inputs.odometry = _odometry(session, inputs)
     return inputs
 
@@ -120,19 +141,25 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
 
 
 def _read(
-    inputs: Inputs, path: Path, reader: Callable[[Path], T], *, quiet: bool = False
+    inputs: Inputs, path: Path, reader: Callable[[Path], T], *, optional: bool = False
 ) -> T | None:
-    """The result of a reader for a file, or None and a note."""
+    """The result of a reader for a file, or None and a note; none of a missing one if optional."""
     place = path.name if path.parent.name != "validation" else f"validation/{path.name}"
     try:
         if path.is_file():
             return reader(path)
-        if not quiet:
+        if not optional:
             inputs.missing.append(place)
     except (ValueError, OSError) as error:
-        if not quiet:
-            inputs.problems.append(str(error).replace(os.fspath(path), place))
+        problem = str(error).replace(os.fspath(path), place)
+        if problem not in inputs.problems:
+            inputs.problems.append(problem)
     return None
+
+
+def _surveyed(path: Path) -> SurveyedFiducials:
+    survey = read_survey(path.with_name("fiducials.json"))
+    return survey_fiducials(survey, read_fiducial_distances(path, survey))
 
 
 def _building(session: Path, inputs: Inputs) -> FloatArray | None:
@@ -205,7 +232,8 @@ def _within(interval: Interval, visits: list[tuple[float, float]]) -> bool:
 def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
     """Odometry that can be compared: on the ground truth's clock, moved onto the truth by visit."""
     odometry = _read(inputs, session / "odometry.csv", read_planar_poses)
-    if odometry is None or inputs.truth is None:
+    onto = inputs.truth if inputs.truth is not None else inputs.streams.get("fused")
+    if odometry is None or onto is None:
         return None
     try:
         times = odometry.times_s
@@ -219,7 +247,7 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
     for visit in inputs.visits:
         part = in_visits(odometry, [visit])
         try:
-            mine, theirs, _ = matched_streams(part, inputs.truth)
+            mine, theirs, _ = matched_streams(part, onto)
             parts.append(moved_poses(mine, planar_alignment(mine, theirs)))
         except GroundTruthError:
             continue  # a visit without odometry, or without truth

@@ -14,19 +14,23 @@ from redetect.groundtruth.report.inputs import STREAMS, Inputs, in_visits
 from redetect.groundtruth.report.pictures import (
     Series,
     Track,
+    clock_figure,
     ellipse_figure,
     map_figure,
     series_figure,
+    stages_figure,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
-from redetect.groundtruth.validation.scoring import PoseScore, score_poses
+from redetect.groundtruth.validation.scoring import PoseScore, score_poses, sigma_of
 from redetect.groundtruth.validation.validate import PUBLISHED
+from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of
 
 # Differences remain without colour: dashes.
 _LOOKS: dict[str, tuple[str, tuple[float, ...]]] = {
     "laser": ("#1f5f99", ()),
     "camera": ("#b8560f", (6, 3)),
+    "filtered": ("#b03a48", (4, 2)),
     "fused": ("#2b7a3a", (10, 3, 2, 3)),
     "odometry": ("#7a4fa0", (2, 3)),
     "truth": ("#222222", (1, 3)),
@@ -35,6 +39,7 @@ _MOST_ROWS = 40
 _ELLIPSES = 60
 # Width and height of the validation's plots on the page.
 _VALIDATION_PX = (864, 410)
+_SCANS_PX, _ALIGNMENT_PX = (864, 237), (864, 274)
 
 
 def report_page(inputs: Inputs, version: str) -> bytes:
@@ -44,7 +49,10 @@ def report_page(inputs: Inputs, version: str) -> bytes:
     """
     sections = [
         Section("state", "What there is", _state(inputs)),
+        Section("building", "Drawing and fiducials", _building(inputs)),
+        Section("scanners", "Fixed scanners", _scanners(inputs)),
         Section("map", "Map and path", _maps(inputs)),
+        Section("stages", "A visit, stage by stage", _stages(inputs)),
         Section("errors", "Errors against the truth", _errors(inputs)),
         Section("validation", "Validation at reference poses", _validation(inputs)),
         Section("clock", "Clocks", _clock(inputs)),
@@ -85,6 +93,78 @@ def _extent(poses: PlanarPoses) -> tuple[str, str, str, str]:
         return "0", "-", "-", with_them
     first, last = f"{poses.times_s[0]:.3f}", f"{poses.times_s[-1]:.3f}"
     return str(len(poses)), first, last, with_them
+
+
+def _building(inputs: Inputs) -> list[Part]:
+    content: list[Part] = []
+    if inputs.dimensions:
+        off = 1e3 * np.array([d.drawn_m - d.measured_m for d in inputs.dimensions])
+        rows = [
+            (d.name, f"{d.drawn_m:.3f}", f"{d.measured_m:.3f}", f"{e:+.1f}")
+            for d, e in zip(inputs.dimensions[:_MOST_ROWS], off)
+        ]
+        head = ("dimension", "drawn / m", "measured / m", "drawn less measured / mm")
+        content.append(table("The drawing against dimensions measured in the building", head, rows))
+        words = f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, "
+        content.append(Part("text", words + f"worst {np.abs(off).max():.1f} mm."))
+    if (found := inputs.fiducials) is not None:
+        rows = [
+            (name, *(f"{v:.4f}" for v in place), *(f"{1e3 * v:.1f}" for v in sigma),
+             *(f"{1e3 * v:+.1f}" for v in place - drawn))
+            for name, place, sigma, drawn in zip(
+                found.names, found.places, found.sigma_m, found.drawn)
+        ]  # fmt: skip
+        head = ("fiducial", "x / m", "y / m", "sigma x / mm", "sigma y", "less drawn x / mm", "y")
+        caption = "Fiducials by the distances between them, moved rigidly onto the drawing"
+        content.append(table(caption, head, rows))
+        rms = 1e3 * float(np.sqrt(np.mean(found.residuals_m**2)))
+        words = f"{len(found.residuals_m)} distances, rms residual {rms:.1f} mm."
+        content.append(Part("text", words))
+    return content or [Part("note", "Nothing measured in the building: no dimensions.csv.")]
+
+
+def _scanners(inputs: Inputs) -> list[Part]:
+    document = inputs.documents.get("aligned.json")
+    if document is None:
+        return [Part("note", "No aligned.json: groundtruth lasers writes it.")]
+    content: list[Part] = []
+    steps = _entry(document, "steps", dict)
+    names = [str(s.get("name")) for s in _entry(document, "scanners", list) if isinstance(s, dict)]
+    rows = []
+    try:
+        last = np.array(steps.get("each to the map"), dtype=np.float64).reshape(len(names), 3)
+        for step, value in steps.items():
+            places = np.array(value, dtype=np.float64).reshape(len(names), 3)[:, :2]
+            moved = apply(fitted(places, last[:, :2]), places)
+            far = 1e3 * np.hypot(*(moved - last[:, :2]).T)
+            rows.append((str(step), *(f"{v:.1f}" for v in far)))
+    except (ValueError, TypeError):
+        rows = []
+    if rows:
+        caption = "Distance from the final place after each step, moved rigidly onto these (mm)"
+        content.append(table(caption, ("step", *names), rows))
+    picture = inputs.pictures.get("aligned.png")
+    if picture is not None:
+        words = "Scans of the empty area on the map, and the ICP of each scanner step by step."
+        content.append(image_part(words, picture, "png", *_ALIGNMENT_PX))
+    return content
+
+
+def _stages(inputs: Inputs) -> list[Part]:
+    streams = dict(inputs.streams)
+    if inputs.odometry is not None:
+        streams = {"odometry": inputs.odometry, **streams}
+    if len(streams) < 2 or not inputs.visits:
+        return [Part("note", "Fewer than two streams of poses: no stages.")]
+    number = int(np.argmax([b - a for a, b in inputs.visits]))
+    stages = [
+        _track(name, in_visits(poses, [inputs.visits[number]]), inputs)
+        for name, poses in streams.items()
+    ]
+    stages = [stage for stage in stages if len(stage.poses)]
+    words = f"Visit {number + 1}: " + ", ".join(stage.label for stage in stages)
+    words += f"; grey: {stages[-1].label}." if stages else "nothing."
+    return [stages_figure(words, stages, inputs.building)] if stages else [Part("note", words)]
 
 
 def _track(name: str, poses: PlanarPoses, inputs: Inputs) -> Track:
@@ -218,9 +298,14 @@ def _validation(inputs: Inputs) -> list[Part]:
             f"{_number(figures.get('nees_high'), 1.0, 3)}.",
         )
     )
-    if inputs.picture is not None:
-        words = "Linear and angular errors at each reference pose."
-        content.append(image_part(words, inputs.picture, "png", *_VALIDATION_PX))
+    for name, words, size in (
+        ("errors", "Linear and angular errors at each reference pose.", _VALIDATION_PX),
+        ("scans", "Readings of the scanners on board, by each set of poses.", _SCANS_PX),
+    ):
+        picture = inputs.pictures.get(f"validation/{name}.png")
+        if picture is not None:
+            content.append(image_part(words, picture, "png", *size))
+    content += _on_board(document)
     refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
     if refused:
         content.append(
@@ -235,6 +320,39 @@ def _validation(inputs: Inputs) -> list[Part]:
                 text=(2, 3),
             )
         )  # fmt: skip
+    return content
+
+
+def _on_board(document: dict[str, Any]) -> list[Part]:
+    """Errors of ranges by incidence, and refined mounts."""
+    content = []
+    bins = [row for row in _entry(document, "incidence", list) if isinstance(row, dict)]
+    if bins:
+        rows = [
+            (f"{_number(r.get('from_deg'), 1.0, 0)} to {_number(r.get('to_deg'), 1.0, 0)}",
+             _number(r.get("readings"), 1.0, 0), _number(r.get("mean_m"), 1e3),
+             _number(r.get("sigma_m"), 1e3))
+            for r in bins[:_MOST_ROWS]
+        ]  # fmt: skip
+        caption = "Ranges on board less the walls' distances, by the angle of incidence"
+        head = ("incidence / deg", "readings", "mean / mm", "sigma")
+        content.append(table(caption, head, rows))
+    rows = []
+    for mount in _entry(document, "mounts", list):
+        given, refined, sigma = (
+            _entry(mount if isinstance(mount, dict) else {}, key, list)
+            for key in ("given", "refined", "sigma")
+        )
+        if len(given) == len(refined) == len(sigma) == 3:
+            scales = (1e3, 1e3, 180.0 / math.pi)
+            moved = [_float(b) - _float(a) for a, b in zip(given, refined)]
+            figures = [*zip(given, scales), *zip(moved, scales), *zip(sigma, scales)]
+            words = [_number(v, f, 1 if f == 1e3 else 3) for v, f in figures]
+            rows.append((str(mount.get("name")), *words))
+    if rows:
+        head = ("scanner", "x / mm", "y", "theta / deg", "moved x / mm", "y", "theta / deg",
+                "sigma x / mm", "y", "theta / deg")  # fmt: skip
+        content.append(table("Mounts of the scanners on board, as given and refined", head, rows))
     return content
 
 
@@ -267,6 +385,9 @@ def _clock(inputs: Inputs) -> list[Part]:
     left_out = len(inputs.clock.segments) - len(rows)
     if left_out > 0:
         content.append(Part("note", f"{left_out} more segments are in clock.json."))
+    if any(math.isfinite(s.sigma_offset_s) for s in inputs.clock.segments):
+        words = "The robot's clock less the straight line through its segments."
+        content.append(clock_figure(words, inputs.clock, inputs.ptpd))
     ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
     if isinstance(ptpd, dict):
         content.append(

@@ -14,13 +14,15 @@ import numpy as np
 
 from redetect import plane
 from redetect.array_types import FloatArray
+from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog
 from redetect.groundtruth.lasers.alignment import Alignment, StillScan
+from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.calibration import Rig, marker_corners
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import apply, inverse
-from redetect.groundtruth.validation.validate import PUBLISHED, Figures, PoseError, ReferencePose
+from redetect.groundtruth.validation.validate import PUBLISHED, Figures, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
@@ -163,14 +165,7 @@ def _map(
     size = np.maximum(_scale(tracks, building) * (high - low), (3.0, 2.0))
     with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
         axes = figure.subplots()
-        if building is not None:
-            draw_walls(axes, building)
-        for track in tracks:
-            breaks = np.flatnonzero(np.diff(track.poses.times_s) > _BREAK_S) + 1
-            thin = max(1, len(track.poses) // _MOST_POINTS)
-            pieces = [piece[::thin] for piece in np.split(track.poses.poses[:, :2], breaks)]
-            x, y = np.concatenate([np.vstack([p, (np.nan, np.nan)]) for p in pieces]).T
-            axes.plot(x, y, color=track.colour, lw=1.3, dashes=track.dashes, label=track.label)
+        _draw_paths(axes, tracks, building)
         for outline in outlines:
             axes.fill(*outline.T, fc=tracks[0].colour, ec=tracks[0].colour, lw=0.8, alpha=0.3)
         _frame(axes, low, high)
@@ -178,6 +173,68 @@ def _map(
         if len(tracks) > 1:
             axes.legend(fontsize=8)
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
+
+
+def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None) -> None:
+    """Walls, and paths that break where nothing was measured."""
+    if building is not None:
+        draw_walls(axes, building)
+    for track in tracks:
+        breaks = np.flatnonzero(np.diff(track.poses.times_s) > _BREAK_S) + 1
+        thin = max(1, len(track.poses) // _MOST_POINTS)
+        pieces = [piece[::thin] for piece in np.split(track.poses.poses[:, :2], breaks)]
+        x, y = np.concatenate([np.vstack([p, (np.nan, np.nan)]) for p in pieces]).T
+        axes.plot(x, y, color=track.colour, lw=1.3, dashes=track.dashes, label=track.label)
+
+
+def stages_figure(words: str, stages: Sequence[Track], building: FloatArray | None) -> Part:
+    """The stages of one visit, a map each; the last stage's path is beneath the others."""
+    low, high = _bounds(stages, building)
+    rows = math.ceil(len(stages) / 2)
+    tall = float((high - low)[1] / (high - low)[0])
+    height = min(rows * (0.5 * _WIDE_IN * tall + 0.5), 11.0)
+    last = stages[-1]._replace(colour="0.8", dashes=())
+    with figure_file((_WIDE_IN, height), "svg") as (figure, content):
+        grid = figure.subplots(rows, 2, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes, stage in zip(grid, stages):
+            _draw_paths(axes, [last], building)
+            xy = stage.poses.poses[:, :2]
+            axes.plot(xy[:, 0], xy[:, 1], ".", color=stage.colour, ms=2.5, mew=0)
+            _frame(axes, low, high, f"{stage.label}: {len(xy)} poses", fontsize=9)
+        for axes in grid[len(stages) :]:
+            axes.set_axis_off()
+    return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE_IN, 96.0 * height)
+
+
+def clock_figure(words: str, clock: ClockModel, ptpd: PtpdLog | None) -> Part:
+    """Offsets of the robot's clock by each segment alone, and by ptpd, less one straight line."""
+    known = [s for s in clock.segments if math.isfinite(s.sigma_offset_s)]
+    times = np.array([s.reference_s for s in known])
+    offsets = np.array([s.offset_s if s.own_offset_s is None else s.own_offset_s for s in known])
+    sigma = np.array([s.sigma_offset_s if s.own_sigma_s is None else s.own_sigma_s for s in known])
+    begin, drift = times[0], np.mean([s.rate - 1.0 for s in known])
+    if len(known) > 1:
+        drift = np.polyfit(times - begin, offsets, 1, w=1.0 / np.maximum(sigma, 1e-9))[0]
+    level = np.average(offsets - drift * (times - begin), weights=np.maximum(sigma, 1e-9) ** -2.0)
+
+    def beyond(at: FloatArray, offset_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return (at - begin) / 60.0, 1e3 * (offset_s - level - drift * (at - begin))
+
+    with figure_file((_WIDE_IN, _SERIES_HIGH_IN), "svg") as (figure, content):
+        axes = figure.subplots()
+        if ptpd is not None:
+            timed = np.isfinite(ptpd.times_s)
+            there = ptpd.times_s[timed] - ptpd.offset_s[timed]
+            axes.plot(*beyond(there, ptpd.offset_s[timed]), ".", color=_ORANGE, ms=3, label="ptpd")
+        axes.errorbar(
+            *beyond(times, offsets), yerr=1.96e3 * sigma, fmt="o", color=_BLUE, capsize=3, ms=5,
+            label="segments, 95 %",
+        )  # fmt: skip
+        axes.axhline(0.0, color=_GREY, lw=0.8, label=f"line: drift {1e6 * drift:+.1f} ppm")
+        axes.set(xlabel="time / min", ylabel="offset less the line / ms")
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.25)
+    return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE_IN, 96.0 * _SERIES_HIGH_IN)
 
 
 def _frame(axes: Axes, low: FloatArray, high: FloatArray, title: str = "", **words: Any) -> None:
@@ -265,18 +322,20 @@ def draw_alignment(
     alignment: Alignment,
     scans: list[StillScan],
     building: FloatArray,
+    icp_rms_m: list[FloatArray],
 ) -> bytes:
     """Draw the scans on the map by the measured poses and by those found; a PNG's bytes.
 
-    The same input gives the same bytes.
+    Beside them `icp_rms_m`, for each scanner the distances from the map (m) step by step of an ICP
+    from its measured pose. The same input gives the same bytes.
     """
-    with figure_file((13.5, 6.2), "png") as (figure, content):
+    with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]
         before = [scanner.pose for scanner in measured]
         everything = np.concatenate([plane.apply(p, s.points) for p, s in zip(after, scans)])
         low, high = everything.min(axis=0) - 0.5, everything.max(axis=0) + 0.5
-        panels = zip(figure.subplots(1, 2), (before, after), ("measured by hand", "aligned"))
-        for axes, poses, title in panels:
+        *maps, steps = figure.subplots(1, 3)
+        for axes, poses, title in zip(maps, (before, after), ("measured by hand", "aligned")):
             draw_walls(axes, building)
             for k, (pose, scan) in enumerate(zip(poses, scans)):
                 colour = _COLOURS[k % len(_COLOURS)]
@@ -289,17 +348,21 @@ def draw_alignment(
                 )
             _frame(axes, low, high, title)
         axes.legend(loc="upper right", framealpha=0.9)
+        for k, rms_m in enumerate(icp_rms_m):
+            steps.plot(1e3 * rms_m, ".-", color=_COLOURS[k % len(_COLOURS)], lw=1.2)
+        steps.set(yscale="log", xlabel="step", ylabel="rms distance from the map / mm")
+        steps.set_title("ICP of each scanner to the map, from its measured pose")
+        steps.grid(alpha=0.25)
     return content.getvalue()
 
 
+# Points farther from every wall are of something else.
+_OF_A_WALL_M = 0.2
 _BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
 def draw_errors(
-    references: Sequence[ReferencePose],
-    errors: Sequence[PoseError],
-    figures: Figures,
-    building: FloatArray | None = None,
+    errors: ReferenceErrors, figures: Figures, building: FloatArray | None = None
 ) -> bytes:
     """Draw errors with bounds by their covariances; returns a PNG's bytes.
 
@@ -311,12 +374,11 @@ def draw_errors(
     with figure_file((13.5, 6.4), "png") as (figure, content):
         grid = figure.add_gridspec(2, 2, width_ratios=[1.25, 1.0])
         linear, angular = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-        names = [str(error.index) for error in errors]
-        at = np.arange(len(errors))
-        heights = 1e3 * np.array([error.linear_m for error in errors])
-        linear.bar(at, heights, color=_BLUE, width=0.6, label="error")
+        names = [str(reference.index) for reference in errors.references]
+        at = np.arange(len(names))
+        linear.bar(at, 1e3 * errors.linear_m, color=_BLUE, width=0.6, label="error")
         # Of two independent directions: the root mean square, so that it compares with errors.
-        expected = 1e3 * np.array([error.sigma_linear_m for error in errors])
+        expected = 1e3 * errors.sigma[:, 0]
         if np.isfinite(expected).any():
             linear.plot(at, expected, "_", color=_ORANGE, ms=11, mew=2, label="expected (rms)")
         linear.axhline(1e3 * figures.linear_mean_m, color=_BLUE, lw=1.0, ls="--", label="mean")
@@ -333,8 +395,7 @@ def draw_errors(
             f"{1e3 * figures.linear_sigma_m:.2f} mm, worst {1e3 * figures.linear_worst_m:.2f} mm",
             fontsize=10,
         )
-        turns = np.degrees([error.angular_rad for error in errors])
-        sigma = np.degrees([error.sigma_angular_rad for error in errors])
+        turns, sigma = np.degrees(errors.error[:, 2]), np.degrees(errors.sigma[:, 1])
         angular.axhline(0.0, color=_GREY, lw=0.8)
         angular.errorbar(
             at, turns, yerr=np.where(np.isfinite(sigma), sigma, 0.0), fmt="o", color=_BLUE,
@@ -359,10 +420,8 @@ def draw_errors(
         where = figure.add_subplot(grid[:, 1])
         if building is not None:
             draw_walls(where, building)
-        by_index = {reference.index: reference for reference in references}
-        poses = np.array([by_index[error.index].pose for error in errors])
-        shown = np.array([[error.x_m, error.y_m] for error in errors])
-        span = float(np.ptp(poses[:, :2], axis=0).max()) if len(errors) > 1 else 1.0
+        poses, shown = np.array([r.pose for r in errors.references]), errors.error
+        span = float(np.ptp(poses[:, :2], axis=0).max()) if len(poses) > 1 else 1.0
         factor = _round_factor(0.12 * max(span, 1.0) / max(figures.linear_worst_m, 1e-6))
         where.quiver(
             poses[:, 0], poses[:, 1], factor * shown[:, 0], factor * shown[:, 1], angles="xy",
@@ -372,12 +431,44 @@ def draw_errors(
         ends = np.stack([poses[:, :2], ahead])
         where.plot(ends[:, :, 0], ends[:, :, 1], color="0.2", lw=1.2, zorder=2)
         where.plot(poses[:, 0], poses[:, 1], "o", color="0.2", ms=3, zorder=2)
-        for error, pose in zip(errors, poses):
-            where.annotate(
-                str(error.index), pose[:2], xytext=(4, 4), textcoords="offset points", fontsize=7
-            )
+        for name, pose in zip(names, poses):
+            where.annotate(name, pose[:2], xytext=(4, 4), textcoords="offset points", fontsize=7)
         low, high = poses[:, :2].min(axis=0) - 1.5, poses[:, :2].max(axis=0) + 1.5
         _frame(where, low, high, f"errors, drawn {factor:g} times as long", fontsize=10)
+    return content.getvalue()
+
+
+def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
+    """Draw what the scanners on board saw on the map, by each set of poses; a PNG's bytes.
+
+    The sets are the reference poses by distances alone, those that the scans refined, and the
+    ground truth. The same input gives the same bytes.
+    """
+    kept = [i for i, r in enumerate(errors.references) if r.still is not None]
+    refined = np.stack([errors.references[i].pose for i in kept])
+    distances = np.stack([errors.references[i].distances.candidates[0] for i in kept])
+    clouds = [still.robot_points() for i in kept if (still := errors.references[i].still)]
+    sets = {
+        "poses by distances": distances,
+        "refined by the scans": refined,
+        "by the ground truth": refined + errors.error[kept],
+    }
+    with figure_file((13.5, 3.7), "png") as (figure, content):
+        for axes, (title, poses) in zip(
+            figure.subplots(1, 3, sharex=True, sharey=True), sets.items()
+        ):
+            points = np.concatenate([plane.apply(p, cloud) for p, cloud in zip(poses, clouds)])
+            squared = nearest_on_segments(points, building)[2]
+            near = np.sqrt(squared[squared < _OF_A_WALL_M**2])
+            draw_walls(axes, building)
+            axes.plot(points[:, 0], points[:, 1], ".", color=_BLUE, ms=1.5, alpha=0.4, mew=0)
+            axes.plot(poses[:, 0], poses[:, 1], "x", color=_ORANGE, ms=4)
+            low, high = (
+                np.quantile(points, 0.01, axis=0) - 0.5,
+                np.quantile(points, 0.99, axis=0) + 0.5,
+            )
+            rms = 1e3 * float(np.sqrt(np.mean(near**2))) if len(near) else math.nan
+            _frame(axes, low, high, f"{title}: {rms:.1f} mm rms from the walls", fontsize=10)
     return content.getvalue()
 
 

@@ -8,8 +8,6 @@ a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth th
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import read_text
+from redetect.groundtruth.files import parse_numbers, read_rows
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
@@ -30,8 +28,6 @@ RAWSEEDS_ROUNDING = 5e-7
 
 _POSE_COLUMNS = 4
 _COVARIANCE_COLUMNS = 13
-_LARGEST_FILE_BYTES = 1 << 28
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,26 +106,21 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
         If the file cannot be read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
-    columns: int | None = None
-    for line, words in _rows(path):
-        if columns is None:
-            columns = len(words)
-        if len(words) not in (_POSE_COLUMNS, _COVARIANCE_COLUMNS) or len(words) != columns:
-            expected = "4 or 13" if not rows else str(columns)
-            raise StreamError(
-                path,
-                line,
-                f"{len(words)} numbers: expected {expected}: t, x, y, theta and 9 of covariance",
-            )
-        rows.append(_numbers(path, line, words))
+    allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
+    for line, words in read_rows(path):
+        if len(words) not in allowed:
+            expected = f"{' or '.join(map(str, allowed))}: t, x, y, theta and 9 of covariance"
+            raise StreamError(path, line, f"{len(words)} numbers: expected {expected}")
+        allowed = (len(words),)
+        rows.append(parse_numbers(path, line, words))
         if len(rows) > 1 and rows[-1][0] < rows[-2][0]:
             raise StreamError(
                 path, line, f"time {rows[-1][0]:.6f} s is before the row above: expected in order"
             )
-    if columns is None:
+    if not rows:
         raise StreamError(path, None, "no poses in it")
     table = np.array(rows)
-    covariances = table[:, 4:].reshape(-1, 3, 3) if columns == _COVARIANCE_COLUMNS else None
+    covariances = table[:, 4:].reshape(-1, 3, 3) if allowed == (_COVARIANCE_COLUMNS,) else None
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
 
 
@@ -179,13 +170,13 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
         If the file cannot be read, a row is malformed or a prefix is listed twice.
     """
     times: dict[str, float] = {}
-    for line, words in _rows(path):
+    for line, words in read_rows(path):
         if len(words) != 2:
             raise StreamError(path, line, f"{len(words)} words: expected a prefix and seconds")
         prefix = words[0]
         if prefix in times:
             raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
-        times[prefix] = _numbers(path, line, words[1:])[0]
+        times[prefix] = parse_numbers(path, line, words[1:])[0]
     return times
 
 
@@ -213,34 +204,15 @@ def read_rows_of_numbers(
         If the file cannot be read, is empty or a row is malformed; it names file and line.
     """
     rows: list[list[float]] = []
-    for line, words in _rows(path):
+    for line, words in read_rows(path):
         if not rows and words == head.split(","):
             continue
         if len(words) != columns:
             raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
-        rows.append(_numbers(path, line, words))
+        rows.append(parse_numbers(path, line, words))
     if not rows:
         raise StreamError(path, None, f"no rows in it: expected {expected}")
     return np.array(rows)
-
-
-def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers and words, without comments and blank lines."""
-    text = read_text(path, _LARGEST_FILE_BYTES, "rows of numbers")
-    for number, line in enumerate(text.split("\n"), 1):
-        content = line.partition("#")[0].strip()
-        if content:
-            yield number, re.split(r"\s*,\s*|\s+", content)
-
-
-def _numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[float]:
-    numbers = []
-    for word in words:
-        value = float(word) if _NUMBER.fullmatch(word) else float("nan")
-        if not np.isfinite(value):
-            raise StreamError(path, line, f"{excerpt(word)}: expected a finite number")
-        numbers.append(value)
-    return numbers
 
 
 def interpolate_poses(

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,14 +22,13 @@ from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import is_number, read_json, read_text
+from redetect.groundtruth.files import JsonObject, read_rows
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
+from redetect.storage.bounds import ABOVE_0
 from redetect.storage.messages import excerpt
 
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
-_NAME = re.compile(r"[^\s,#\"]{1,64}")
-_LARGEST_FILE_BYTES = 1 << 26
 _FARTHEST_M = 1e6
 
 
@@ -63,14 +61,10 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     GroundTruthError
         If the file cannot be read, or an entry is missing or impossible.
     """
-    content = read_json(path)
-    if content.get("version") != 1:
-        raise GroundTruthError(f"{path}: version is {excerpt(content.get('version'))}: expected 1")
-    sigma = content.get("sigma_m")
-    if not is_number(sigma) or not 0.0 < sigma < _FARTHEST_M:
-        raise GroundTruthError(f"{path}: sigma_m is {excerpt(sigma)}: expected metres above 0")
-    points = [_points(path, content, key) for key in ("fiducials", "robot_points")]
-    return Survey(points[0], points[1], float(sigma))
+    content = JsonObject.read(path)
+    content.demand_version()
+    fiducials, robot_points = (_points(content, key) for key in ("fiducials", "robot_points"))
+    return Survey(fiducials, robot_points, content.number("sigma_m", ABOVE_0))
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
@@ -91,34 +85,22 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     StreamError
         If the file cannot be read, a row is malformed or names a point that is not known.
     """
-    text = read_text(path, _LARGEST_FILE_BYTES, "rows")
     rows: list[Distance] = []
-    for number, line in enumerate(text.split("\n"), 1):
-        content = line.partition("#")[0].strip()
-        if not content or (not rows and content == DISTANCES_HEAD):
-            continue
-        rows.append(_distance(path, number, [word.strip() for word in content.split(",")], survey))
+    for line, words in read_rows(path):
+        if rows or words != DISTANCES_HEAD.split(","):
+            rows.append(_distance(path, line, words, survey))
     return rows
 
 
-def _points(
-    path: str | os.PathLike[str], content: dict[str, Any], key: str
-) -> dict[str, FloatArray]:
-    entries = content.get(key)
-    if not isinstance(entries, dict) or len(entries) < 2:
-        raise GroundTruthError(f"{path}: {key}: expected two or more points by name")
-    points = {}
-    for name, value in entries.items():
-        good = isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
-        if not good or not all(abs(x) < _FARTHEST_M for x in value):
-            raise GroundTruthError(
-                f"{path}: {key}: {excerpt(name)} is {excerpt(value)}: expected [x, y]"
-            )
-        if not _NAME.fullmatch(name):
-            raise GroundTruthError(
-                f"{path}: {key}: {excerpt(name)}: expected a name without blanks"
-            )
-        points[name] = np.array(value, dtype=np.float64)
+def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
+    names = content.values.get(key)
+    if not isinstance(names, dict) or len(names) < 2:
+        raise GroundTruthError(f"{content.place}: {key}: expected two or more points by name")
+    entries = JsonObject(f"{content.place}: {key}", names)
+    points = {name: entries.numbers(name, 2) for name in names}
+    for name, point in points.items():
+        if not np.all(np.abs(point) < _FARTHEST_M):
+            raise entries.wrong(name, f"less than {_FARTHEST_M:g} m")
     return points
 
 

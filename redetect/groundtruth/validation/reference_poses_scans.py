@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from redetect.array_types import FloatArray
+from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import IcpResult, IcpSettings, icp_to_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
@@ -69,17 +70,97 @@ class StillPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedPose:
-    """A reference pose after refinement by scans."""
+class ReferencePose:
+    """A reference pose, and how it came about."""
 
-    pose: FloatArray  # (3,)
+    distances: DistancePose
+    pose: FloatArray  # (3,): x, y (m), theta (rad)
     covariance: FloatArray  # (3, 3)
     # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
     # `moved`: the robot was not at rest; `no scans`: too few readings are on walls; `not asked`.
     scans: ScanStatus
+    note: str  # Remarks
+    points: int = 0  # Points of the scans on walls that count
+    rms_m: float = math.nan  # Of their distances from the walls; NaN without.
+    still: StillPoints | None = None  # What the scanners on board saw, at rest
+
+    @property
+    def index(self) -> int:
+        """Its number in the file of distances."""
+        return self.distances.index
+
+    @property
+    def time_s(self) -> float:
+        """When it was measured, on the ground truth's clock."""
+        return self.distances.time_s
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A pose that is no reference, and why."""
+
+    index: int
+    time_s: float
+    status: str
     reason: str
-    points: int  # Points on walls that count
-    rms_m: float  # Of their distances from the walls; NaN without.
+
+
+def reference_poses(
+    distances: Sequence[DistancePose],
+    onboard: Sequence[Onboard] = (),
+    segments: FloatArray | None = None,
+    clock: ClockModel | None = None,
+) -> tuple[list[ReferencePose], list[Refused]]:
+    """Poses from distances, refined by scans where these help.
+
+    Parameters
+    ----------
+    distances : sequence of DistancePose
+        From `redetect.groundtruth.validation.reference_poses.poses_from_distances`.
+    onboard : sequence of Onboard
+        Scanners on board; without any, distances alone count.
+    segments : (S, 4) array, optional
+        The building's walls, needed with scanners.
+    clock : ClockModel, optional
+        Without it the robot's clock is assumed to be the ground truth's.
+
+    Returns
+    -------
+    refused : list of Refused
+        Those that distances leave ambiguous, undetermined or inconsistent.
+    """
+    references: list[ReferencePose] = []
+    refused: list[Refused] = []
+    for d in distances:
+        reference, reason = None, d.reason
+        if d.status in ("ok", "ambiguous") and onboard and segments is not None:
+            time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
+            reason = f"{d.reason}; the walls do not decide"
+            try:
+                reference = refine_pose(d, still_points(onboard, time), segments)
+            except GeometryError as error:
+                if d.status == "ok":
+                    reference = _unrefined(d, "moved", str(error))
+        elif d.status == "ok":
+            reference = _unrefined(d, "not asked")
+        if reference is None:
+            refused.append(Refused(d.index, d.time_s, d.status, reason))
+        else:
+            references.append(reference)
+    return references, refused
+
+
+def _unrefined(
+    d: DistancePose,
+    scans: ScanStatus,
+    reason: str = "",
+    chosen: int = 0,
+    still: StillPoints | None = None,
+) -> ReferencePose:
+    """The pose by distances alone."""
+    note = "; ".join(part for part in (d.reason, reason) if part)
+    pose, covariance = d.candidates[chosen], d.covariances[chosen]
+    return ReferencePose(d, pose, covariance, scans, note, still=still)
 
 
 def still_points(onboard: Sequence[Onboard], time_s: float) -> StillPoints:
@@ -116,7 +197,7 @@ def still_points(onboard: Sequence[Onboard], time_s: float) -> StillPoints:
 
 def refine_pose(
     distances: DistancePose, points: StillPoints, segments: FloatArray
-) -> RefinedPose | None:
+) -> ReferencePose | None:
     """Combine what distances and walls say of a pose.
 
     Parameters
@@ -128,7 +209,7 @@ def refine_pose(
 
     Returns
     -------
-    RefinedPose or None
+    ReferencePose or None
         None if several poses fit and the walls do not decide.
     """
     cloud = points.robot_points()
@@ -139,33 +220,33 @@ def refine_pose(
             return None
         chosen = decided
     prior, covariance = distances.candidates[chosen], distances.covariances[chosen]
-
-    def unrefined(status: ScanStatus, reason: str) -> RefinedPose:
-        return RefinedPose(prior, covariance, status, reason, 0, math.nan)
-
     try:
         found = _aligned(cloud, segments, prior)
     except (GeometryError, GroundTruthError) as error:
-        return unrefined("no scans", str(error))
+        return _unrefined(distances, "no scans", str(error), chosen)
     if len(found.undetermined) or not np.isfinite(found.covariance).all():
-        return unrefined("undetermined", "the walls leave a direction open")
+        reason = "the walls leave a direction open"
+        return _unrefined(distances, "undetermined", reason, chosen, points)
     own = found.covariance + _mount_covariance(points, segments, found)
     apart = found.pose - prior
     apart[2] = wrap_angle(apart[2])
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
     if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
-        return unrefined(
-            "disagrees",
+        reason = (
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
-            "from the pose by distances, more than both allow",
+            "from the pose by distances, more than both allow"
         )
+        return _unrefined(distances, "disagrees", reason, chosen, points)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
     # Joseph's form stays symmetric and positive.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return RefinedPose(pose, combined, "used", "", int(found.used.sum()), found.rms_m)
+    points_used = int(found.used.sum())
+    return ReferencePose(
+        distances, pose, combined, "used", distances.reason, points_used, found.rms_m, points
+    )
 
 
 def _aligned(cloud: FloatArray, segments: FloatArray, start: FloatArray) -> IcpResult:

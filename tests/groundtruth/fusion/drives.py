@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.fuse import FuseSettings
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.landmarks import wrap_angle
 

@@ -12,8 +12,10 @@ from scipy.optimize import least_squares
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse, noise_of
+from redetect.groundtruth.fusion.fuse import fuse
+from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,

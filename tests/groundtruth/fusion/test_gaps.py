@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.fuse import fuse
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.landmarks import wrap_angle
 from redetect.plane import between

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.inputs import FuseSettings
 from redetect.groundtruth.fusion.kernels import STATE, arc_integrals, move
 from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle

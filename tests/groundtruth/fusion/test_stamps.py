@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.fuse import FuseSettings, fuse
+from redetect.groundtruth.fusion.fuse import fuse
 from redetect.groundtruth.fusion.movement import movement_problem
+from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from tests.groundtruth.fusion.drives import LASER_COVARIANCE, drive, measure, normalised_error
 

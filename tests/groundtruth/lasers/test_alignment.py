@@ -15,11 +15,11 @@ from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.alignment import (
     STEPS,
-    AlignmentSettings,
     align_scanners,
     still_scan,
 )
 from redetect.groundtruth.lasers.scanners import Scanner, Scans, read_scanners
+from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
 from tests.groundtruth.lasers.scene import (
@@ -161,7 +161,7 @@ def test_bad_input_is_said() -> None:
     with pytest.raises(GroundTruthError, match="gate_m"):
         AlignmentSettings(gate_m=-1.0)
     with pytest.raises(GroundTruthError, match="kept"):
-        AlignmentSettings(kept=0.0)
+        AlignmentSettings(keep=0.0)
 
 
 @pytest.mark.long

@@ -15,7 +15,6 @@ from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     AGREES_M,
-    LaserSettings,
     acquire,
     explain,
     refine,
@@ -42,6 +41,7 @@ from redetect.groundtruth.lasers.tracking import (
     track_without_suspects,
 )
 from redetect.groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, new_points
+from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert
@@ -438,7 +438,7 @@ def test_a_session_without_the_robot_gives_no_pose(
 
 def test_settings_are_checked() -> None:
     with pytest.raises(GroundTruthError, match="kept"):
-        LaserSettings(kept=1.2)
+        LaserSettings(keep=1.2)
     with pytest.raises(GroundTruthError, match="gate_m"):
         LaserSettings(gate_m=float("nan"))
     with pytest.raises(GroundTruthError, match="no scanners"):

@@ -12,7 +12,7 @@ from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import ChainPoints
 from redetect.groundtruth.markers.poses import SOLVERS, estimate_pose
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
-from redetect.groundtruth.markers.settings import PoseSettings, Solver
+from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     inverse,
     log_se3,

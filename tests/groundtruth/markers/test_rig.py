@@ -25,8 +25,8 @@ from redetect.groundtruth.markers.rig_estimation import (
     rig_by_reference_poses,
 )
 from redetect.groundtruth.markers.session import MarkerFrame
-from redetect.groundtruth.markers.settings import RigSettings
 from redetect.groundtruth.report.pictures import draw_rig
+from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import (
     exp_se3,

@@ -59,10 +59,10 @@ def test_distances_come_back(tmp_path: Path) -> None:
         ({"sigma_m": float("nan")}, "sigma_m is nan"),
         ({"fiducials": {"a": [0, 0]}}, "fiducials: expected two or more"),
         ({"fiducials": [[0, 0], [1, 1]]}, "fiducials: expected two or more"),
-        ({"fiducials": {"a": [0, 0], "b": [1]}}, "fiducials: 'b'"),
-        ({"fiducials": {"a": [0, 0], "b": [1, float("inf")]}}, "fiducials: 'b'"),
-        ({"robot_points": {"a": [0, 0], "b, c": [1, 1]}}, "without blanks"),
-        ({"robot_points": {"a": [0, 0], "b": [True, 1]}}, "robot_points: 'b'"),
+        ({"fiducials": {"a": [0, 0], "b": [1]}}, "fiducials: b is"),
+        ({"fiducials": {"a": [0, 0], "b": [1, float("inf")]}}, "fiducials: b is"),
+        ({"fiducials": {"a": [0, 0], "b": [1, 1e9]}}, "less than 1e.06 m"),
+        ({"robot_points": {"a": [0, 0], "b": [True, 1]}}, "robot_points: b is"),
     ],
 )
 def test_malformed_surveys_are_refused(

@@ -20,7 +20,8 @@ from redetect.groundtruth.trajectories.streams import (
     write_planar_poses,
 )
 from redetect.groundtruth.validation.reference_poses import Distance, Survey, poses_from_distances
-from redetect.groundtruth.validation.validate import figures_of, pose_errors, reference_poses
+from redetect.groundtruth.validation.reference_poses_scans import reference_poses
+from redetect.groundtruth.validation.validate import figures_of, pose_errors
 from tools.simulator.laser.writers import (
     write_building,
     write_distances,
@@ -100,11 +101,9 @@ def test_known_errors_come_back() -> None:
     wrong = STANDS + np.array([0.03, -0.04, 0.1])
     errors, without = pose_errors(references, ground_truth(wrong))
     assert not without
-    for error in errors:
-        assert error.linear_m == pytest.approx(0.05, abs=1e-7)
-        assert error.x_m == pytest.approx(0.03, abs=1e-7)
-        assert error.angular_rad == pytest.approx(0.1, abs=1e-7)  # past pi at the second
-        assert math.isnan(error.nees)
+    # The second heading is past pi.
+    np.testing.assert_allclose(errors.error, np.tile([0.03, -0.04, 0.1], (4, 1)), atol=1e-7)
+    assert np.isnan(errors.nees).all()
     figures = figures_of(errors)
     assert figures.linear_mean_m == pytest.approx(0.05, abs=1e-7)
     assert figures.linear_sigma_m == pytest.approx(0.0, abs=1e-7)
@@ -135,10 +134,10 @@ def test_a_reference_without_ground_truth_is_named() -> None:
     poses = ground_truth(STANDS)
     part = PlanarPoses(poses.times_s[:4], poses.poses[:4])
     errors, without = pose_errors(references, part)
-    assert [error.index for error in errors] == [0, 1]
+    assert [reference.index for reference in errors.references] == [0, 1]
     assert [entry.index for entry in without] == [2, 3]
     with pytest.raises(GroundTruthError, match="no reference pose"):
-        figures_of([])
+        figures_of(pose_errors(references[2:], part)[0])
 
 
 def test_the_nearest_pose_counts_as_it_is() -> None:
@@ -150,10 +149,10 @@ def test_the_nearest_pose_counts_as_it_is() -> None:
     covariances = np.arange(1.0, 8.0)[:, None, None] * 1e-6 * np.eye(3)
     errors, without = pose_errors(references, PlanarPoses(times, rows, covariances))
     assert [entry.index for entry in without] == [1]  # both are more than half a second away
-    assert [error.index for error in errors] == [0, 2, 3]
-    np.testing.assert_allclose([error.x_m for error in errors], [0.001, 0.002, 0.003], atol=1e-7)
+    assert [reference.index for reference in errors.references] == [0, 2, 3]
+    np.testing.assert_allclose(errors.error[:, 0], [0.001, 0.002, 0.003], atol=1e-7)
     extra = references[0].covariance[0, 0] + references[0].covariance[1, 1]
-    assert errors[0].sigma_linear_m == pytest.approx(math.sqrt(2 * 2e-6 + extra))
+    assert errors.sigma[0, 0] == pytest.approx(math.sqrt(2 * 2e-6 + extra))
 
 
 def test_the_command_writes_the_folder(session: Path, capsys: pytest.CaptureFixture[str]) -> None:

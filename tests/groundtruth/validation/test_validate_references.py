@@ -224,7 +224,7 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
         prior = solved(measured(truth, survey, rng), survey)
         refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
         assert refined is not None
-        assert refined.scans == "used", refined.reason
+        assert refined.scans == "used", refined.note
         error = refined.pose - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
         total += float(error @ np.linalg.solve(refined.covariance, error))
@@ -273,7 +273,7 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
     assert refined is not None
     assert refined.scans == "disagrees"
-    assert "more than both allow" in refined.reason
+    assert "more than both allow" in refined.note
     np.testing.assert_array_equal(refined.pose, prior.candidates[0])
     # No readings at all about the time.
     nothing = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 99.0), ROOM)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.lasers.scanners import Scanner, Scans, write_scanners
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     write_planar_poses,
 )
+from redetect.groundtruth.validation.dimensions import DIMENSIONS_HEAD, FIDUCIAL_DISTANCES_HEAD
 from redetect.groundtruth.validation.reference_poses import Distance, Survey
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
@@ -40,6 +43,8 @@ LOG_MARGIN_S = 5.0
 
 _CAMERAS = np.array([[0.3, 0.4], [9.6, 7.1]])
 _NEAREST_FIDUCIALS = 4
+#: How many walls are measured by tape: the longest.
+_DIMENSIONS = 12
 
 
 def exact_poses(plan: SessionPlan, times_s: FloatArray) -> PlanarPoses:
@@ -169,6 +174,7 @@ def write_session(
     write_planar_poses(folder / "camera.csv", camera_stream(plan), overwrite=overwrite)
     write_survey(folder / "fiducials.json", survey_of(plan), {"note": NOTE}, overwrite=overwrite)
     write_distances(folder / "distances.csv", measured_distances(plan), overwrite=overwrite)
+    _write_tape(plan, folder, overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
     write_bytes(folder / "ptpd.log", ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
@@ -176,11 +182,49 @@ def write_session(
     return plan
 
 
+def _write_tape(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
+    """Dimensions of the building and distances between fiducials, measured by tape."""
+    rng, sigma = plan.random("tape"), plan.settings.distance_sigma_m
+    drawn, walls = _drawn(plan), plan.site.walls
+    length = np.hypot(*(walls[:, 2:] - walls[:, :2]).T)
+    rows = [
+        f"wall{i},{','.join(f'{x:.4f}' for x in drawn[i])},{length[i] + rng.normal(0.0, sigma):.4f}"
+        for i in np.argsort(-length, kind="stable")[:_DIMENSIONS]
+    ]
+    lines = "\n".join([DIMENSIONS_HEAD, *rows]) + "\n"
+    write_bytes(folder / "dimensions.csv", lines.encode(), overwrite=overwrite)
+    rows = [
+        f"{a},{b},{math.dist(FIDUCIALS[a], FIDUCIALS[b]) + rng.normal(0.0, sigma):.4f}"
+        for a, b in combinations(FIDUCIALS, 2)
+    ]
+    lines = "\n".join([FIDUCIAL_DISTANCES_HEAD, *rows]) + "\n"
+    write_bytes(folder / "fiducial_distances.csv", lines.encode(), overwrite=overwrite)
+
+
+def _drawn(plan: SessionPlan) -> FloatArray:
+    """(S, 4) walls as the drawing has them."""
+    sigma, walls = plan.settings.drawing_sigma_m, plan.site.walls
+    return walls + sigma * plan.random("drawing").standard_normal(walls.shape)
+
+
+def _mounted_by_hand(plan: SessionPlan) -> Robot:
+    """The robot with the mounts of its scanners as they were measured."""
+    settings, rng = plan.settings, plan.random("mounts")
+    sigma = np.array(
+        [settings.mount_sigma_m, settings.mount_sigma_m, np.deg2rad(settings.mount_sigma_deg)]
+    )
+    scanners = tuple(
+        replace(s, pose=s.pose + sigma * rng.standard_normal(3), covariance=np.diag(sigma**2))
+        for s in plan.robot.scanners
+    )
+    return replace(plan.robot, scanners=scanners)
+
+
 def _write_site(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
-    building = plan.site.walls
+    building = _drawn(plan)
     write_building(folder / "building.csv", building, overwrite=overwrite)
     write_drawing(folder / "building.dxf", building, overwrite=overwrite)
-    write_robot(folder / "robot.json", plan.robot, {"note": NOTE}, overwrite=overwrite)
+    write_robot(folder / "robot.json", _mounted_by_hand(plan), {"note": NOTE}, overwrite=overwrite)
     x, y = ROOM_M
     extra = {"note": NOTE, "covered_area": [[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]]}
     write_scanners(folder / "scanners.json", _measured_by_hand(plan), extra, overwrite=overwrite)

@@ -95,7 +95,10 @@ class LaserSettings:
     clock_drift: float = 4e-5  # The robot's clock goes faster by this share.
     hand_sigma_m: float = 0.05  # Of the fixed scanners' positions measured by hand.
     hand_sigma_deg: float = 2.0  # Of their directions.
-    distance_sigma_m: float = 0.005  # Of the distances to the fiducials.
+    distance_sigma_m: float = 0.005  # Of the distances to the fiducials, and all others by tape.
+    drawing_sigma_m: float = 0.0  # Of the walls' ends in the drawing, as against the building.
+    mount_sigma_m: float = 0.0  # Of the places of the scanners on board, as measured by hand.
+    mount_sigma_deg: float = 0.0  # Of their directions.
     reading: ReadingErrors = field(default_factory=ReadingErrors)
     wheels: WheelErrors = field(default_factory=WheelErrors)
     driving: DrivingLimits = field(default_factory=DrivingLimits)
@@ -107,7 +110,8 @@ class LaserSettings:
             self, GroundTruthError, visits=ABOVE_0, visit_s=ABOVE_0, rate_hz=ABOVE_0,
             onboard_hz=ABOVE_0, odometry_hz=ABOVE_0, camera_hz=ABOVE_0, truth_hz=ABOVE_0,
             ptpd_hz=ABOVE_0, empty_s=ABOVE_0, stand_s=ABOVE_0, references=NOT_NEGATIVE,
-            passers=NOT_NEGATIVE, between_s=NOT_NEGATIVE,
+            passers=NOT_NEGATIVE, between_s=NOT_NEGATIVE, drawing_sigma_m=NOT_NEGATIVE,
+            mount_sigma_m=NOT_NEGATIVE, mount_sigma_deg=NOT_NEGATIVE,
             max_range_m=Bounds("above 0, at most 65", 0.0, 65.0, above=True),
         )  # fmt: skip
         # A clock that is set back gives two readings the same stamp.

@@ -1,0 +1,186 @@
+"""Settings of all estimations, for the command line and library callers.
+
+Nothing heavy is imported here: `--help` is quick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.storage.bounds import (
+    FINITE,
+    PROBABILITY,
+    Bounds,
+    NotNegative,
+    Positive,
+    ShareAbove0,
+    demand_fields,
+    inside,
+    whole,
+)
+
+Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
+Loss = Literal["linear", "huber", "cauchy"]
+
+_ODDS = Bounds("more than 1", 1.0, above=True, below=True)
+
+
+class _Bounded:
+    """Settings whose numbers are within the bounds that annotate them.
+
+    Raises
+    ------
+    GroundTruthError
+        If a number is not.
+    """
+
+    def __post_init__(self) -> None:
+        demand_fields(self, GroundTruthError)
+
+
+@dataclass(frozen=True)
+class PoseSettings(_Bounded):
+    """Settings of the poses."""
+
+    solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
+    loss: Loss = "huber"  # How markers that fit badly are weighted in the least squares.
+    loss_scale: Positive = 2.0  # Normalised error of a marker at which its weight begins to fall.
+    # A marker in an image is left out, and listed, if its normalised error is larger than this
+    # and its residual larger than --outlier-px.
+    outlier_sigma: Positive = 5.0
+    outlier_px: NotNegative = 1.0  # Root mean square residual of what may be left out (px).
+    # Standard deviation added to each corner's own covariance, for errors that a fit to the image
+    # does not include: the lens' calibration, the print (px).
+    corner_floor_px: NotNegative = 0.01
+    # A second solution is ruled out only if the first is this many times likelier.
+    ambiguity_odds: Annotated[float, _ODDS] = 1000.0
+    floor: bool = False  # Assume that the robot is on the floor: z, roll and pitch are known.
+    floor_z_m: Annotated[float, FINITE] = 0.0  # Height of the robot's origin there (m).
+    floor_sigma_z_m: Positive = 0.01  # Standard deviation of the height (m).
+    floor_sigma_tilt_deg: Positive = 0.5  # Standard deviation of roll and pitch (deg).
+    # Images whose times differ by at most this are used together (s).
+    time_tolerance_s: NotNegative = 0.005
+    # Speed that the robot reaches, when neighbouring frames decide between solutions (m/s).
+    speed_m_s: Positive = 1.0
+    turn_deg_s: Positive = 90.0  # The same for its turning (deg/s).
+    # By how much the robot's height may differ between neighbouring frames (m).
+    heave_m: Positive = 0.03
+    wobble_deg: Positive = 2.0  # The same for roll and pitch (deg).
+
+
+@dataclass(frozen=True)
+class RigSettings(_Bounded):
+    """Settings of the rig's estimation."""
+
+    # A marker belongs to the rig only if this many times, or images, show it with another and agree
+    least_support: Annotated[int, whole(1)] = 3
+    # A marker in an image is left out, and counted, if its normalised error is larger than this
+    # and its residual larger than --outlier-px.
+    outlier_sigma: NotNegative = 5.0
+    outlier_px: NotNegative = 1.0  # Root mean square residual of what may be left out (px).
+    # Standard deviation added to each corner's own covariance (px).
+    corner_floor_px: NotNegative = 0.01
+    # Images of different cameras whose times differ by at most this are used together (s).
+    time_tolerance_s: NotNegative = 0.005
+
+
+@dataclass(frozen=True)
+class NetworkSettings(_Bounded):
+    """Settings of the network's estimation."""
+
+    # Standard deviation of a checkerboard's corners (px). Only its ratio to the sigmas of the
+    # boards' offset matters: the result's covariance is scaled by the residuals.
+    corner_sigma_px: Positive = 0.1
+    # A board in an image is left out, and counted, if its normalised error is larger than this and
+    # its residual larger than --outlier-px.
+    outlier_sigma: Positive = 10.0
+    outlier_px: Positive = 1.0  # Root mean square residual of what may be left out (px).
+
+
+@dataclass(frozen=True)
+class AlignmentSettings(_Bounded):
+    """Settings of the scanners' alignment."""
+
+    # Farthest that a reading may lie from what it is matched with at first (m).
+    gate_m: Positive = 0.5
+    keep: ShareAbove0 = 0.95  # Share of the matches that counts: the best.
+
+
+@dataclass(frozen=True)
+class LaserSettings(_Bounded):
+    """Settings of laser tracking."""
+
+    gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m).
+    keep: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best.
+
+    # The ICP ends when its root mean square error changes by less, or after as many steps.
+    threshold_m: ClassVar[float] = 1e-5
+    most_steps: ClassVar[int] = 60
+    # Standard deviation of a reading's distance from the outline that does not depend on the
+    # scanner's noise: the outline is drawn to millimetres.
+    floor_m: ClassVar[float] = 0.001
+    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
+    # their distances from the face are small whatever the pose.
+    least_slope: ClassVar[float] = 0.35
+    # The final pose uses readings up to this many standard deviations off.
+    gate_sigma: ClassVar[float] = 3.5
+    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
+    # by what it does to the farthest corner).
+    weak_sigma_m: ClassVar[float] = 0.03
+    # Readings that a pose needs, and that a robot needs which is found again.
+    least_readings: ClassVar[int] = 8
+    acquire_readings: ClassVar[int] = 16
+    # The robot is lost after so long without a pose; then it is searched this often.
+    coast_s: ClassVar[float] = 0.25
+    acquire_s: ClassVar[float] = 0.05
+    # Headings that the search begins from.
+    headings: ClassVar[int] = 24
+    # New readings nearer to each other than this may be of one object.
+    link_m: ClassVar[float] = 0.3
+    # Share of the beams that should see the robot, or see something beside it, that must agree.
+    least_agreement: ClassVar[float] = 0.75
+    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
+    symmetry_m: ClassVar[float] = 0.12
+    # The readings identify the front if the residuals differ by this many standard errors; else it
+    # is known after the robot has driven this much farther forward than backward.
+    front_sigma: ClassVar[float] = 5.0
+    forward_m: ClassVar[float] = 0.3
+
+
+@dataclass(frozen=True)
+class SyncSettings(_Bounded):
+    """Settings of the synchronisation of clocks."""
+
+    largest_offset_s: Positive = 1.0  # Bound of the time offset, either way (s).
+    # Bound of the drift: the clocks' rates differ by at most this share.
+    largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
+    segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).
+    # Refine the estimate by headings with the whole movement if the ground truth has covariances.
+    use_movement: bool = True
+
+
+@dataclass(frozen=True)
+class FuseSettings(_Bounded):
+    """How odometry errs, and how far a measurement may be off."""
+
+    # Standard deviation of odometry's distance per square root of a metre driven (m).
+    distance_sigma: NotNegative = 0.02
+    # How far the robot slips sideways per square root of a metre driven (m). The lateral error by a
+    # wrong heading is not part of it.
+    lateral_sigma: NotNegative = 0.01
+    # Standard deviation of odometry's heading per square root of a radian turned (rad).
+    turn_sigma: NotNegative = 0.02
+    turn_per_metre_sigma: NotNegative = 0.01  # The same per square root of a metre driven (rad).
+    # Scale these deviations (distance's, the sideways one, and both of the heading together) to
+    # maximise the likelihood of the measurements; they only begin the search then.
+    learn_noise: bool = True
+    # Standard deviation, before anything was measured, of the share by which odometry's turns are
+    # too long or too short. Of this and the next two, terms that make no better predictions are
+    # left out.
+    turn_scale_sigma: NotNegative = 0.03
+    turn_bias_per_metre_sigma: NotNegative = 0.01  # The same of its turn per metre driven (rad).
+    distance_scale_sigma: NotNegative = 0.03  # The same of the share of its ways.
+    # Share of right poses that pass the gate.
+    gate_probability: Annotated[float, PROBABILITY] = 0.9999

@@ -1,0 +1,79 @@
+"""The scanners on board: ranges against walls by incidence, and mounts that come back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from redetect.groundtruth.validation.onboard import first_walls, range_errors, refine_mounts
+from redetect.groundtruth.validation.reference_poses import Distance, poses_from_distances
+from redetect.groundtruth.validation.reference_poses_scans import ReferencePose, reference_poses
+from redetect.plane import compose
+from tests.groundtruth.validation.test_validate_references import (
+    ROOM,
+    measured,
+    onboard,
+    survey_of,
+)
+
+
+def test_rays_meet_the_first_wall_at_its_angle() -> None:
+    walls = np.array([[2.0, -5.0, 2.0, 5.0], [3.0, -5.0, 3.0, 5.0]])
+    angles = np.radians([0.0, 30.0, -60.0, 180.0])
+    rays = np.column_stack([np.cos(angles), np.sin(angles)])
+    far, incidence = first_walls(np.zeros(2), rays, walls)
+    np.testing.assert_allclose(far, [2.0, 2.0 / math.cos(math.pi / 6), 4.0, np.inf])
+    np.testing.assert_allclose(np.degrees(incidence[:3]), [0.0, 30.0, 60.0], atol=1e-5)
+
+
+def references(
+    rng: np.random.Generator, shift: np.ndarray, count: int, sigma_m: float = 0.003
+) -> list[ReferencePose]:
+    """Reference poses of a robot whose scanners are mounted off by `shift` from what is said."""
+    survey = survey_of(sigma_m=sigma_m)
+    found = []
+    for _ in range(count):
+        truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
+        rows = [Distance(0, 5.0, d.point, d.fiducial, d.distance_m)
+                for d in measured(truth, survey, rng)]  # fmt: skip
+        # The readings are cast from where the scanners really are.
+        seen = onboard(compose(truth, shift), ROOM, rng)
+        references, refused = reference_poses(poses_from_distances(survey, rows), seen, ROOM)
+        assert not refused
+        found += references
+    return found
+
+
+def test_range_errors_are_those_of_the_readings() -> None:
+    found = references(np.random.default_rng(2), np.zeros(3), 4)
+    angles, errors = range_errors(found, ROOM)
+    assert len(errors) > 500
+    assert abs(errors.mean()) < 5e-4
+    assert errors.std() < 0.02
+    assert angles.min() >= 0.0
+    assert angles.max() <= 0.5 * math.pi
+
+
+@pytest.mark.long
+def test_mounts_come_back_with_their_covariance() -> None:
+    """All scanners moved together against the body, which distances alone can tell."""
+    rng = np.random.default_rng(3)
+    shift = np.array([0.006, -0.004, math.radians(0.2)])
+    total = 0.0
+    for _ in range(6):
+        found = refine_mounts(references(rng, shift, 8), ROOM)
+        assert found is not None
+        given = np.array([[0.3, 0.0, 0.0], [-0.4, 0.0, math.pi]])
+        error = found.poses - compose(np.broadcast_to(shift, given.shape), given)
+        error[:, 2] = (error[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        assert np.abs(error[:, :2]).max() < 0.004
+        total += float(error.ravel() @ np.linalg.solve(found.covariance, error.ravel()))
+    low, high = chi2.ppf([0.001, 0.999], 36)
+    assert low < total < high
+
+
+def test_two_poses_are_too_few_for_mounts() -> None:
+    assert refine_mounts(references(np.random.default_rng(4), np.zeros(3), 2), ROOM) is None
