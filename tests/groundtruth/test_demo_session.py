@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def test_the_demo_sessions_poses_are_true(project_root: Path, tmp_path: Path) ->
         run = open_run(folder)
         settings = MarkerSettings(dictionary="rawseeds")
         frames = []
-        for frame in run.frames:
+        for frame in islice(run.frames, 0, None, 3):
             found = detect_markers(read_image(frame, run.camera), settings, run.camera)
             rows = []
             for number in range(len(found)):
@@ -45,7 +46,7 @@ def test_the_demo_sessions_poses_are_true(project_root: Path, tmp_path: Path) ->
     poses = read_planar_poses(session / "poses.csv")
     truth = read_planar_poses(session / "truth.csv")
     score = compare_streams(poses, truth)
-    assert score.poses == len(truth)
+    assert score.poses == len(truth.times_s[::3])
     assert score.position_mean_m < 0.005
     assert abs(np.degrees(score.angle_mean_rad)) < 0.1
     assert 0.2 < score.normalised_error < 2.0

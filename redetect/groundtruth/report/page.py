@@ -151,9 +151,7 @@ def _scanners(inputs: Inputs) -> list[Part]:
 
 
 def _stages(inputs: Inputs) -> list[Part]:
-    streams = dict(inputs.streams)
-    if inputs.odometry is not None:
-        streams = {"odometry": inputs.odometry, **streams}
+    streams = _all_streams(inputs)
     if len(streams) < 2 or not inputs.visits:
         return [Part("note", "Fewer than two streams of poses: no stages.")]
     number = int(np.argmax([b - a for a, b in inputs.visits]))
@@ -170,6 +168,12 @@ def _stages(inputs: Inputs) -> list[Part]:
 def _track(name: str, poses: PlanarPoses, inputs: Inputs) -> Track:
     colour, dashes = _LOOKS[name]
     return Track(STREAMS.get(name, name), colour, dashes, in_visits(poses, inputs.visits))
+
+
+def _all_streams(inputs: Inputs) -> dict[str, PlanarPoses]:
+    """Odometry, if it can be compared, and the others."""
+    odometry = {} if inputs.odometry is None else {"odometry": inputs.odometry}
+    return {**odometry, **inputs.streams}
 
 
 def _maps(inputs: Inputs) -> list[Part]:
@@ -200,29 +204,26 @@ def _errors(inputs: Inputs) -> list[Part]:
         return [Part("note", words)]
     rows: list[tuple[str, ...]] = []
     place, turn, faults = [], [], []
-    named = {name: (STREAMS[name], poses) for name, poses in inputs.streams.items()}
-    if inputs.odometry is not None:
-        named["odometry"] = ("odometry", inputs.odometry)
-    for name, (label, poses) in named.items():
-        inside = in_visits(poses, inputs.visits)
+    compared = [
+        (STREAMS.get(name, name), name, in_visits(poses, inputs.visits))
+        for name, poses in _all_streams(inputs).items()
+    ]
+    fused = inputs.streams.get("fused")
+    if fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
+        compared.append(("fused, pauses included", "", fused))
+    for label, name, poses in compared:
         try:
-            mine, theirs, _ = matched_streams(inside, inputs.truth)
+            mine, theirs, _ = matched_streams(poses, inputs.truth)
         except ValueError as fault:
             rows.append((label, "0", *("-",) * 9))
             faults.append(Part("problem", f"{label}: {fault}"))
             continue
         rows.append((label, *_score_words(score_poses(mine, theirs))))
-        error = pose_differences(mine.poses, theirs.poses)
-        look = (STREAMS.get(name, name), *_LOOKS[name], mine.times_s)
-        place.append(Series(*look, 1e3 * np.hypot(error[:, 0], error[:, 1])))
-        turn.append(Series(*look, np.degrees(np.abs(error[:, 2]))))
-    fused = inputs.streams.get("fused")
-    if place and fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
-        try:
-            mine, theirs, _ = matched_streams(fused, inputs.truth)
-            rows.append(("fused, pauses included", *_score_words(score_poses(mine, theirs))))
-        except ValueError as fault:
-            faults.append(Part("problem", f"fused, pauses included: {fault}"))
+        if name:
+            error = pose_differences(mine.poses, theirs.poses)
+            look = (label, *_LOOKS[name], mine.times_s)
+            place.append(Series(*look, 1e3 * np.hypot(error[:, 0], error[:, 1])))
+            turn.append(Series(*look, np.degrees(np.abs(error[:, 2]))))
     head = (
         "stream", "poses", "mean / mm", "sigma", "rmse", "worst", "mean / deg", "sigma", "worst",
         "NEES / 3", "poses with it",

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _WIDE_IN, _TALLEST_IN, _SERIES_HIGH_IN = 7.9, 7.9, 2.9
-_MOST_POINTS = 1500
+_MOST_POINTS, _MOST_STAGE_POINTS = 1500, 400
 _BREAK_S = 1.0
 # Stretches of time of which the largest value is drawn, over all visits.
 _BINS = 340
@@ -199,7 +199,8 @@ def stages_figure(words: str, stages: Sequence[Track], building: FloatArray | No
         for axes, stage in zip(grid, stages):
             _draw_paths(axes, [last], building)
             xy = stage.poses.poses[:, :2]
-            axes.plot(xy[:, 0], xy[:, 1], ".", color=stage.colour, ms=2.5, mew=0)
+            few = xy[:: max(1, len(xy) // _MOST_STAGE_POINTS)]
+            axes.plot(few[:, 0], few[:, 1], ".", color=stage.colour, ms=2.5, mew=0)
             _frame(axes, low, high, f"{stage.label}: {len(xy)} poses", fontsize=9)
         for axes in grid[len(stages) :]:
             axes.set_axis_off()

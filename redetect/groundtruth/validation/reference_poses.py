@@ -14,17 +14,16 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import JsonObject, read_rows
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply
+from redetect.plane import rotation
 from redetect.storage.bounds import ABOVE_0
 from redetect.storage.messages import excerpt
 
@@ -125,6 +124,8 @@ Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
 _HEADINGS = 24
 _SAME_M = 1e-4
+# Steps of the descent, and when they are as good as none (m, rad).
+_STEPS, _SETTLED = 60, 1e-10
 # Distances that fit less well than this share of right ones hold a gross error; at most two of a
 # pose are left out.
 _GROSS_PROBABILITY = 1e-4
@@ -171,88 +172,91 @@ def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[
         levers = np.array([survey.robot_points[row.point] for row in rows])
         lengths = np.array([row.distance_m for row in rows])
         time = float(np.median([row.time_s for row in rows]))
-        found.append(_solve(index, time, fiducials, levers, lengths, survey.sigma_m))
+        found.append(_solve(index, time, Measured(fiducials, levers, lengths, survey.sigma_m)))
     return sorted(found, key=lambda pose: (pose.time_s, pose.index))
 
 
-def distance_minima(
-    fiducials: FloatArray, levers: FloatArray, distances_m: FloatArray, sigma_m: float
-) -> tuple[FloatArray, FloatArray]:
+class Measured(NamedTuple):
+    """The K distances of one pose."""
+
+    fiducials: FloatArray  # (K, 2): ends in the world (m)
+    levers: FloatArray  # (K, 2): ends on the robot, in its frame (m)
+    distances_m: FloatArray  # (K,)
+    sigma_m: float
+
+    def only(self, kept: BoolArray) -> Measured:
+        """Some of the distances."""
+        chosen = (self.fiducials[kept], self.levers[kept], self.distances_m[kept])
+        return Measured(*chosen, self.sigma_m)
+
+
+def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    From (K, 2) points in the world, (K, 2) points on the robot, and (K,) distances. Starts are
-    where, for headings all round, two circles about fiducial points meet.
+    Levenberg-Marquardt from all starts at once: where, for headings all round, two circles about
+    fiducial points meet.
     """
-    known = (fiducials, levers, distances_m)
-    found = [
-        least_squares(
-            lambda pose: distance_residuals(pose, *known)[0] / sigma_m,
-            start,
-            lambda pose: distance_residuals(pose, *known)[1] / sigma_m,
-            method="lm",
-            xtol=1e-12,
-            ftol=1e-12,
-            gtol=1e-12,
-        )
-        for start in _starts(*known)
-    ]
-    poses, cost = np.array([one.x for one in found]), np.array([2.0 * one.cost for one in found])
+    poses = _starts(measured)
+    damping = np.full(len(poses), 1e-3)
+    residuals, jacobians = distance_residuals(poses, measured)
+    for _ in range(_STEPS):
+        gradient = np.einsum("ski,sk->si", jacobians, residuals)
+        normal = np.einsum("ski,skj->sij", jacobians, jacobians)
+        diagonal = np.einsum("sii->si", normal)
+        diagonal += damping[:, None] * (diagonal + 1e-6)
+        step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+        tried = distance_residuals(poses + step, measured)
+        better = np.sum(tried[0] ** 2, axis=1) <= np.sum(residuals**2, axis=1)
+        poses[better] += step[better]
+        residuals[better], jacobians[better] = tried[0][better], tried[1][better]
+        damping = np.clip(np.where(better, 0.1 * damping, 10.0 * damping), 1e-9, 1e9)
+        if np.abs(step).max() < _SETTLED:
+            break
     poses[:, 2] = wrap_angle(poses[:, 2])
+    cost = np.sum(residuals**2, axis=1) / measured.sigma_m**2
     kept = _distinct(poses, cost, _SAME_M)
     return poses[kept], cost[kept]
 
 
-def distance_residuals(
-    pose: FloatArray, fiducials: FloatArray, levers: FloatArray, distances_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Measured minus expected distances (K,) in metres, and their (K, 3) derivative by the pose."""
-    arm = apply([0.0, 0.0, pose[2]], levers)
-    apart = pose[:2] + arm - fiducials
-    length = np.hypot(apart[:, 0], apart[:, 1])
-    x, y = (apart / np.maximum(length, 1e-12)[:, None]).T
-    return distances_m - length, -np.column_stack([x, y, y * arm[:, 0] - x * arm[:, 1]])
+def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:
+    """Measured minus expected distances (..., K) in metres of poses (..., 3), and their derivatives
+    by these (..., K, 3).
+    """
+    arm = measured.levers @ np.swapaxes(rotation(pose[..., 2]), -1, -2)
+    apart = pose[..., None, :2] + arm - measured.fiducials
+    length = np.hypot(apart[..., 0], apart[..., 1])
+    along = apart / np.maximum(length, 1e-12)[..., None]
+    turn = along[..., 1] * arm[..., 0] - along[..., 0] * arm[..., 1]
+    return measured.distances_m - length, -np.concatenate([along, turn[..., None]], axis=-1)
 
 
-def _solve(
-    index: int,
-    time_s: float,
-    fiducials: FloatArray,
-    levers: FloatArray,
-    lengths: FloatArray,
-    sigma_m: float,
-) -> DistancePose:
-    count = len(lengths)
+def _solve(index: int, time_s: float, measured: Measured) -> DistancePose:
+    count = len(measured.distances_m)
     used = np.ones(count, dtype=np.bool_)
-    nothing = np.zeros((0, 3))
     if count < 3:
+        reason, nothing = f"{count} distances: expected 3 or more", np.zeros((0, 3))
         return DistancePose(
-            index, time_s, "undetermined", f"{count} distances: expected 3 or more", nothing,
-            np.zeros((0, 3, 3)), np.full(count, np.nan), used, math.nan, count - 3,
+            index, time_s, "undetermined", reason, nothing, np.zeros((0, 3, 3)),
+            np.full(count, np.nan), used, math.nan, count - 3,
         )  # fmt: skip
     status: Status = "ok"
-    poses, costs = distance_minima(fiducials, levers, lengths, sigma_m)
+    poses, costs = distance_minima(measured)
     reason = ""
     if _improbable(costs[0], count - 3):
-        kept, reason = _without_gross(fiducials, levers, lengths, sigma_m)
+        kept, reason = _without_gross(measured)
         if kept is None:
             status = "inconsistent"
         else:
             used = kept
-            poses, costs = distance_minima(fiducials[used], levers[used], lengths[used], sigma_m)
-    rivals = costs < costs[0] + _AMBIGUITY_CHI2
-    candidates = poses[rivals]
-    residuals, _ = distance_residuals(candidates[0], fiducials, levers, lengths)
-    covariances = np.stack(
-        [
-            _covariance(distance_residuals(pose, fiducials, levers, lengths)[1][used], sigma_m)
-            for pose in candidates
-        ]
-    )
+            poses, costs = distance_minima(measured.only(used))
+    candidates = poses[costs < costs[0] + _AMBIGUITY_CHI2]
+    residuals, jacobians = distance_residuals(candidates, measured)
+    covariances = np.stack([_covariance(j[used], measured.sigma_m) for j in jacobians])
     if status == "ok":
         status, fault = _determined(candidates, covariances)
         reason = "; ".join(part for part in (fault, reason) if part)
     return DistancePose(
-        index, time_s, status, reason, candidates, covariances, residuals, used,
+        index, time_s, status, reason, candidates, covariances, residuals[0], used,
         float(costs[0]), int(used.sum()) - 3,
     )  # fmt: skip
 
@@ -274,11 +278,9 @@ def _determined(candidates: FloatArray, covariances: FloatArray) -> tuple[Status
     return "ok", ""
 
 
-def _without_gross(
-    fiducials: FloatArray, levers: FloatArray, lengths: FloatArray, sigma_m: float
-) -> tuple[BoolArray | None, str]:
+def _without_gross(measured: Measured) -> tuple[BoolArray | None, str]:
     """Which distances to keep so that the rest agrees, or None, and what there is to say."""
-    used = np.ones(len(lengths), dtype=np.bool_)
+    used = np.ones(len(measured.distances_m), dtype=np.bool_)
     for removed in range(1, _MOST_GROSS + 1):
         # With less than one degree of freedom left anything fits.
         if int(used.sum()) - 1 < 4:
@@ -287,9 +289,8 @@ def _without_gross(
         for k in np.flatnonzero(used).tolist():
             kept = used.copy()
             kept[k] = False
-            poses, costs = distance_minima(fiducials[kept], levers[kept], lengths[kept], sigma_m)
-            trials.append((float(costs[0]), k, poses[0]))
-        trials.sort(key=lambda trial: trial[0])
+            trials.append((float(distance_minima(measured.only(kept))[1][0]), k))
+        trials.sort()
         used[trials[0][1]] = False
         freedom = int(used.sum()) - 3
         if not _improbable(trials[0][0], freedom):
@@ -313,8 +314,9 @@ def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
     return np.asarray((vectors / values) @ vectors.T)
 
 
-def _starts(fiducials: FloatArray, levers: FloatArray, distances_m: FloatArray) -> FloatArray:
+def _starts(measured: Measured) -> FloatArray:
     """(S, 3) poses at which, for a heading, two of the distances are right."""
+    fiducials, levers, distances_m, _ = measured
     pairs = _wide_pairs(fiducials)
     starts = []
     for heading in np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS):

@@ -160,7 +160,7 @@ def test_bad_input_is_said() -> None:
         align_scanners([], [], ROOM)
     with pytest.raises(GroundTruthError, match="gate_m"):
         AlignmentSettings(gate_m=-1.0)
-    with pytest.raises(GroundTruthError, match="kept"):
+    with pytest.raises(GroundTruthError, match="keep"):
         AlignmentSettings(keep=0.0)
 
 

@@ -423,7 +423,7 @@ def test_the_command_writes_the_same_bytes_again(
     assert len(lines) == len(sets_of_scans(scans))
     assert {line["status"] for line in lines} <= {"ok", "reacquired", "lost", "coasting"}
     content = json.loads(first["json"])
-    assert content["settings"]["kept"] == 0.95
+    assert content["settings"]["keep"] == 0.95
     assert not any(entry["suspect"] for entry in content["scanners"])
     assert "6 poses" not in capsys.readouterr().err
 
@@ -437,7 +437,7 @@ def test_a_session_without_the_robot_gives_no_pose(
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(GroundTruthError, match="kept"):
+    with pytest.raises(GroundTruthError, match="keep"):
         LaserSettings(keep=1.2)
     with pytest.raises(GroundTruthError, match="gate_m"):
         LaserSettings(gate_m=float("nan"))

@@ -13,7 +13,7 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.report.inputs import Interval, gather
+from redetect.groundtruth.report.inputs import Inputs, Interval, gather
 from redetect.groundtruth.report.page import report_page, table
 from redetect.groundtruth.report.pictures import (
     Series,
@@ -95,9 +95,8 @@ def stream(offset: float, seed: int, covariance: bool = True) -> PlanarPoses:
     return PlanarPoses(times, noisy, covariances)
 
 
-@pytest.fixture
-def session(tmp_path: Path) -> Path:
-    folder = tmp_path / "a session <b>"
+def write_session(place: Path) -> Path:
+    folder = place / "a session <b>"
     folder.mkdir()
     walls = np.array([[0, 0, 6, 0], [6, 0, 6, 6], [6, 6, 0, 6], [0, 6, 0, 0]], dtype=float)
     write_building(folder / "building.csv", walls)
@@ -107,10 +106,22 @@ def session(tmp_path: Path) -> Path:
     return folder
 
 
-def test_figures_on_the_page_are_those_of_the_streams(session: Path) -> None:
-    inputs = gather(session)
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    return write_session(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def unchanged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Inputs, bytes]:
+    """What a session holds, and its page."""
+    inputs = gather(write_session(tmp_path_factory.mktemp("report")))
+    return inputs, report_page(inputs, "1.2.3")
+
+
+def test_figures_on_the_page_are_those_of_the_streams(unchanged: tuple[Inputs, bytes]) -> None:
+    inputs, content = unchanged
     np.testing.assert_allclose(inputs.visits, [(0.0, 19.8), (100.0, 119.8)])
-    page = Page(report_page(inputs, "1.2.3"))
+    page = Page(content)
     assert_harmless(page)
     assert inputs.truth is not None
     for name in ("laser", "camera", "fused"):
@@ -132,8 +143,10 @@ def test_figures_on_the_page_are_those_of_the_streams(session: Path) -> None:
     assert sum("visit 2: 20 s" in figure for figure in figures) == 2
 
 
-def test_the_page_can_be_used_with_keyboard_and_without_eyes(session: Path) -> None:
-    page = Page(report_page(gather(session), "1"))
+def test_the_page_can_be_used_with_keyboard_and_without_eyes(
+    unchanged: tuple[Inputs, bytes],
+) -> None:
+    page = Page(unchanged[1])
     ids = [value for _, name, value in page.attributes if name == "id"]
     assert len(ids) == len(set(ids))
     for tag, name, value in page.attributes:
@@ -256,8 +269,10 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     assert main(["report", str(session), "--truth", str(session / "none.csv"), "--force"]) == 1
 
 
-def test_the_same_session_gives_the_same_page(session: Path) -> None:
-    assert report_page(gather(session), "1") == report_page(gather(session), "1")
+def test_the_same_session_gives_the_same_page(
+    session: Path, unchanged: tuple[Inputs, bytes]
+) -> None:
+    assert report_page(gather(session), "1.2.3") == unchanged[1]
 
 
 def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
@@ -357,13 +372,44 @@ def test_the_worst_of_each_stretch_is_drawn() -> None:
 
 
 @pytest.mark.parametrize(("nees", "marked"), [(1.05, False), (2.5, True)])
-def test_a_normalised_error_outside_its_band_is_marked(
-    session: Path, nees: float, marked: bool
-) -> None:
+def test_a_normalised_error_outside_its_band_is_marked(nees: float, marked: bool) -> None:
     figures = {"nees": nees, "nees_low": 0.8, "nees_high": 1.2, "poses": 23}
+    inputs = Inputs("s", documents={"validation.json": {"figures": figures}})
+    assert ('class="problem">23 reference poses' in report_page(inputs, "1").decode()) == marked
+
+
+def test_what_was_measured_in_the_building_and_on_board_is_shown(session: Path) -> None:
+    (session / "dimensions.csv").write_text("room,0,0,3,4,5.01\nwall,0,0,0,2,1.998\n")
+    places = {"A": [0, 0], "B": [3, 0], "C": [3, 4]}
+    survey = {"version": 1, "sigma_m": 0.005, "fiducials": places, "robot_points": places}
+    (session / "fiducials.json").write_text(json.dumps(survey))
+    (session / "fiducial_distances.csv").write_text("A,B,3.0\nB,C,4.0\nA,C,5.0\n")
+    square = np.array([[0, 0, 0], [4, 0, 1], [4, 3, 2.0]])
+    turned = square @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [5, 5, 0]
+    aligned = {
+        "scanners": [{"name": name} for name in "abc"],
+        "steps": {"pairs": turned.tolist(), "each to the map": square.tolist()},
+    }
+    (session / "aligned.json").write_text(json.dumps(aligned))
+    bins = [{"from_deg": 0, "to_deg": 15, "readings": 7, "mean_m": 0.0012, "sigma_m": 0.0034}]
+    mount = {"name": "front", "given": [0.36, 0, 0], "refined": [0.361, 0.002, 0.001],
+             "sigma": [0.0004, 0.0005, 0.0006]}  # fmt: skip
     (session / "validation").mkdir()
-    (session / "validation" / "validation.json").write_text(json.dumps({"figures": figures}))
-
-    text = report_page(gather(session), "1").decode()
-
-    assert ('class="problem">23 reference poses' in text) == marked
+    document = {"figures": {}, "incidence": bins, "mounts": [mount, {"name": "odd"}, 5]}
+    (session / "validation" / "validation.json").write_text(json.dumps(document))
+    write_planar_poses(session / "filtered.csv", stream(0.004, 7))
+    inputs = gather(session)
+    assert not inputs.problems
+    page = Page(report_page(inputs, "1"))
+    assert_harmless(page)
+    for words in (
+        "room 5.000 5.010 -10.0 wall 2.000 1.998 +2.0",
+        "2 dimensions: mean -4.0 mm, sigma 8.5 mm, worst 10.0 mm",
+        "3 distances, rms residual 0.0 mm",
+        "pairs 0.0 0.0 0.0 each to the map 0.0 0.0 0.0",  # moved as a whole alone
+        "0 to 15 7 1.20 3.40",
+        "front 360.0 0.0 0.000 1.0 2.0 0.057 0.4 0.5 0.034",
+        "filter alone 200",
+        "Visit 1: laser, cameras, filter alone, fused; grey: fused.",
+    ):
+        assert words in page.text, words

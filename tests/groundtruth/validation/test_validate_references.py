@@ -16,6 +16,7 @@ from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.validation.reference_poses import (
     Distance,
     DistancePose,
+    Measured,
     Survey,
     distance_residuals,
     poses_from_distances,
@@ -142,13 +143,14 @@ def test_the_derivative_is_that_of_the_residuals() -> None:
     rng = np.random.default_rng(2)
     fiducials, levers = rng.normal(size=(5, 2)) * 4, rng.normal(size=(5, 2))
     pose, lengths = rng.normal(size=3), np.ones(5)
-    _, jacobian = distance_residuals(pose, fiducials, levers, lengths)
+    rows = Measured(fiducials, levers, lengths, 1.0)
+    _, jacobian = distance_residuals(pose, rows)
     for axis in range(3):
         ends = []
         for sign in (1, -1):
             other = pose.copy()
             other[axis] += sign * 1e-6
-            ends.append(distance_residuals(other, fiducials, levers, lengths)[0])
+            ends.append(distance_residuals(other, rows)[0])
         np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, jacobian[:, axis], atol=1e-8)
 
 

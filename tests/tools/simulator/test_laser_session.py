@@ -237,7 +237,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
     folder, _ = session
     write_session(SMALL, tmp_path / "again", seed=SEED)
     files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(files) == 23
+    assert len(files) == 25
     for file in files:
         assert (folder / file).read_bytes() == (tmp_path / "again" / file).read_bytes(), file
     other = plan_session(SMALL, SEED + 1)
