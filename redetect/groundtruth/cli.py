@@ -6,36 +6,14 @@ line was wrong; 130 it was interrupted.
 
 from __future__ import annotations
 
-from redetect.groundtruth.commands.options import (
-    Fuse,
-    Laser,
-    Lasers,
-    Network,
-    Poses,
-    Report,
-    Rig,
-    Score,
-    Sync,
-    Validate,
-)
+from redetect.groundtruth.commands.options import COMMANDS
 from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "groundtruth",
     "Where the robot really was: markers, lasers, clocks, and their fusion.\n\n"
     "Example: groundtruth poses images/m -o poses.csv",
-    {
-        Rig: "redetect.groundtruth.commands.rig",
-        Network: "redetect.groundtruth.commands.network",
-        Poses: "redetect.groundtruth.commands.poses",
-        Score: "redetect.groundtruth.commands.score",
-        Lasers: "redetect.groundtruth.commands.lasers",
-        Laser: "redetect.groundtruth.commands.laser",
-        Sync: "redetect.groundtruth.commands.sync",
-        Fuse: "redetect.groundtruth.commands.fuse",
-        Validate: "redetect.groundtruth.commands.validate",
-        Report: "redetect.groundtruth.commands.report",
-    },
+    {kind: f"redetect.groundtruth.commands.{kind.__name__.lower()}" for kind in COMMANDS},
 )
 
 main, parsed = PROGRAM.main, PROGRAM.parsed

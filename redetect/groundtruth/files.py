@@ -233,7 +233,9 @@ def read_rows(
     for number, line in enumerate(text.split("\n"), 1):
         content = line.partition("#")[0].strip()
         if content:
-            yield number, re.split(r"\s*,\s*|\s+", content)
+            blanks = len(content.split(None, 1)) > 1
+            # Rows of hundreds of readings have commas alone: a quarter of the time.
+            yield number, re.split(r"\s*,\s*|\s+", content) if blanks else content.split(",")
 
 
 def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[float]:

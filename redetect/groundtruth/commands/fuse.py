@@ -19,6 +19,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.storage.bounds import ABOVE_0, demand
 
 
 def perform(options: Fuse) -> int:
@@ -29,6 +30,7 @@ def perform(options: Fuse) -> int:
     files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
     if not files:
         raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
+    demand(options, GroundTruthError, covariance_scale=ABOVE_0)
     settings, scales = options.settings, dict(zip(named, options.covariance_scale))
     odometry = read_planar_poses(options.odometry)
     if options.clock is not None:

@@ -17,7 +17,6 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-from redetect.storage.bounds import Positive
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -129,12 +128,12 @@ class Lasers:
     # building.csv or building.dxf.
     session: Positional[Path]
     building: MaybePath = None  # The building map, if it is not the one in the session.
-    settings: OmitArgPrefixes[AlignmentSettings] = field(default_factory=AlignmentSettings)
     # The picture to write; by default the output's name with the ending .png.
     picture: MaybePath = None
     # The scanners file to write; by default aligned.json in the session.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace existing files.
+    settings: OmitArgPrefixes[AlignmentSettings] = field(default_factory=AlignmentSettings)
 
 
 @dataclass(frozen=True)
@@ -147,12 +146,12 @@ class Laser:
     session: Positional[Path]  # Folder with robot.json, the scans, and the scans of the empty area.
     # Poses of the fixed scanners; by default aligned.json in the session, else scanners.json.
     scanners: MaybePath = None
-    settings: OmitArgPrefixes[LaserSettings] = field(default_factory=LaserSettings)
     average: int = 6  # Sets of scans that each written pose rests on; no set is used twice.
     # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. An
     # account of every set of scans goes into a .jsonl, settings and version into a .json beside it.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace existing files.
+    settings: OmitArgPrefixes[LaserSettings] = field(default_factory=LaserSettings)
 
 
 @dataclass(frozen=True)
@@ -165,11 +164,11 @@ class Sync:
     odometry: Positional[Path]  # The robot's own poses (t, x, y, theta) on its clock.
     # Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
     groundtruth: Positional[Path]
-    settings: OmitArgPrefixes[SyncSettings] = field(default_factory=SyncSettings)
     ptpd: MaybePath = None  # Log of ptpd, to compare with.
     apply: MaybePath = None  # Write the odometry on the ground truth's clock to this file.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")  # The clock file to write.
     force: bool = False  # Replace existing files.
+    settings: OmitArgPrefixes[SyncSettings] = field(default_factory=SyncSettings)
 
 
 @dataclass(frozen=True)
@@ -184,9 +183,8 @@ class Fuse:
     camera: MaybePath = None  # Ground truth from the markers, in the same columns.
     # Output of `groundtruth sync`; without it all clocks are assumed to be one.
     clock: MaybePath = None
-    settings: OmitArgPrefixes[FuseSettings] = field(default_factory=FuseSettings)
     # Factors on the covariances of laser and camera.
-    covariance_scale: tuple[Positive, Positive] = (1.0, 1.0)
+    covariance_scale: tuple[float, float] = (1.0, 1.0)
     # Leave each segment of the ground truth between two others out as well, predict it, and print
     # how far off the prediction is (pauses of more than 5 s begin another segment).
     leave_out: bool = False
@@ -196,6 +194,7 @@ class Fuse:
     # version go into a .json beside it.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")
     force: bool = False  # Replace existing files.
+    settings: OmitArgPrefixes[FuseSettings] = field(default_factory=FuseSettings)
 
 
 @dataclass(frozen=True)
@@ -235,4 +234,5 @@ class Report:
     force: bool = False  # Replace an existing file.
 
 
-Command = Rig | Network | Poses | Score | Lasers | Laser | Sync | Fuse | Validate | Report
+#: All commands, in the order in which a session needs them.
+COMMANDS = (Rig, Network, Poses, Score, Lasers, Laser, Sync, Fuse, Validate, Report)

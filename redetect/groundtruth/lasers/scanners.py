@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Annotated, Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,14 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.storage.bounded import read_plain_array
-from redetect.storage.bounds import ABOVE_0
+from redetect.storage.bounds import (
+    ABOVE_0,
+    FINITE,
+    NotNegative,
+    Positive,
+    demand_fields,
+    whole,
+)
 from redetect.storage.messages import excerpt, one_line
 
 MOST_READINGS = 4096
@@ -54,31 +61,21 @@ class Scanner:
     covariance: FloatArray
     # `first_angle_rad`, `angle_step_rad`: Beam i points to first_angle + i step in the scanner's
     # frame; the step is above 0.
-    first_angle_rad: float
-    angle_step_rad: float
-    readings: int  # Beams per scan
-    max_range_m: float  # A reading as long as this or longer is none
-    sigma_m: float  # Standard deviation of a reading (m)
+    first_angle_rad: Annotated[float, FINITE]
+    angle_step_rad: Positive
+    readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
+    max_range_m: Positive  # A reading as long as this or longer is none
+    sigma_m: NotNegative  # Standard deviation of a reading (m)
 
     def __post_init__(self) -> None:
         place = f"scanner {excerpt(self.name)}"
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", self.name):
             raise GroundTruthError(f"{place}: expected a name of letters, digits, '-', '_', '.'")
-        if not 1 <= self.readings <= MOST_READINGS:
-            raise GroundTruthError(
-                f"{place}: {self.readings} readings: expected 1 to {MOST_READINGS}"
-            )
-        turn = (self.readings - 1) * self.angle_step_rad
-        if not (self.angle_step_rad > 0.0 and turn <= 2.0 * np.pi + 1e-6):
+        demand_fields(self, GroundTruthError)
+        if (self.readings - 1) * self.angle_step_rad > 2.0 * np.pi + 1e-6:
             raise GroundTruthError(
                 f"{place}: {self.readings} readings {self.angle_step_rad!r} rad apart: expected "
-                "one turn or less, counter-clockwise"
-            )
-        if not np.isfinite(self.first_angle_rad):
-            raise GroundTruthError(f"{place}: first_angle_rad is not finite")
-        if not 0.0 < self.max_range_m < float("inf") or not 0.0 <= self.sigma_m < float("inf"):
-            raise GroundTruthError(
-                f"{place}: expected max_range_m above 0 and sigma_m of 0 or more"
+                "one turn or less"
             )
 
     @property

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,14 +40,11 @@ def drive(
 
 
 def chain(steps: FloatArray, start: FloatArray) -> FloatArray:
-    poses = [start]
-    for dx, dy, turn in steps[1:]:
-        x, y, theta = poses[-1]
-        c, s = math.cos(theta), math.sin(theta)
-        poses.append(np.array([x + c * dx - s * dy, y + s * dx + c * dy, theta + turn]))
-    result = np.array(poses)
-    result[:, 2] = wrap_angle(result[:, 2])
-    return result
+    """(N, 3) poses from a start; each step but the first is in the frame of the pose before."""
+    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[1:, 2])])
+    moves = (steps[1:, 0] + 1j * steps[1:, 1]) * np.exp(1j * theta[:-1])
+    xy = complex(start[0], start[1]) + np.concatenate([[0.0], np.cumsum(moves)])
+    return np.column_stack([xy.real, xy.imag, wrap_angle(theta)])
 
 
 def measure(

@@ -68,11 +68,11 @@ def test_beams_are_counted_counter_clockwise_from_the_first_angle() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"readings": 0}, "0 readings"),
+        ({"readings": 0}, "readings is 0"),
         ({"readings": 10**9}, "readings"),
-        ({"angle_step_rad": -0.01}, "counter-clockwise"),
+        ({"angle_step_rad": -0.01}, "angle_step_rad is -0.01"),
         ({"angle_step_rad": 0.05}, "one turn or less"),
-        ({"angle_step_rad": float("nan")}, "counter-clockwise"),
+        ({"angle_step_rad": float("nan")}, "angle_step_rad is nan"),
         ({"first_angle_rad": float("inf")}, "first_angle_rad"),
         ({"max_range_m": 0.0}, "max_range_m"),
         ({"sigma_m": -0.1}, "sigma_m"),

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from camera import parse_camera, read_camera
 from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
-from redetect.groundtruth.markers.boards import Checkerboard, find_checkerboard
+from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
 from redetect.groundtruth.markers.calibration import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
 from redetect.groundtruth.trajectories.transforms import (
@@ -333,10 +333,12 @@ def test_demo_session_comes_out_again(project_root: Path) -> None:
     assert len(truth["frames"]) == 36
 
 
-def test_boards_have_the_frame_of_those_that_are_looked_for(full_plan: SessionPlan) -> None:
+def test_boards_have_the_frame_of_those_that_are_looked_for(
+    full_plan: SessionPlan, tmp_path: Path
+) -> None:
     """What the simulator calls a board is what `groundtruth` finds in an image."""
     for board, pose in ((DOUBLE, 0.3), (WORLD, -0.4)):
-        same = Checkerboard(board.columns, board.rows, board.square_m)
+        same = checkerboard(board.columns, board.rows, board.square_m)
         np.testing.assert_allclose(board.points, same.points, atol=1e-12)
         camera = full_plan.network.cameras[0]
         camera_from_board = facing_pose(np.zeros(3), pose, 0.2, 0.5)
@@ -347,6 +349,8 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(full_plan: SessionPl
         empty = np.full((camera.height, camera.width), 0.4, np.float32)
         imaging = Imaging(blur_px=0.8)
         light = render_light(camera, [[board_surface(board, camera_from_board)]], empty)
-        image = grey_image(light, 1.0, imaging, np.random.default_rng(0))
+        path = tmp_path / "a.png"
+        cv2.imwrite(str(path), grey_image(light, 1.0, imaging, np.random.default_rng(0)))
         truth = camera.project(apply(camera_from_board, board.points))
-        assert np.abs(find_checkerboard(image, same) - truth).max() < 0.5
+        found = find_boards(BoardImage("a", "b", 0, path, None), same, camera)
+        assert np.abs(found.corners - truth).max() < 0.5
