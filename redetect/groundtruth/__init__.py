@@ -1,6 +1,6 @@
 """Where the robot really was: markers, lasers, clocks, their fusion and its validation.
 
-Each package imports only from those named here; `errors` and `files` serve all:
+Each package imports only from those named here; `errors`, `files` and `settings` serve all:
 
 - `trajectories`: rigid motions in space and in the plane; poses over time and their files.
 - `markers`: poses from square markers, rigs and networks of cameras: `trajectories`.

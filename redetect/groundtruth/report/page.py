@@ -21,6 +21,7 @@ from redetect.groundtruth.report.pictures import (
     stages_figure,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
+from redetect.groundtruth.validation.dimensions import Dimension, SurveyedFiducials
 from redetect.groundtruth.validation.scoring import PoseScore, score_poses, sigma_of
 from redetect.groundtruth.validation.validate import PUBLISHED
 from redetect.plane import apply, fitted
@@ -98,29 +99,38 @@ def _extent(poses: PlanarPoses) -> tuple[str, str, str, str]:
 def _building(inputs: Inputs) -> list[Part]:
     content: list[Part] = []
     if inputs.dimensions:
-        off = 1e3 * np.array([d.drawn_m - d.measured_m for d in inputs.dimensions])
-        rows = [
-            (d.name, f"{d.drawn_m:.3f}", f"{d.measured_m:.3f}", f"{e:+.1f}")
-            for d, e in zip(inputs.dimensions[:_MOST_ROWS], off)
-        ]
-        head = ("dimension", "drawn / m", "measured / m", "drawn less measured / mm")
-        content.append(table("The drawing against dimensions measured in the building", head, rows))
-        words = f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, "
-        content.append(Part("text", words + f"worst {np.abs(off).max():.1f} mm."))
-    if (found := inputs.fiducials) is not None:
-        rows = [
-            (name, *(f"{v:.4f}" for v in place), *(f"{1e3 * v:.1f}" for v in sigma),
-             *(f"{1e3 * v:+.1f}" for v in place - drawn))
-            for name, place, sigma, drawn in zip(
-                found.names, found.places, found.sigma_m, found.drawn)
-        ]  # fmt: skip
-        head = ("fiducial", "x / m", "y / m", "sigma x / mm", "sigma y", "less drawn x / mm", "y")
-        caption = "Fiducials by the distances between them, moved rigidly onto the drawing"
-        content.append(table(caption, head, rows))
-        rms = 1e3 * float(np.sqrt(np.mean(found.residuals_m**2)))
-        words = f"{len(found.residuals_m)} distances, rms residual {rms:.1f} mm."
-        content.append(Part("text", words))
+        content += _dimensions(inputs.dimensions)
+    if inputs.fiducials is not None:
+        content += _fiducials(inputs.fiducials)
     return content or [Part("note", "Nothing measured in the building: no dimensions.csv.")]
+
+
+def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
+    off = 1e3 * np.array([d.drawn_m - d.measured_m for d in dimensions])
+    rows = [
+        (d.name, f"{d.drawn_m:.3f}", f"{d.measured_m:.3f}", f"{e:+.1f}")
+        for d, e in zip(dimensions[:_MOST_ROWS], off)
+    ]
+    head = ("dimension", "drawn / m", "measured / m", "drawn less measured / mm")
+    words = (
+        f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, worst "
+        f"{np.abs(off).max():.1f} mm."
+    )
+    caption = "The drawing against dimensions measured in the building"
+    return [table(caption, head, rows), Part("text", words)]
+
+
+def _fiducials(found: SurveyedFiducials) -> list[Part]:
+    rows = [
+        (name, *(f"{v:.4f}" for v in place), *(f"{1e3 * v:.1f}" for v in sigma),
+         *(f"{1e3 * v:+.1f}" for v in place - drawn))
+        for name, place, sigma, drawn in zip(found.names, found.places, found.sigma_m, found.drawn)
+    ]  # fmt: skip
+    head = ("fiducial", "x / m", "y / m", "sigma x / mm", "sigma y", "less drawn x / mm", "y")
+    caption = "Fiducials by the distances between them, moved rigidly onto the drawing"
+    rms = 1e3 * float(np.sqrt(np.mean(found.residuals_m**2)))
+    words = f"{len(found.residuals_m)} distances, rms residual {rms:.1f} mm."
+    return [table(caption, head, rows), Part("text", words)]
 
 
 def _scanners(inputs: Inputs) -> list[Part]:
@@ -306,7 +316,7 @@ def _validation(inputs: Inputs) -> list[Part]:
         picture = inputs.pictures.get(f"validation/{name}.png")
         if picture is not None:
             content.append(image_part(words, picture, "png", *size))
-    content += _on_board(document)
+    content += [*_incidence(document), *_mounts(document)]
     refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
     if refused:
         content.append(
@@ -324,37 +334,36 @@ def _validation(inputs: Inputs) -> list[Part]:
     return content
 
 
-def _on_board(document: dict[str, Any]) -> list[Part]:
-    """Errors of ranges by incidence, and refined mounts."""
-    content = []
-    bins = [row for row in _entry(document, "incidence", list) if isinstance(row, dict)]
-    if bins:
-        rows = [
-            (f"{_number(r.get('from_deg'), 1.0, 0)} to {_number(r.get('to_deg'), 1.0, 0)}",
-             _number(r.get("readings"), 1.0, 0), _number(r.get("mean_m"), 1e3),
-             _number(r.get("sigma_m"), 1e3))
-            for r in bins[:_MOST_ROWS]
-        ]  # fmt: skip
-        caption = "Ranges on board less the walls' distances, by the angle of incidence"
-        head = ("incidence / deg", "readings", "mean / mm", "sigma")
-        content.append(table(caption, head, rows))
+def _incidence(document: dict[str, Any]) -> list[Part]:
+    rows = [
+        (f"{_number(r.get('from_deg'), 1.0, 0)} to {_number(r.get('to_deg'), 1.0, 0)}",
+         _number(r.get("readings"), 1.0, 0), _number(r.get("mean_m"), 1e3),
+         _number(r.get("sigma_m"), 1e3))
+        for r in _entry(document, "incidence", list)[:_MOST_ROWS] if isinstance(r, dict)
+    ]  # fmt: skip
+    caption = "Ranges on board less the walls' distances, by the angle of incidence"
+    head = ("incidence / deg", "readings", "mean / mm", "sigma")
+    return [table(caption, head, rows)] if rows else []
+
+
+def _mounts(document: dict[str, Any]) -> list[Part]:
     rows = []
-    for mount in _entry(document, "mounts", list):
-        given, refined, sigma = (
-            _entry(mount if isinstance(mount, dict) else {}, key, list)
-            for key in ("given", "refined", "sigma")
-        )
+    for mount in _entry(document, "mounts", list)[:_MOST_ROWS]:
+        entry = mount if isinstance(mount, dict) else {}
+        given, refined, sigma = (_entry(entry, key, list) for key in ("given", "refined", "sigma"))
         if len(given) == len(refined) == len(sigma) == 3:
-            scales = (1e3, 1e3, 180.0 / math.pi)
             moved = [_float(b) - _float(a) for a, b in zip(given, refined)]
-            figures = [*zip(given, scales), *zip(moved, scales), *zip(sigma, scales)]
-            words = [_number(v, f, 1 if f == 1e3 else 3) for v, f in figures]
-            rows.append((str(mount.get("name")), *words))
-    if rows:
-        head = ("scanner", "x / mm", "y", "theta / deg", "moved x / mm", "y", "theta / deg",
-                "sigma x / mm", "y", "theta / deg")  # fmt: skip
-        content.append(table("Mounts of the scanners on board, as given and refined", head, rows))
-    return content
+            scales = ((1e3, 1), (1e3, 1), (180.0 / math.pi, 3))
+            words = [
+                _number(value, factor, decimals)
+                for pose in (given, moved, sigma)
+                for value, (factor, decimals) in zip(pose, scales)
+            ]
+            rows.append((str(entry.get("name")), *words))
+    head = ("scanner", "x / mm", "y", "theta / deg", "moved x / mm", "y", "theta / deg",
+            "sigma x / mm", "y", "theta / deg")  # fmt: skip
+    caption = "Mounts of the scanners on board, as given and refined"
+    return [table(caption, head, rows)] if rows else []
 
 
 def _clock(inputs: Inputs) -> list[Part]:

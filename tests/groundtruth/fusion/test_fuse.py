@@ -181,6 +181,24 @@ def test_outliers_are_kept_out_and_listed() -> None:
     assert np.max(np.abs(fusion.poses.poses[:, :2] - exact.poses[:, :2])) < 0.1
 
 
+def test_the_filter_alone_knows_less_and_as_much_at_the_end() -> None:
+    rng = np.random.default_rng(8)
+    truth, odometry = drive(rng, 40.0, FuseSettings())
+    times = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(25.0, 39.9, 0.1)])
+    fusion = fuse(odometry, {"laser": measure(rng, truth, times, LASER_COVARIANCE)})
+    filtered, smoothed = fusion.filtered, fusion.poses
+    assert filtered.covariances is not None
+    assert smoothed.covariances is not None
+    np.testing.assert_allclose(filtered.poses[-1], smoothed.poses[-1], atol=0.01)
+    spreads = [np.trace(p.covariances[:, :2, :2], axis1=1, axis2=2) for p in (filtered, smoothed)]
+    assert np.all(spreads[0] > 0.98 * spreads[1])
+    at = int(
+        np.searchsorted(smoothed.times_s, 24.9)
+    )  # the end of a gap, which the filter can't see
+    assert spreads[0][at] > 10.0 * spreads[1][at]
+    assert 0.2 < np.mean(normalised_error(filtered, truth)) / 3.0 < 3.0
+
+
 def test_two_streams_are_better_than_each() -> None:
     rng = np.random.default_rng(6)
     truth, odometry = drive(rng, 60.0, FuseSettings())
@@ -277,13 +295,15 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     write_planar_poses(tmp_path / "laser.csv", laser)
     command = [
         *("fuse", str(tmp_path / "odometry.csv"), "--laser", str(tmp_path / "laser.csv")),
-        *("-o", str(tmp_path / "fused.csv")),
+        *("-o", str(tmp_path / "fused.csv"), "--filtered", str(tmp_path / "filtered.csv")),
     ]
     assert main(command) == 0
     assert "99 from laser; 0 rejected, 0 restarts" in capsys.readouterr().out
     fused = read_planar_poses(tmp_path / "fused.csv")
     assert fused.covariances is not None
     assert (tmp_path / "fused.json").exists()
+    filtered = read_planar_poses(tmp_path / "filtered.csv")
+    np.testing.assert_array_equal(filtered.times_s, fused.times_s)
     assert main(command) == 1
     assert "give --force" in capsys.readouterr().err
     assert main(["fuse", str(tmp_path / "odometry.csv")]) == 1
