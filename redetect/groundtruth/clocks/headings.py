@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -23,13 +22,6 @@ from redetect.landmarks import wrap_angle
 def continuous_headings(poses: PlanarPoses) -> FloatArray:
     """(N,) headings (rad) without jumps of whole turns, of poses less than half a turn apart."""
     return np.asarray(np.unwrap(poses.poses[:, 2]))
-
-
-def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
-    """The samples (N,) of each segment between pauses that are longer than a limit."""
-    cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
-    ends = [0, *cuts.tolist(), len(times_s)]
-    return [slice(a, b) for a, b in pairwise(ends) if b > a]
 
 
 def heading_noise(times_s: FloatArray, headings_rad: FloatArray) -> float:

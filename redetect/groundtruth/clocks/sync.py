@@ -38,7 +38,6 @@ from redetect.groundtruth.clocks.headings import (
     estimate_wandering,
     find_jump,
     pair_headings,
-    segments_between_gaps,
     without_turns,
 )
 from redetect.groundtruth.errors import GroundTruthError
@@ -46,7 +45,11 @@ from redetect.groundtruth.fusion.fuse import likeliest_noise
 from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    last_of_each_time,
+    segments_between_gaps,
+)
 from redetect.landmarks import wrap_angle
 
 _MOST_COARSE_SAMPLES = 400

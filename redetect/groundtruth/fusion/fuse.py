@@ -31,6 +31,7 @@ from redetect.groundtruth.trajectories.streams import (
     moved_poses,
     planar_alignment,
     pose_differences,
+    segments_between_gaps,
 )
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 
@@ -347,8 +348,7 @@ def leave_out(
     own = last_of_each_time(odometry)
     inside = (truth.times_s >= own.times_s[0]) & (truth.times_s <= own.times_s[-1])
     truth = truth.only(inside)
-    cuts = np.flatnonzero(np.diff(truth.times_s) > _SEGMENT_GAP_S) + 1
-    parts = [times for times in np.split(truth.times_s, cuts) if len(times)]
+    parts = [truth.times_s[s] for s in segments_between_gaps(truth.times_s, _SEGMENT_GAP_S)]
     if len(parts) < 3:
         raise GroundTruthError(
             f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "

@@ -218,7 +218,6 @@ class Tracker:
         self.track.noise[i] = found.covariance
         self.track.covariances[i] = found.covariance + calibration
         self.track.weak[i] = found.weak
-        self._evidence = found.information, found.gradient
         return found
 
     def _store(self, i: int, found: OutlinePose, beams: BeamCounts) -> None:
@@ -259,8 +258,8 @@ class Tracker:
         # Keeps what the whole visit, or its first set, has determined.
         if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
             self.track.status[i] = status
-        self.information += self._evidence[0]
-        self.gradient += self._evidence[1]
+        self.information += found.information
+        self.gradient += found.gradient
 
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.

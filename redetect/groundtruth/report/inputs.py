@@ -23,6 +23,7 @@ from redetect.groundtruth.trajectories.streams import (
     moved_poses,
     planar_alignment,
     read_planar_poses,
+    segments_between_gaps,
 )
 from redetect.groundtruth.validation.dimensions import (
     Dimension,
@@ -220,9 +221,8 @@ def _visits(inputs: Inputs) -> list[tuple[float, float]]:
     if not measured:
         return []
     times = np.sort(np.concatenate(measured))
-    breaks = np.flatnonzero(np.diff(times) > _GAP_S)
-    first, last = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(times) - 1]])
-    return [(float(times[i]), float(times[j])) for i, j in zip(first, last)]
+    parts = [times[s] for s in segments_between_gaps(times, _GAP_S)]
+    return [(float(part[0]), float(part[-1])) for part in parts]
 
 
 def _within(interval: Interval, visits: list[tuple[float, float]]) -> bool:

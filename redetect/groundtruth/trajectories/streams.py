@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -213,6 +214,13 @@ def read_rows_of_numbers(
     if not rows:
         raise StreamError(path, None, f"no rows in it: expected {expected}")
     return np.array(rows)
+
+
+def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
+    """The samples (N,) of each segment between pauses that are longer than a limit."""
+    cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
+    ends = [0, *cuts.tolist(), len(times_s)]
+    return [slice(a, b) for a, b in pairwise(ends) if b > a]
 
 
 def interpolate_poses(

@@ -24,7 +24,6 @@ from redetect.groundtruth.clocks.headings import (
     Wandering,
     estimate_wandering,
     heading_noise,
-    segments_between_gaps,
 )
 from redetect.groundtruth.clocks.sync import synchronise
 from redetect.groundtruth.errors import GroundTruthError, StreamError
@@ -33,6 +32,7 @@ from redetect.groundtruth.settings import SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
+    segments_between_gaps,
     write_planar_poses,
 )
 from redetect.landmarks import wrap_angle

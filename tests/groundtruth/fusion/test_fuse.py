@@ -187,10 +187,11 @@ def test_the_filter_alone_knows_less_and_as_much_at_the_end() -> None:
     times = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(25.0, 39.9, 0.1)])
     fusion = fuse(odometry, {"laser": measure(rng, truth, times, LASER_COVARIANCE)})
     filtered, smoothed = fusion.filtered, fusion.poses
-    assert filtered.covariances is not None
-    assert smoothed.covariances is not None
     np.testing.assert_allclose(filtered.poses[-1], smoothed.poses[-1], atol=0.01)
-    spreads = [np.trace(p.covariances[:, :2, :2], axis1=1, axis2=2) for p in (filtered, smoothed)]
+    spreads = []
+    for path in (filtered, smoothed):
+        assert path.covariances is not None
+        spreads.append(np.trace(path.covariances[:, :2, :2], axis1=1, axis2=2))
     assert np.all(spreads[0] > 0.98 * spreads[1])
     at = int(
         np.searchsorted(smoothed.times_s, 24.9)
