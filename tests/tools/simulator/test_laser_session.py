@@ -20,6 +20,7 @@ from redetect.groundtruth.lasers.scanners import (
     read_scans,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
+from redetect.groundtruth.validation.dimensions import read_dimensions, read_fiducial_distances
 from redetect.groundtruth.validation.reference_poses import read_distances, read_survey
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose
@@ -229,6 +230,21 @@ def test_the_drawing_is_the_map(session: tuple[Path, SessionPlan]) -> None:
     rows, drawing = (read_building(folder / f"building.{end}") for end in ("csv", "dxf"))
     np.testing.assert_allclose(rows, drawing, atol=1e-9)
     np.testing.assert_allclose(rows, plan.site.walls, atol=1e-6)
+
+
+def test_the_tape_measures_the_building_not_the_drawing(session: tuple[Path, SessionPlan]) -> None:
+    folder, plan = session
+    survey = read_survey(folder / "fiducials.json")
+    between = read_fiducial_distances(folder / "fiducial_distances.csv", survey)
+    exact = [np.hypot(*(survey.fiducials[d.a] - survey.fiducials[d.b])) for d in between]
+    errors = np.subtract([d.distance_m for d in between], exact)
+    assert len(errors) == 15
+    assert 0.002 < errors.std() < 0.009
+    drawn, measured = np.array([d[1:] for d in read_dimensions(folder / "dimensions.csv")]).T
+    walls = plan.site.walls
+    longest = np.sort(np.hypot(*(walls[:, 2:] - walls[:, :2]).T))[::-1][:12]
+    np.testing.assert_allclose(drawn, longest, atol=2e-4)  # the drawing is exact unasked
+    assert 0.0 < np.abs(measured - longest).max() < 0.025
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
