@@ -13,7 +13,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
@@ -22,6 +21,7 @@ from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
 from detect.discs.rim import PLACING_SIGMA, Rim, follow_again, follow_rim, median
+from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
@@ -38,7 +38,7 @@ _LEAST_WHOLE = 3
 _BLUR_PX = 1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def place_by_part(
     scene: Scene, radius: float, rim: Rim, by_points: bool, work: Any, result: Any
 ) -> None:
@@ -76,7 +76,7 @@ def place_by_part(
         _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _add_square(result: Any, share: float, x: float, y: float) -> None:
     """Add a share of the square of (x, y), metres, to the covariance of a result."""
     result.cov_xx += share * x * x
@@ -84,7 +84,7 @@ def _add_square(result: Any, share: float, x: float, y: float) -> None:
     result.cov_yy += share * y * y
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def place_all_by_part(
     scene: Scene,
     radius: float,
@@ -102,7 +102,7 @@ def place_all_by_part(
     return results
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
     """The radius that discs of an image seem to have, by those that are wholly in view.
 
@@ -114,7 +114,7 @@ def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
     return median(radii)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(inline="always")
 def _fit_in_view(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
     """Whether a fit to the pixels in view comes to a disc near the rim, of about its size."""
     floor_xy, given = scene.floor_xy, scene.settings
