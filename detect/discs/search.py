@@ -24,7 +24,7 @@ from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
 from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_part
 from detect.discs.quality import Centres
-from detect.discs.rim import Rim, follow_rim
+from detect.discs.rim import follow_rim
 from redetect.compiled import kernel
 
 #: Candidates whose first look is this much below the required evidence are not fitted in full; more
@@ -55,12 +55,6 @@ _MOST_UNEVEN = 0.14
 _BY_FIT = 0.5
 #: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
-#: A rim whose step varies by less than this over the directions, relative to its mean, is even.
-_EVEN = 0.18
-#: Nothing moves where the blur is less than this, pixels.
-_SHARP_PX = 1.2
-#: A fit that explains less of the variance than this is of a disc that something hides.
-_LITTLE = 0.7
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
 _IN_PART, _HALF_RIM = 0.94, 0.5
 
@@ -261,7 +255,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             rim = follow_rim(
                 image, scene.camera_numbers, rim_xy[k, 0], rim_xy[k, 1], radius, rim_step[k]
             )
-            place_by_part(scene, radius, rim, _is_even(rim, result), work, result)
+            place_by_part(scene, radius, rim, work, result)
             if search.refine:
                 place[k, 0], place[k, 1] = result.x, result.y
     best = best_apart(place, score, search.separation)
@@ -424,16 +418,6 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
     u1, v1, u2, v2 = u1 - u, v1 - v, u2 - u, v2 - v
     squares = u1 * u1 + v1 * v1 + u2 * u2 + v2 * v2
     return 0.5 * math.sqrt(squares + 2.0 * abs(u1 * v2 - u2 * v1))
-
-
-@kernel()
-def _is_even(rim: Rim, result: Any) -> bool:
-    """Whether the points of a rim are found at its place all round where it is not hidden.
-
-    Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
-    explains most, though, and says that it is blurred.
-    """
-    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
 
 
 @kernel(forceinline=True)
