@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from camera.model import Camera
 from redetect.array_types import FloatArray
+from redetect.compiled import kernel
 
 _NEWTON_STEPS = 100
 _LAST_STEP = 1e-9
@@ -58,7 +58,7 @@ def lens_numbers(camera: Camera) -> FloatArray:
     return np.array([*camera.coef, *camera.brown, camera.r_max])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def brown_shift_point(
     k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
 ) -> tuple[float, float]:
@@ -68,7 +68,7 @@ def brown_shift_point(
     return along * x + squared * p2, along * y + squared * p1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def straightened_point(
     lens: FloatArray, x_seen: float, y_seen: float, x: float, y: float
 ) -> tuple[float, float]:
@@ -149,7 +149,7 @@ def straightened_point(
     return math.nan, math.nan
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def straighten_points(
     lens: FloatArray,
     seen: FloatArray,
@@ -164,14 +164,14 @@ def straighten_points(
         straight[k, 0], straight[k, 1] = straightened_point(lens, x, y, x * ratio, y * ratio)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def has_brown(terms: FloatArray) -> bool:
     """Whether any of k1, k2, p1, p2, k3 is not 0."""
     k1, k2, p1, p2, k3 = terms[0], terms[1], terms[2], terms[3], terms[4]
     return bool(k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> tuple[float, float]:
     """Pixel (u, v) of a direction in the robot frame; both NaN where it is undefined."""
     z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
@@ -195,7 +195,7 @@ def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> t
     return u + numbers[2], v + numbers[3]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def project_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> tuple[float, float]:
     """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
     return project_direction(numbers, x_robot - numbers[19], y_robot - numbers[20], -numbers[21])

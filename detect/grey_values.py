@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from redetect.compiled import kernel
 
 #: With fewer pixels than this that are neither black nor saturated, all count for the noise.
 _LEAST_COUNTABLE = 100
@@ -31,7 +32,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
     return _median_response(image, rows) / 0.6745 / 6.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _median_response(image: NDArray[np.uint8], rows: NDArray[np.int64]) -> float:
     """Median of the absolute responses in some rows, by their histogram."""
     width = image.shape[1]

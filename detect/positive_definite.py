@@ -8,14 +8,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from redetect.compiled import kernel
 
 #: A pivot less than this part of its diagonal entry is rounding.
 _LEAST_PIVOT = 1e-13
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def solve_positive(
     matrix: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
 ) -> bool:
@@ -43,10 +44,12 @@ def solve_positive(
         for k in range(i + 1, n):
             total -= lower[k, i] * solution[k]
         solution[i] = total / lower[i, i]
-    return bool(np.all(np.isfinite(solution)))
+        if not math.isfinite(solution[i]):
+            return False
+    return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
     """Inverse of a positive definite matrix; False if it is not one."""
     n = matrix.shape[0]

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
 FloatArray = NDArray[np.float64]
@@ -289,13 +289,13 @@ def _share_exact(apart: Sequence[float]) -> float:
     return 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _weighed(share: float, off: float, variance: float) -> float:
     """A share of a normal density."""
     return share * math.exp(-0.5 * min(off * off / variance, 1000.0)) / math.sqrt(variance)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def smooth_axis(
     deviation: NDArray[np.float64],
     sigma: NDArray[np.float64],

@@ -18,12 +18,12 @@ from functools import cached_property, lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
 
@@ -215,7 +215,7 @@ def _sample_pixels(
     return _samples_of(numbers, camera.width, camera.height, centre_xy, down, outlines)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _samples_of(
     numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, down: FloatArray,
     outlines: _Outlines,

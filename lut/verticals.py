@@ -15,11 +15,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_direction
+from redetect.compiled import kernel
 
 #: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
 STEEPEST_SLOPE = 1.0
@@ -163,7 +163,7 @@ def _roots(
     return np.asarray(0.5 * (low + high))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def trace_verticals(
     numbers: NDArray[np.float64],
     bearing: NDArray[np.float64],
@@ -196,7 +196,7 @@ def trace_verticals(
                 angle += direction / slope
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _crossing(
     numbers: NDArray[np.float64], bearing: float, row: float, angle: float
 ) -> tuple[float, float, float]:
@@ -213,7 +213,7 @@ def _crossing(
     return math.nan, math.nan, math.nan
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _seen(numbers: NDArray[np.float64], bearing: float, elevation: float) -> tuple[float, float]:
     ahead = math.cos(elevation)
     return project_direction(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from detect.discs.quality import Centres
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def suppress_neighbours(
     return kept
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> NDArray[np.int64]:
     """Those of some positions, in this order, that are not nearer than this to one kept before."""
     kept, count = np.empty(len(order), np.int64), 0
@@ -94,7 +94,7 @@ def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> 
     return kept[:count]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def best_apart(floor_xy: FloatArray, score: FloatArray, separation: float) -> NDArray[np.int64]:
     """Those of some positions that have no better one nearer than this, the best first.
 
@@ -113,7 +113,7 @@ def best_apart(floor_xy: FloatArray, score: FloatArray, separation: float) -> ND
     return apart(floor_xy, order[:count], separation)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def strong_and_alone(
     centres: Centres, floor_xy: NDArray[np.float32], weakest: float, separation: float
 ) -> NDArray[np.int64]:
@@ -143,7 +143,7 @@ def strong_and_alone(
     return best_apart(place, score, separation)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def middles(
     centres: Centres, keep: NDArray[np.int64], floor_xy: NDArray[np.float32], weakest: float,
     separation: float,
@@ -181,7 +181,7 @@ def middles(
     return middle
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def alone_published(
     pixels: NDArray[np.int64], quality: FloatArray, floor_xy: NDArray[np.float32],
     separation: float,

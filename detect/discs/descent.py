@@ -15,7 +15,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
 from detect.discs.least_squares import (
@@ -44,6 +43,7 @@ from detect.discs.model import (
     edge_shares,
 )
 from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
+from redetect.compiled import kernel
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
 LEAST_BLUR, MOST_BLUR = 0.1, 8.0
@@ -100,27 +100,27 @@ class Descent(NamedTuple):
     variance: float  # of the residuals, grey levels squared
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def blur_of(shape: int, disc: Disc, ratio: float) -> Blur:
     """A disc's blur along the axes of a patch of that shape."""
     blur = math.exp(disc.log_blur)
     return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _sigma(disc: Disc) -> float:
     """Standard deviation of optics and pixel together, pixels."""
     return math.sqrt(math.exp(2.0 * disc.log_blur) + PIXEL_VARIANCE)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _add_ridge(begin: int, end: int, n: int, work: Any) -> None:
     """Where two unknowns do the same, or one does nothing, there is still one solution."""
     for j in range(begin, end):
         work.products[j, j] += 1e-9 * n
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def solve_step(
     best: Disc, contrast: float, variance: float, damping: float, settings: FitSettings,
     log_most: float, work: Any,
@@ -156,7 +156,7 @@ def solve_step(
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def moved(best: Disc, contrast: float, log_most: float, work: Any) -> Disc:
     """A step on from the best parameters, within limits."""
     values = work.values
@@ -172,7 +172,7 @@ def moved(best: Disc, contrast: float, log_most: float, work: Any) -> Disc:
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def descend(
     gathered: Gathered, start: Disc, settings: FitSettings, most_blur: float,
     most_evaluations: int, hope: Hope, work: Any,
@@ -262,7 +262,7 @@ def descend(
     return Descent(False, best, contrast, variance)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _is_hopeless(share: float, radius: float, width: float, first: bool, hope: Hope) -> bool:
     """Whether what a step promises, the explained share and the radius, is too little."""
     if share < hope.least_share:

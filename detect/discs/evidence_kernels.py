@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from detect.discs.rim import Rim
+from redetect.compiled import kernel
 
 #: What no disc's fit violates: radius relative to the nominal one, explained variance, and the
 #: share of the outline that has a step of the right sign.
@@ -21,7 +20,7 @@ MOST_UNEVEN = 1.2
 UNDISTURBED = 0.75
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def evidence_of(
     explained: float,
     relative_radius: float,
@@ -69,7 +68,7 @@ RIM_RADIUS = 0.95
 _EVEN = 0.3
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def evidence_with_rim(
     fitted: float, explained: float, contrast: float, quality: float, rim: Rim, radius: float
 ) -> float:
@@ -104,7 +103,7 @@ def evidence_with_rim(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _log_odds(share: float) -> float:
     bounded = min(max(share, 0.003), 0.997)
     return math.log(bounded / (1.0 - bounded))

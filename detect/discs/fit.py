@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
@@ -42,6 +41,7 @@ from detect.discs.least_squares import (
 )
 from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
 from detect.discs.patch import EDGE, FULL, LOOK, Candidate, Effort, FitSettings, Gathered, gather
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ SECTORS_GOOD, OUTLINE_DEVIATION, MIDDLE_STEP = "sectors_good", "outline_deviatio
 RELATIVE_BLUR, BLUR_BOUND = "relative_blur", "blur_bound"
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def fit_disc(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -144,14 +144,14 @@ def fit_disc(
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _clear(result: Any) -> None:
     result.x = result.y = result.radius = result.blur = result.contrast = result.explained = 0.0
     result.cov_xx = result.cov_xy = result.cov_yy = result.sectors_good = 0.0
     result.outline_deviation = result.middle_step = result.relative_blur = 0.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _solve_last_step(descent: Descent, settings: FitSettings, most_blur: float, work: Any) -> bool:
     """All unknowns of the undamped step into `work.values`, the background alone into `bare`."""
     factor = work.factor
@@ -166,7 +166,7 @@ def _solve_last_step(descent: Descent, settings: FitSettings, most_blur: float, 
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _judge(
     gathered: Gathered, disc: Disc, radius: float, variance: float, work: Any, result: Any
 ) -> None:
@@ -188,7 +188,7 @@ def _judge(
     result.middle_step = outline.middle
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def fit_all(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],

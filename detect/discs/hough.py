@@ -23,12 +23,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
 from detect.discs.candidates import suppress_neighbours
 from lut import DiscTable
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -99,7 +99,7 @@ def hough_candidates(
     return HoughCandidates(place[best] @ grid.turn + grid.foot, score[best])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def count_votes(
     image: NDArray[np.uint8], grid: Grid, radius: float, least_step: float
 ) -> NDArray[np.float32]:
@@ -144,7 +144,7 @@ def count_votes(
     return votes
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})
+@kernel(fastmath={"reassoc", "nsz"})
 def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArray]:
     """Places (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape

@@ -16,7 +16,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs.model import (
@@ -36,6 +35,7 @@ from detect.discs.model import (
     Blur,
     Disc,
 )
+from redetect.compiled import kernel
 
 #: Terms of the background, and unknowns of a step.
 BACKGROUND, UNKNOWNS = 5, 10
@@ -54,7 +54,7 @@ _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0)
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def background_products(patch: Any, n: int, products: FloatArray) -> None:
     """Sums of products of the background's terms with each other and the grey values."""
     design = patch.design
@@ -68,7 +68,7 @@ def background_products(patch: Any, n: int, products: FloatArray) -> None:
             products[a, c] = total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def disc_products(patch: Any, n: int, products: FloatArray) -> None:
     """Sums of products of the disc's rows with all rows."""
     design = patch.design
@@ -86,7 +86,7 @@ def disc_products(patch: Any, n: int, products: FloatArray) -> None:
             products[max(row, SHARE + column), min(row, SHARE + column)] = total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def factor_rows(products: FloatArray, begin: int, end: int, factor: FloatArray) -> bool:
     """Rows `begin` to `end` of the Cholesky factor, and the row of the grey values as far.
 
@@ -111,7 +111,7 @@ def factor_rows(products: FloatArray, begin: int, end: int, factor: FloatArray) 
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def left_over(products: FloatArray, factor: FloatArray, unknowns: int) -> float:
     """The sum of the squared residuals with the first unknowns, however many."""
     left = products[GREY, GREY]
@@ -120,7 +120,7 @@ def left_over(products: FloatArray, factor: FloatArray, unknowns: int) -> float:
     return max(float(left), 0.0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def solution(factor: FloatArray, begin: int, end: int, values: FloatArray) -> None:
     """Unknowns `begin` to `end` of the least-squares solution with the first `end` unknowns."""
     for i in range(end - 1, begin - 1, -1):
@@ -130,7 +130,7 @@ def solution(factor: FloatArray, begin: int, end: int, values: FloatArray) -> No
         values[i] = s * factor[i, i]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def residuals(
     patch: Any, n: int, values: NDArray[np.float64], bare: NDArray[np.float64]
 ) -> tuple[float, float, float]:
@@ -158,7 +158,7 @@ def residuals(
     return total, near, near_total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def correlated_area(patch: Any, n: int) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
@@ -181,7 +181,7 @@ def correlated_area(patch: Any, n: int) -> float:
     return area
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def blur_width(patch: Any, n: int, disc: Disc, blur: Blur) -> float:
     """Mean width of the blur, of optics and pixel, across the edge, in nominal radii."""
     x0, y0, most = F32(disc.x), F32(disc.y), F32(2.5)
@@ -212,7 +212,7 @@ class Outline(NamedTuple):
     middle: float
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
     """Which sector pixels are in; `SECTORS` for those in the middle, and those not fitted."""
     design = patch.design
@@ -229,7 +229,7 @@ def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
         patch.sector[i] = k if counts else np.int32(SECTORS)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def outline_statistics(
     patch: Any, n: int, disc: Disc, contrast: float, sums: NDArray[np.float32]
 ) -> Outline:

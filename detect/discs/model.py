@@ -36,7 +36,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from redetect.compiled import kernel
 
 #: Single precision. Numba knows it as the type, the type checker as a function.
 F32: Callable[[Any], Any] = np.float32
@@ -91,7 +92,7 @@ _C2, _C4, _C6, _C8 = F32(-1 / 2), F32(1 / 24), F32(-1 / 720), F32(1 / 40320)
 _C10 = F32(-1 / 3628800)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def normal(x: float) -> tuple[float, float]:
     """Density and distribution function of a standard normal variable, within 2e-6."""
     a = min(abs(x), _FAR)
@@ -108,7 +109,7 @@ def normal(x: float) -> tuple[float, float]:
     return density, (_1 - tail if x > _0 else tail)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def arcsine(x: float) -> float:
     """Within 7e-5; what lies beyond -1 and 1 is cut off."""
     a = min(abs(x), _1)
@@ -138,7 +139,7 @@ _Z_PER_T = F32((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
 _ASIDE = F32(1e-6)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     """W by the profile of a curved edge, for the first n pixels.
 
@@ -215,7 +216,7 @@ class _Pixel(NamedTuple):
     growth: float  # and by what share each is longer than the one before
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _chord(
     theta: float, weight: float, radius: float, per_sigma: float, pixel: _Pixel
 ) -> tuple[float, float, float, float, float, float]:
@@ -255,7 +256,7 @@ def _chord(
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def chord_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     """W by the blurred chords along the patch's first axis, for the first n pixels."""
     design = patch.design

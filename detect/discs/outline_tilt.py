@@ -21,7 +21,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
@@ -29,6 +28,7 @@ from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
 from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
+from redetect.compiled import kernel
 
 #: Directions in which the rim must lie on the ellipse.
 LEAST_DIRECTIONS = 24
@@ -61,7 +61,7 @@ class OutlineTilt(NamedTuple):
     discs: int
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _derivative_of_levelling(
     rotation: NDArray[np.float64], centre: NDArray[np.float64], x: float, y: float
 ) -> tuple[float, float, float, float]:
@@ -80,7 +80,7 @@ def _derivative_of_levelling(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _contrast(grey: NDArray[np.float64]) -> float:
     """Grey levels within half a radius minus those beyond one and a third."""
     inside = outside = 0.0
@@ -97,7 +97,7 @@ def _contrast(grey: NDArray[np.float64]) -> float:
     return inside / inside_count - outside / outside_count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def fit_outline(
     point_xy: NDArray[np.float64],
     px_per_m: NDArray[np.float64],
@@ -119,7 +119,7 @@ def fit_outline(
     for k in range(count):
         weight[k] = 0.0 if math.isnan(point_xy[k, 0]) else 1.0
     normal, inverse, sigma = np.zeros((4, 4)), np.zeros((4, 4)), 0.0
-    shapes = np.empty((5, 4))
+    shapes, off = np.empty((5, 4)), np.empty(count)
     for iteration in range(_ITERATIONS):
         pitch, roll = unknowns[2], unknowns[3]
         for i in range(5):
@@ -145,7 +145,12 @@ def fit_outline(
             row[k, 3] = (lengths[3] - lengths[4]) / (2.0 * _STEP_RAD) * px_per_m[k]
         if iteration > 1:
             # The first steps go from a level floor to the tilted one, with all points.
-            sigma = max(0.1, 1.48 * median(np.abs(residual[weight > 0.0])))
+            used = 0
+            for k in range(count):
+                if weight[k] > 0.0:
+                    off[used] = abs(residual[k])
+                    used += 1
+            sigma = max(0.1, 1.48 * median(off[:used]))
             for k in range(count):
                 if weight[k] > 0.0:
                     weight[k] = 1.0 / (1.0 + (residual[k] / (2.0 * sigma)) ** 2) ** 2
@@ -187,7 +192,7 @@ def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
     return mean, of_mean
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _tilts_of_discs(
     image: NDArray[np.uint8],
     numbers: FloatArray,
@@ -199,7 +204,7 @@ def _tilts_of_discs(
     """Tilts of the discs that show one, and their covariances."""
     tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
     used = 0
-    point_xy = np.empty((DIRECTIONS, 2))
+    point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         grey, scale = profiles(image, numbers, x, y, radius)
@@ -209,14 +214,17 @@ def _tilts_of_discs(
         if not abs(contrast) >= LEAST_CONTRAST:
             continue
         distance, _ = rim_points(grey, scale, contrast)
-        if np.count_nonzero(~np.isnan(distance)) < LEAST_DIRECTIONS:
-            continue
+        seen = 0
         for m in range(DIRECTIONS):
+            seen += not math.isnan(distance[m])
             point_xy[m, 0] = radius * distance[m] * COS[m]
             point_xy[m, 1] = radius * distance[m] * SIN[m]
+            px_per_m[m] = scale[m] / radius
+        if seen < LEAST_DIRECTIONS:
+            continue
         # What a higher camera sees is larger than the calibrated floor has it.
         found, tilt, covariance = fit_outline(
-            point_xy, scale / radius, centre, x, y, radius / height_ratio
+            point_xy, px_per_m, centre, x, y, radius / height_ratio
         )
         if found:
             for i in range(2):

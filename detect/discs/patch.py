@@ -13,7 +13,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.discs.model import (
@@ -29,6 +28,7 @@ from detect.discs.model import (
     SADDLE_XY,
     Disc,
 )
+from redetect.compiled import kernel
 
 #: Most pixels of a patch.
 CAPACITY = 4096
@@ -142,13 +142,13 @@ class View(NamedTuple):
     """By how much the floor moves from pixel to pixel: x, y by u, and by v; radii."""
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def padded(n: int) -> int:
     """A number of pixels, rounded up to what loops work on at once."""
     return (n + WHOLE - 1) // WHOLE * WHOLE
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def floor_steps(
     floor_xy: NDArray[np.float32], u0: int, v0: int
 ) -> tuple[float, float, float, float]:
@@ -164,7 +164,7 @@ def floor_steps(
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def view_of(
     floor_xy: NDArray[np.float32], candidate: Candidate, relative: float, ratio: float
 ) -> View:
@@ -207,7 +207,7 @@ class Gathered(NamedTuple):
     """Those of them that are fitted."""
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def gather(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -243,7 +243,7 @@ def gather(
     return Gathered(view.shape, padded(count), count)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _choose(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
@@ -312,7 +312,7 @@ def _choose(
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _in_view(
     floor_xy: NDArray[np.float32], candidate: Candidate, start: Disc, count: int, patch: Any
 ) -> int:
@@ -331,7 +331,7 @@ def _in_view(
     return kept
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _weigh(
     length: int,
     candidate: Candidate,
@@ -377,7 +377,7 @@ def _weigh(
         patch.row[k] = at_edge if near & edge else weight
 
 
-@njit(cache=True, error_model="numpy", forceinline=True, fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _describe(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],

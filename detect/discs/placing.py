@@ -13,7 +13,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
@@ -22,6 +21,7 @@ from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
 from detect.discs.rim import PLACING_SIGMA, Rim, follow_again, follow_rim, median
+from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
@@ -36,12 +36,16 @@ _DISAGREEMENT = 0.5
 _LEAST_WHOLE = 3
 #: Blur from which fits start: that of a whole disc's fit is also of what hides a part, pixels.
 _BLUR_PX = 1.0
+#: A rim whose step varies by less than this over the directions, relative to its mean, is even.
+_EVEN = 0.18
+#: Nothing moves where the blur is less than this, pixels.
+_SHARP_PX = 1.2
+#: A fit that explains less of the variance than this is of a disc that something hides.
+_LITTLE = 0.7
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def place_by_part(
-    scene: Scene, radius: float, rim: Rim, by_points: bool, work: Any, result: Any
-) -> None:
+@kernel()
+def place_by_part(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> None:
     """Place a disc by the part of its rim that is in view.
 
     Parameters
@@ -51,12 +55,10 @@ def place_by_part(
         That discs of the image seem to have (`apparent_radius`), metres.
     rim : Rim
         Followed from about its own middle.
-    by_points : bool
-        Whether the points of the rim place it where no fit does.
     work : WORK
         Working space.
     result : RESULT
-        Its centre and covariance are replaced.
+        The fit of the whole disc, or zeros: its centre and covariance are replaced.
     """
     of_part = np.zeros(1, RESULT)
     part = of_part[0]
@@ -70,13 +72,23 @@ def place_by_part(
         # What fit and points of the rim disagree by is a sample of what either may be wrong by.
         _add_square(result, _DISAGREEMENT, part.x - rim.x, part.y - rim.y)
         _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
-    elif by_points:
+    elif _is_even(rim, result):
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
         _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel()
+def _is_even(rim: Rim, result: Any) -> bool:
+    """Whether the points of a rim are found at its place all round where it is not hidden.
+
+    Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
+    explains most, though, and says that it is blurred.
+    """
+    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
+
+
+@kernel(forceinline=True)
 def _add_square(result: Any, share: float, x: float, y: float) -> None:
     """Add a share of the square of (x, y), metres, to the covariance of a result."""
     result.cov_xx += share * x * x
@@ -84,7 +96,7 @@ def _add_square(result: Any, share: float, x: float, y: float) -> None:
     result.cov_yy += share * y * y
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def place_all_by_part(
     scene: Scene,
     radius: float,
@@ -98,11 +110,11 @@ def place_all_by_part(
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, step[k])
         rim = follow_again(scene.image, scene.camera_numbers, radius, rim)
-        place_by_part(scene, radius, rim, True, space[0], results[k])
+        place_by_part(scene, radius, rim, space[0], results[k])
     return results
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
     """The radius that discs of an image seem to have, by those that are wholly in view.
 
@@ -114,7 +126,7 @@ def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
     return median(radii)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(inline="always")
 def _fit_in_view(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
     """Whether a fit to the pixels in view comes to a disc near the rim, of about its size."""
     floor_xy, given = scene.floor_xy, scene.settings

@@ -10,10 +10,10 @@ seems to give the position (`detect.circles.tilt_jacobian`).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 _STEP_M = 1e-5
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _add_pixels(
     numbers: FloatArray, x: float, y: float, pixel_variance: float, covariance: FloatArray
 ) -> None:
@@ -39,7 +39,7 @@ def _add_pixels(
     covariance[1, 1] += scale * (ux * ux + vx * vx)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def refined_covariances(
     camera_numbers: FloatArray,
     centre: FloatArray,

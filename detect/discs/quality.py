@@ -28,11 +28,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from lut import GROUP_COLUMNS, GROUP_SAMPLES, CentreGroups, DiscTable
+from redetect.compiled import kernel
 
 # Unsigned: an index that is none of those counted from the end.
 _U64, _U32, _I32, _F32 = np.uint64, np.uint32, np.int32, np.float32
@@ -72,7 +72,7 @@ def least_part_quality(quality: float, samples: int) -> float:
     return 1.0 - (1.0 - quality) * samples / GROUP_SAMPLES
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _with_squares(grey: NDArray[np.uint8], first: int, end: int) -> NDArray[np.uint32]:
     """Of some pixels, x 2^20 + x^2; uninitialised before and after them."""
     both = np.empty(len(grey), np.uint32)
@@ -82,7 +82,7 @@ def _with_squares(grey: NDArray[np.uint8], first: int, end: int) -> NDArray[np.u
     return both
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _columns_left(
     both: NDArray[np.uint32], samples: NDArray[np.uint32], g: int, least_quality: np.float32
 ) -> np.int32:
@@ -102,7 +102,7 @@ def _columns_left(
     return left
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _quality_of(
     grey: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, outside: int
 ) -> tuple[float, float]:
@@ -126,7 +126,7 @@ def _quality_of(
     return quality, difference / pairs if pairs > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def find_centres(
     grey: NDArray[np.uint8], outside: int, pixels: NDArray[np.int32],
     samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,

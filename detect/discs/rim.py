@@ -20,11 +20,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
 from detect.discs.patch import DIRECTIONS as DIRECTIONS
+from redetect.compiled import kernel
 
 #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 STEPS = 32
@@ -115,7 +115,7 @@ class Rim(NamedTuple):
     """Directions in or beside which the rim is not on the circle, a bit each."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def profiles(
     image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], x: float, y: float, radius: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -161,7 +161,7 @@ def profiles(
     return grey, scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def rim_points(
     grey: NDArray[np.float64], pixels_per_radius: NDArray[np.float64], contrast: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -224,7 +224,7 @@ class Circle(NamedTuple):
     cov_yy: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def fit_circle(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -276,12 +276,12 @@ def fit_circle(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _bounded(step: float) -> float:
     return min(max(step, -_LONGEST_STEP), _LONGEST_STEP)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _choose(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -308,7 +308,7 @@ def _choose(
     return count, changed != 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def best_circle(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -380,7 +380,7 @@ def best_circle(
     return best, best_count, doubt
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def follow_rim(
     image: NDArray[np.uint8],
     camera_numbers: NDArray[np.float64],
@@ -469,7 +469,7 @@ def follow_rim(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def follow_again(
     image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], radius: float, rim: Rim
 ) -> Rim:
@@ -478,7 +478,7 @@ def follow_again(
     return again if again.agreeing >= rim.agreeing - _SLACK else rim
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _placed(
     x: NDArray[np.float64], y: NDArray[np.float64], chosen: NDArray[np.float64], circle: Circle
 ) -> tuple[Circle, tuple[float, float, float]]:
@@ -514,7 +514,7 @@ def _placed(
     return circle, _by_jackknife(x, y, trusted, circle)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _by_jackknife(
     x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64], circle: Circle
 ) -> tuple[float, float, float]:
@@ -549,7 +549,7 @@ def _by_jackknife(
     return share * xx, share * xy, share * yy
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def median(values: NDArray[np.float64]) -> float:
     """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
     count = len(values)

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from redetect.compiled import kernel
 
 WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 #: Besides grey values, a network sees of each direction its size in the image and its share outside
@@ -69,7 +70,7 @@ def trained_networks() -> Networks:
     return Networks(glance, look)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def network_inputs(
     grey: NDArray[np.float64], pixels_per_radius: NDArray[np.float64], sign: float
 ) -> tuple[_Weights, _Weights]:
@@ -114,7 +115,7 @@ def network_inputs(
     return inputs, scales
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
     """Convolution over three neighbours on a circle, and relu, as (C, K + 2) float32."""
     result = np.empty((len(bias), values.shape[1]), np.float32)
@@ -134,7 +135,7 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
     return result
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: NDArray[np.float64], network: RimNetwork
 ) -> float:

@@ -6,7 +6,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
@@ -25,7 +24,8 @@ from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
 from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_part
 from detect.discs.quality import Centres
-from detect.discs.rim import Rim, follow_rim
+from detect.discs.rim import follow_rim
+from redetect.compiled import kernel
 
 #: Candidates whose first look is this much below the required evidence are not fitted in full; more
 #: is allowed where the quality is high, for what hides part of a disc hardly lowers that.
@@ -55,12 +55,6 @@ _MOST_UNEVEN = 0.14
 _BY_FIT = 0.5
 #: From this share of the rim on, the fit of the whole disc gives the place better.
 _WHOLE_RIM = 0.9
-#: A rim whose step varies by less than this over the directions, relative to its mean, is even.
-_EVEN = 0.18
-#: Nothing moves where the blur is less than this, pixels.
-_SHARP_PX = 1.2
-#: A fit that explains less of the variance than this is of a disc that something hides.
-_LITTLE = 0.7
 #: A fit that explains less of the variance than this may place the disc worse than half of its rim.
 _IN_PART, _HALF_RIM = 0.94, 0.5
 
@@ -177,7 +171,7 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     return FoundDiscs(centre, xy, covariance, evidence, radius, Looks(*looks))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any]) -> Any:
     """`search_discs`: the fields of what it returns."""
     image, floor_xy, search, settings = scene.image, scene.floor_xy, scene.search, scene.settings
@@ -261,7 +255,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             rim = follow_rim(
                 image, scene.camera_numbers, rim_xy[k, 0], rim_xy[k, 1], radius, rim_step[k]
             )
-            place_by_part(scene, radius, rim, _is_even(rim, result), work, result)
+            place_by_part(scene, radius, rim, work, result)
             if search.refine:
                 place[k, 0], place[k, 1] = result.x, result.y
     best = best_apart(place, score, search.separation)
@@ -288,7 +282,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
     return found, found_xy, covariance, log_odds, radius, looks
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _apparent_radius(
     results: NDArray[Any], evidence: NDArray[np.float64], search: DiscSearch
 ) -> float:
@@ -302,7 +296,7 @@ def _apparent_radius(
     return apparent_radius(search.radius, radii[:count])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _at_clear_disc(
     search: DiscSearch, looked_at: NDArray[np.float64], evidence: NDArray[np.float64],
     place: NDArray[np.float32],
@@ -317,7 +311,7 @@ def _at_clear_disc(
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def of_likely_sign(
     found: NDArray[np.int64], contrast: NDArray[np.float64], evidence: NDArray[np.float64],
     least_evidence: float,
@@ -345,7 +339,7 @@ def of_likely_sign(
     return kept[:count]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _evidence(result: Any, search: DiscSearch) -> float:
     return evidence_of(
         result.explained,
@@ -358,7 +352,7 @@ def _evidence(result: Any, search: DiscSearch) -> float:
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _hope(search: DiscSearch, quality: float) -> Hope:
     """When a fit is given up: it may promise less where the quality is high."""
     if not search.verify:
@@ -377,7 +371,7 @@ class _Verdict(NamedTuple):
     """0 where the fit places the disc."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(inline="always")
 def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> _Verdict:
     """The evidence of a fit with its rim, where it is doubtful; the rim may place the disc.
 
@@ -414,7 +408,7 @@ def _with_rim(scene: Scene, quality: float, log_odds: float, result: Any) -> _Ve
     return _Verdict(by_rim, rim.x, rim.y, step)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _radius_px(scene: Scene, x: float, y: float) -> float:
     """The geometric mean of a disc's radius over all directions: (a + b) / 2 of an ellipse."""
     radius = scene.search.radius
@@ -426,17 +420,7 @@ def _radius_px(scene: Scene, x: float, y: float) -> float:
     return 0.5 * math.sqrt(squares + 2.0 * abs(u1 * v2 - u2 * v1))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _is_even(rim: Rim, result: Any) -> bool:
-    """Whether the points of a rim are found at its place all round where it is not hidden.
-
-    Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
-    explains most, though, and says that it is blurred.
-    """
-    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def nearest_pixel(
     floor_xy: NDArray[np.float32], u: int, v: int, x: float, y: float
 ) -> tuple[int, int]:
@@ -463,7 +447,7 @@ def nearest_pixel(
     return min(max(u, 1), width - 2), min(max(v, 1), height - 2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def share_of_steps(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
@@ -520,7 +504,7 @@ def share_of_steps(
     return steps / seen if seen > 0 else 1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def worth_a_look(scene: Scene, u: int, v: int, quality: float, contrast: float) -> bool:
     """Whether a candidate's quality is clear, or the grey value steps on most sides."""
     if quality >= CLEAR_QUALITY:

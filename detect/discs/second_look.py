@@ -14,7 +14,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
@@ -34,6 +33,7 @@ from detect.discs.rim import (
     profiles,
 )
 from detect.discs.rim_network import Networks, network_inputs, network_log_odds
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def second_looks(
     return SecondLooks(*(values[best] for values in looks))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _look_at_all(
     image: NDArray[np.uint8],
     candidates: HoughCandidates,
@@ -169,7 +169,7 @@ def _look_at_all(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _near_any(places: FloatArray, x: float, y: float, distance: float) -> bool:
     for k in range(len(places)):
         if (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2 < distance * distance:
@@ -177,7 +177,7 @@ def _near_any(places: FloatArray, x: float, y: float, distance: float) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
     """Mean grey value of each direction between two distances, nominal radii."""
     per_step = (FARTHEST - NEAREST) / (STEPS - 1)
@@ -189,7 +189,7 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
     return mean
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def glance(
     image: NDArray[np.uint8], camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -216,13 +216,13 @@ def glance(
     return grey, scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def pairs_of_steps(grey: FloatArray) -> FloatArray:
     """Profiles as the network sees them: means of two steps each."""
     return 0.5 * (grey[:, ::2] + grey[:, 1::2])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _contrast(grey: FloatArray, sought: Sought) -> float:
     """Median step over those directions that step enough; 0 where these are too few."""
     steps = np.empty(GLANCED)
@@ -235,7 +235,7 @@ def _contrast(grey: FloatArray, sought: Sought) -> float:
     return median(steps[:count]) if count >= _LEAST_STEPS * GLANCED else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _quality(grey: FloatArray) -> float:
     """Between-class over total variance of the grey values inside and outside."""
     inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
@@ -248,7 +248,7 @@ def _quality(grey: FloatArray) -> float:
     return float(between / total) if total > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _note_rim(rim: Rim, radius: float, score: float, out: FloatArray) -> None:
     """The features of the rim, each bounded, for a single one is never to decide."""
     off = abs(math.log(min(max(rim.radius / radius, 0.3), 3.0) / _RIM_RADIUS))

@@ -11,11 +11,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.markers.geometry import Picture, is_convex
 from detect.positive_definite import invert_positive, solve_positive
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ def refine_quadrangle(
     return refined
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _fit_edges(
     grey: NDArray[np.uint8],
     straight: NDArray[np.float32],
@@ -215,7 +215,7 @@ def _fit_edges(
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
     """Robust least squares of a blurred step; NaN if there is none.
 
@@ -271,7 +271,7 @@ def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _pixels_along(grey: NDArray[np.uint8], straight: NDArray[np.float32], band: _Band) -> _Pixels:
     """Pixels near a line but not near its ends; of many, only some columns (rows)."""
     height, width = grey.shape
@@ -303,7 +303,7 @@ def _pixels_along(grey: NDArray[np.uint8], straight: NDArray[np.float32], band: 
     return _Pixels(along[:count], across[:count], values[:count])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _best_split(pixels: _Pixels, reach: float) -> tuple[float, float, float, float]:
     """Offset and turn of the line that splits the grey values best, and the means on both sides.
 
@@ -333,7 +333,7 @@ def _best_split(pixels: _Pixels, reach: float) -> tuple[float, float, float, flo
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _linearise(
     pixels: _Pixels, p: FloatArray, expected: FloatArray, prior: FloatArray, outlier: float
 ) -> _Linearised:
@@ -370,13 +370,13 @@ def _linearise(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def robust_sigma(residual: FloatArray, least: float) -> float:
     """Standard deviation of residuals (N,) by the median of their magnitudes, at least `least`."""
     return max(least, _MEDIAN_TO_SIGMA * float(np.median(np.abs(residual))))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _support(pixels: _Pixels, p: FloatArray) -> float:
     """Share of the segments of an edge whose own step is at least half the fitted one."""
     out = pixels.across - p[0] - p[1] * pixels.along

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
 from detect.grey_values import estimate_noise
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
     return np.ascontiguousarray(corners if signed_area(corners) > 0.0 else corners[::-1])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def largest_quadrangle(points: FloatArray) -> NDArray[np.int64]:
     """Indices (4,) of the largest quadrangle among points (N, 2), in the order of the points.
 

@@ -13,9 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtr
+
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +93,7 @@ def pattern_of(lines: FloatArray, black: FloatArray) -> Pattern:
     return Pattern(lines, black, np.diff(np.diff(np.pad(black, 1), axis=0), axis=1))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _cell_profile(
     x: float, sigma: float, lines: FloatArray, z: FloatArray, cdf: FloatArray, pdf: FloatArray
 ) -> tuple[int, int]:
@@ -113,7 +114,7 @@ def _cell_profile(
     return first, last
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: float) -> float:
     """Bivariate normal distribution at (h, k) less the product of its margins.
 
@@ -127,7 +128,7 @@ def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: 
     return total * angle / (2.0 * math.pi)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def blurred_blackness(at: Places, pattern: Pattern) -> Blackness:
     """Blurred pattern at some places."""
     count, n = len(at.x), len(pattern.lines)

@@ -12,11 +12,11 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import strongest_first
+from redetect.compiled import kernel
 
 #: A filter of this share of the blur's width is wide enough.
 _WIDE_ENOUGH = 0.68
@@ -69,7 +69,7 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
     return dataclasses.replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def median_sharpness(fits: LineFits) -> float:
     """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
 

@@ -18,7 +18,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import JoiningNumbers
@@ -33,6 +32,7 @@ from detect.verticals.refinement import LineFits
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.tilt import level_matrix, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.compiled import kernel
 
 
 class Lines(NamedTuple):
@@ -71,7 +71,7 @@ def lines_of_tracks(
     return _join(strip, tracks, judged.fits, judged.evidence, judged.fate, tilt, numbers)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
     fate: NDArray[np.int8], tilt: tuple[float, float], numbers: JoiningNumbers,
@@ -128,12 +128,12 @@ def _join(
     return Lines(ends, joined, beta, sigma, own_noise, members, bounds)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _wrapped(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _bearings(
     fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: JoiningNumbers
 ) -> tuple[FloatArray, FloatArray]:
@@ -160,7 +160,7 @@ def _bearings(
     return alpha, noise
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _leave_out(
     tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
     evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
@@ -182,7 +182,7 @@ def _leave_out(
                 fate[t] = BESIDE_A_STRONGER_EDGE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
     """Number the groups of bearings whose neighbours are close.
 
@@ -206,7 +206,7 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
     return group
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def join_mixtures(
     alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
@@ -242,14 +242,14 @@ def join_mixtures(
     return mean, deviation
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _inclination(line: FloatArray) -> float:
     """Inclination of the normal of a line's plane (rad)."""
     a, b = line
     return -math.asin(b / math.sqrt(1.0 + a * a + b * b))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _end_of_line(
     strip: Strip, tracks: LineTracks, fits: LineFits, t: int, end: int
 ) -> tuple[float, float]:

@@ -13,7 +13,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import JudgementNumbers, LineNumbers
@@ -27,6 +26,7 @@ from detect.verticals.tilt import (
     strongest_first,
 )
 from detect.verticals.tracking import LineTracks
+from redetect.compiled import kernel
 
 #: Fates of tracks: a line of its own, joined to another one, or the reason for its rejection.
 FATES = (
@@ -120,7 +120,7 @@ def fit_and_judge(
 # Kernels that are launched one after the other compile faster than one in another.
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
 ) -> tuple[
@@ -152,7 +152,7 @@ def _judge(
     return evidence, fate, doubtful, accepted, lines, edge
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _judge_each(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers,
     evidence: FloatArray, fate: NDArray[np.int8],
@@ -186,7 +186,7 @@ def _judge_each(
             fate[t] = ACCEPTED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
     accepted, count = np.empty(len(fate), np.int64), 0
     for t in range(len(fate)):
@@ -196,7 +196,7 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
     return accepted[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _reject_soft(
     fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: JudgementNumbers,
     fate: NDArray[np.int8],
@@ -213,7 +213,7 @@ def _reject_soft(
             fate[t] = SOFT
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> float:
     """Quantile of some values, interpolated linearly."""
     own = np.empty(len(chosen))
@@ -226,7 +226,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
     return float(high - (place - upper) * (high - low))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _weigh(
     fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
@@ -257,7 +257,7 @@ def _weigh(
     return Verticals(normal, variance, tolerance, votes)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
     """Let the lines of one edge say together as much about the tilt as one."""
     members = np.zeros(len(edge), np.int64)

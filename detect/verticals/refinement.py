@@ -19,12 +19,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
 from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, Strip
 from detect.verticals.tracking import LineTracks
+from redetect.compiled import kernel
 
 #: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
 SUBPIXELS = 64
@@ -170,7 +170,7 @@ class Eigenline(NamedTuple):
     spread: float
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _fits(count: int, known: LineFits, again: NDArray[np.bool_]) -> tuple[LineFits, int]:
     """Lines that are known, their number, and others of tracks that have none yet."""
     line, covariance, sharpness = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
@@ -208,7 +208,7 @@ def _fits(count: int, known: LineFits, again: NDArray[np.bool_]) -> tuple[LineFi
     return fits, n
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _fit_points(
     strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
     fits: LineFits,
@@ -244,7 +244,7 @@ def _fit_points(
     return line
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
     least: tuple[int, float], known: LineFits, again: NDArray[np.bool_],
@@ -293,7 +293,7 @@ def fit_lines(
     return fits
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _place_in_chart(
     strip: Strip, row: NDArray[np.int32], column: FloatArray, reference: float,
     x: FloatArray, z: FloatArray,
@@ -311,7 +311,7 @@ def _place_in_chart(
         z[i] = e / (c * ahead + s * left)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _eigenline(x: FloatArray, z: FloatArray) -> Eigenline:
     """The line along the larger eigenvalue's eigenvector of the points' scatter."""
     n = len(x)
@@ -331,7 +331,7 @@ def _eigenline(x: FloatArray, z: FloatArray) -> Eigenline:
     return Eigenline(mean_x - b * mean_z, b, smaller, mean_z, zz)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _cross_rows(
     strip: Strip, tracked: FloatArray, x: FloatArray, z: FloatArray, line: Eigenline,
     crossings: Crossings,
@@ -358,7 +358,7 @@ def _cross_rows(
             by_a[i] = by_b[i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _climb(
     image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,
@@ -392,7 +392,7 @@ def _climb(
     return NewtonStep(a, b, aa, ab, bb)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+@kernel(fastmath={"contract", "reassoc"}, forceinline=True)
 def newton_step(
     image: NDArray[np.uint8], crossings: Crossings, weights: SingleArray, half: int, sign: float
 ) -> NewtonStep:
@@ -449,7 +449,7 @@ def newton_step(
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _contrasts(
     image: NDArray[np.uint8], crossings: Crossings, heights: SingleArray
 ) -> tuple[int, float, float]:
@@ -466,7 +466,7 @@ def _contrasts(
 
 
 # Sums in any order become vectors; inlined, their order is that of the kernel that has them.
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"}, forceinline=True)
+@kernel(fastmath={"contract", "reassoc"}, forceinline=True)
 def _see(
     image: NDArray[np.uint8], v: int, u: float, weights: SingleArray, half: int
 ) -> tuple[bool, float, float, float]:

@@ -20,11 +20,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
 from lut.verticals import VerticalTable
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
@@ -190,7 +190,7 @@ def line_response(
     return _respond_everywhere(np.ascontiguousarray(image), column, line_filter(settings)).T
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _respond_everywhere(
     image: NDArray[np.uint8], column: SingleArray, window: LineFilter
 ) -> SingleArray:
@@ -208,7 +208,7 @@ def _respond_everywhere(
     return response
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def empty_stripe(window: LineFilter) -> Stripe:
     """Buffers for the stripes of a filter."""
     taps, length = window.across.shape[1], len(window.along)
@@ -226,7 +226,7 @@ def empty_stripe(window: LineFilter) -> Stripe:
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def respond(image: NDArray[np.uint8], top: int, stripe: Stripe) -> None:
     """Evaluate the response in a stripe along its path, from row `top` of the image on."""
     path, response, window = stripe.path, stripe.response, stripe.window
@@ -246,7 +246,7 @@ def respond(image: NDArray[np.uint8], top: int, stripe: Stripe) -> None:
         _leave_out(path[window.half_length :], left, image.shape[1] - 2 * reach - 1, response)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _leave_out(path: FloatArray, left: int, last: int, response: SingleArray) -> None:
     """No response where a path is not seen or windows leave the image."""
     columns = response.shape[1]
@@ -258,7 +258,7 @@ def _leave_out(path: FloatArray, left: int, last: int, response: SingleArray) ->
             response[b, c] = 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def _sample(
     image: NDArray[np.uint8], first_row: int, left: int, path: FloatArray, samples: SingleArray
 ) -> bool:
@@ -294,7 +294,7 @@ def _sample(
     return inside
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def correlate(values: SingleArray, weights: SingleArray, stride: int, sums: SingleArray) -> None:
     """Weighted sums of values a stride apart; several at a time, for which one pass suffices."""
     for c in range(len(sums)):
@@ -308,7 +308,7 @@ def correlate(values: SingleArray, weights: SingleArray, stride: int, sums: Sing
             sums[c] = total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _normalise(path: FloatArray, along: SingleArray, moments: SingleArray) -> None:
     """Divide moments by the weights of the rows on which the path is seen."""
     columns = moments.shape[1] // STRIPE_ROWS
@@ -322,7 +322,7 @@ def _normalise(path: FloatArray, along: SingleArray, moments: SingleArray) -> No
                 moments[k, c] /= share
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def divide(moments: SingleArray, regulariser: np.float32, response: SingleArray) -> None:
     """The response by mean, covariance and mean square."""
     mean, cov, mean_square = moments[0], moments[1], moments[2]

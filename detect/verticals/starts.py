@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
@@ -30,6 +29,7 @@ from detect.verticals.response import (
 )
 from detect.verticals.tilt import strongest_first
 from lut.verticals import VerticalTable
+from redetect.compiled import kernel
 
 #: Starts must be on chains if each line crosses at least this many rows of the band.
 _CROSSED = 3
@@ -168,7 +168,7 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
 # Loops that become vectors have functions of their own, which take arrays one by one.
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _filter_band(
     pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, response: SingleArray
 ) -> None:
@@ -194,19 +194,19 @@ def _filter_band(
         _leave_out(band.row[k], response[k])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _scale(means: SingleArray, scale: SingleArray) -> None:
     for c in range(len(scale)):
         means[c] *= scale[c]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _leave_out(row: NDArray[np.int32], response: SingleArray) -> None:
     for c in range(len(response)):
         response[c] = response[c] if row[c] >= 0 else np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _interpolate(
     pixels: NDArray[np.uint8], pixel: NDArray[np.int32], left: SingleArray, right: SingleArray,
     sides: NDArray[np.uint8], between: SingleArray,
@@ -239,7 +239,7 @@ def line_starts(response: SingleArray, band: StartBand, threshold: float) -> Lin
     return _chains(response, band.row, threshold, _LEAST if band.chained else 1)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _chains(
     response: SingleArray, rows: NDArray[np.int32], threshold: float, least: int
 ) -> LineStarts:

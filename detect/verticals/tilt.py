@@ -34,10 +34,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings, TiltNumbers
+from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -158,7 +158,7 @@ def with_error(
     return tilt._replace(covariance=error)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
     """Places of some values, the largest first; of equal ones the first."""
     order = np.empty(len(strength), np.int64)
@@ -171,7 +171,7 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
     return order
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
     """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
@@ -192,7 +192,7 @@ def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate,
     return TiltEstimate(pitch, roll, covariance, count, votes / total), agrees
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float]:
     """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
 
@@ -234,7 +234,7 @@ def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float
     return pitch[best], roll[best]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _refine_tilt(
     lines: Verticals, pitch: float, roll: float, prior: float, covariance: FloatArray,
     agrees: NDArray[np.bool_],
@@ -271,7 +271,7 @@ def _refine_tilt(
     return pitch, roll
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def level_matrix(pitch: float, roll: float) -> FloatArray:
     """(3, 3) rotation exp([pitch, roll, 0]x)."""
     squared = pitch * pitch + roll * roll
@@ -292,7 +292,7 @@ def level_matrix(pitch: float, roll: float) -> FloatArray:
     return rotation
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def gather(
     place: FloatArray, reach: FloatArray, strength: FloatArray, kind: FloatArray
 ) -> NDArray[np.int64]:
@@ -323,7 +323,7 @@ def gather(
     return group
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
     """(G, 4) mean normals of groups of lines, and the variances of their inclinations.
 
@@ -347,7 +347,7 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
     return merged[:groups]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _error_of_tilt(
     lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], prior: float,
     stray_share: float, grid: FloatArray,
@@ -384,7 +384,7 @@ def _error_of_tilt(
     return error
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _stretch(
     groups: FloatArray, tilt: tuple[float, float], prior: float
 ) -> tuple[float, float, float]:
@@ -407,7 +407,7 @@ def _stretch(
     return shortest * c * c + s * s, (shortest - 1.0) * c * s, shortest * s * s + c * c
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _posterior(
     before: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
     stray_share: float, density: FloatArray,

@@ -24,7 +24,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from detect.line_settings import TrackingNumbers
@@ -39,6 +38,7 @@ from detect.verticals.response import (
     respond,
 )
 from detect.verticals.starts import LineStarts
+from redetect.compiled import kernel
 
 #: Points that the prior counts for: an edge leans no more than verticals of a tilted camera.
 _UPRIGHT_POINTS = 5
@@ -157,7 +157,7 @@ def follow_again(
     return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _follow_edges(
     image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
     numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
@@ -240,7 +240,7 @@ def _follow_edges(
     )
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
     """Mark the columns round a point as followed, if its row has starts."""
     if 0 <= row < len(marks):
@@ -249,7 +249,7 @@ def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
             marks[row, k] = True
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _take_chain(
     strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: SingleArray
 ) -> float:
@@ -277,7 +277,7 @@ def _take_chain(
     return (n * xy - x * y) / (n * xx - x * x) if n >= 3.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _follow(
     image: NDArray[np.uint8], strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
     start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: SingleArray,
@@ -355,7 +355,7 @@ def _follow(
     return end, _Edge(place, lean, points, vertical)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
     """Distance of verticals in a row, on the side on which there are more of them."""
     if 2 * j < len(at):
@@ -363,13 +363,13 @@ def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
     return float(at[j, v] - at[j - 1, v])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _place_on(path: _Path, rise: SingleArray, v: int) -> float:
     """Where a path crosses a row, as a column of the strip."""
     return path.place + path.lean * float(rise[path.column, v] - rise[path.column, path.row])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _three(
     response: SingleArray, b: int, c: int, sign: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:

@@ -65,7 +65,7 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     assert read.centre[2] > 0.0  # kept by the camera, and handed over with it
     assert read.rotation.shape == (3, 3)
     handed_over = pickle.loads(pickle.dumps(read))
-    kernels = (refined_covariances,)
+    kernels: tuple[Any, ...] = (refined_covariances,)
     pixels, two = np.array([[400, 200], [300, 150]]), np.ones(2)
     discs = CircleDetections(pixels, FLOOR_XY, COVARIANCE, two, two)
     tilt = FrameTilt("e.0000", 0.01, 0.02, 1e-6, 0.0, 1e-6, 9)
