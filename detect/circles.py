@@ -212,24 +212,20 @@ def second_look(
     Candidates by edges have a sign. Where none is stated, that of the clear discs is taken, for
     discs of one place are mostly alike; where these differ, or are few, there is no second look.
     """
+    if not (settings.verify and settings.refine):
+        return NO_LOOKS
     most, less = None, 0.0
-    if settings.polarity == "any" and settings.verify and settings.refine:
+    if settings.polarity == "any":
         contrast = first.centres.contrast[first.found.centre]
         contrast = contrast[first.found.evidence >= _CLEAR]
-        if len(contrast) >= _LEAST_CLEAR and (np.sign(contrast) == np.sign(contrast[0])).all():
-            settings = replace(settings, polarity="light" if contrast[0] > 0.0 else "dark")
-            most, less = _BEST, _UNSTATED
-    if not _looks_twice(settings):
-        return NO_LOOKS
+        if len(contrast) < _LEAST_CLEAR or (np.sign(contrast) != np.sign(contrast[0])).any():
+            return NO_LOOKS
+        settings = replace(settings, polarity="light" if contrast[0] > 0.0 else "dark")
+        most, less = _BEST, _UNSTATED
     candidates = candidates_at(image, camera, table, settings, first.noise)
     best = HoughCandidates(candidates.floor_xy[:most], candidates.score[:most])
     looks = second_looks_at(image, camera, settings, best, first.found.floor_xy, first.noise)
     return looks._replace(log_odds=looks.log_odds - less)
-
-
-def _looks_twice(settings: CircleSettings) -> bool:
-    """Whether there is a second look at least: of two signs, chance would speak for either."""
-    return settings.polarity != "any" and settings.verify and settings.refine
 
 
 def candidates_at(
@@ -318,7 +314,7 @@ def _disc_search(settings: CircleSettings) -> DiscSearch:
 def first_search(settings: CircleSettings) -> DiscSearch:
     """What the first look goes by: where a second is certain, that decides on doubtful discs."""
     search = _disc_search(settings)
-    if not _looks_twice(settings):
+    if settings.polarity == "any" or not (settings.verify and settings.refine):
         return search
     return search._replace(least_evidence=search.least_evidence + _DOUBTFUL)
 
