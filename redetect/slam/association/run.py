@@ -25,7 +25,7 @@ from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
-from redetect.plane import apply, rotation
+from redetect.plane import compose, rotation
 from redetect.slam.association.frame_to_frame import (
     LocalAssociation,
     LocalSettings,
@@ -241,7 +241,7 @@ def _closed_by_parts(
     counts = np.cumsum([0, *(len(part.xy) for part in parts)])
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
     own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
-    laid = [np.column_stack([apply(m, p[:, :2]), p[:, 2] + m[2]]) for m, p in zip(motions, own)]
+    laid = [compose(motion, path) for motion, path in zip(motions, own)]
     labels, _ = merge_labels(frames, together, pairs_by_votes(pairs))
     whole = _closed(recording, labels, setting, camera_xy, report, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
