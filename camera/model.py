@@ -129,6 +129,10 @@ class Camera:
         check_numbers(self)
         check_one_to_one(self)
 
+    def __hash__(self) -> int:
+        # By a digest that is kept: tables are looked up by the camera, image by image.
+        return int(self.content_hash[:15], 16)
+
     # -- files ------------------------------------------------------------------------------
 
     @classmethod

@@ -24,7 +24,7 @@ from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.placing import place_all_by_part
-from detect.discs.positions import refined_covariances
+from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
@@ -357,14 +357,10 @@ def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[Floa
         (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
         (`Camera.floor_jacobian_published`).
     """
-    kernel = _kernel_camera(camera)
-    floor_xy = floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
-    floor_variance = np.zeros((len(pixels), 2, 2))
-    floor_variance[:, 0, 0] = floor_variance[:, 1, 1] = PUBLISHED_FLOOR_M**2
-    covariance = refined_covariances(
-        kernel.published, kernel.centre, floor_xy, floor_variance, PUBLISHED_PIXEL_VARIANCE, 0.0
+    numbers, floor_xy = _kernel_camera(camera).published, floor_positions(camera)
+    return pixel_positions(
+        numbers, floor_xy, pixels, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE
     )
-    return floor_xy, np.asarray(covariance)
 
 
 class _KernelCamera(NamedTuple):

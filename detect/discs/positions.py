@@ -40,6 +40,28 @@ def _add_pixels(
 
 
 @kernel()
+def pixel_positions(
+    camera_numbers: FloatArray,
+    floor_xy: FloatArray,
+    pixels: NDArray[np.int64],
+    floor_variance: float,
+    pixel_variance: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Where (N, 2) pixels (u, v) see the floor, (N, 2), and (N, 2, 2) covariances.
+
+    `camera_numbers` are those of `camera.kernels`, and `floor_xy` is what every pixel sees, (H, W,
+    2). The variances are of any direction, on the floor and in the image.
+    """
+    position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
+    for k in range(len(pixels)):
+        x, y = floor_xy[pixels[k, 1], pixels[k, 0]]
+        position[k, 0], position[k, 1] = x, y
+        covariance[k, 0, 0] = covariance[k, 1, 1] = floor_variance
+        _add_pixels(camera_numbers, x, y, pixel_variance, covariance[k])
+    return position, covariance
+
+
+@kernel()
 def refined_covariances(
     camera_numbers: FloatArray,
     centre: FloatArray,

@@ -145,15 +145,15 @@ def find_centres(
     """
     least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
     both = _with_squares(grey, groups.begin, groups.end)
-    any_left = np.empty(len(groups.samples), np.bool_)
-    for g in range(_U64(len(any_left))):
-        any_left[g] = _columns_left(both, groups.samples, g, least_part) != 0
+    left_of = np.empty(len(groups.samples), np.int32)
+    for g in range(_U64(len(left_of))):
+        left_of[g] = _columns_left(both, groups.samples, g, least_part)
     # Those that are left are collected first: the next one's samples are fetched meanwhile then.
-    group = np.flatnonzero(any_left)
+    group = np.flatnonzero(left_of)
     centre = np.empty(len(group) * GROUP_COLUMNS, np.int64)
     most = 0
     for h in group:
-        left = _columns_left(both, groups.samples, int(h), least_part) & groups.columns[h]
+        left = left_of[h] & groups.columns[h]
         i = int(groups.first[h]) - 1
         for k in range(GROUP_COLUMNS):
             i += (groups.columns[h] >> k) & 1
