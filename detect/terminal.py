@@ -98,8 +98,8 @@ def say_compiling() -> None:
     _log.info("compiling kernels, once: about a minute")
 
 
-def on_compilation(call: Callable[[], object]) -> None:
-    """Have something called before this process compiles a kernel.
+def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
+    """Have something called before this process compiles a kernel, until the result is called.
 
     The compiler makes many objects and keeps most of them. Meanwhile Python does not search them
     for cycles again and again, which would take a tenth of the time.
@@ -119,7 +119,9 @@ def on_compilation(call: Callable[[], object]) -> None:
             if not self.depth:
                 gc.enable()
 
-    event.register("numba:compile", Compilation())
+    compilation = Compilation()
+    event.register("numba:compile", compilation)
+    return lambda: event.unregister("numba:compile", compilation)
 
 
 _SHOWN_FAILURES = 10

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
@@ -182,23 +182,28 @@ _GRACE_S = 1.0
 
 def default_jobs(frames: int) -> int:
     """A process for every `FRAMES_PER_PROCESS` frames, at most as many as there are cores."""
+    return max(1, min(_cores(), frames // FRAMES_PER_PROCESS))
+
+
+def _cores() -> int:
     affinity = getattr(os, "sched_getaffinity", None)
-    cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-    return max(1, min(cores, frames // FRAMES_PER_PROCESS))
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-def local_workers(jobs: int, *, large: bool = False) -> Workers:
+def local_workers(jobs: int, *, large: bool = False, halves: bool = False) -> Workers:
     """Processes of this machine; 1 is this process itself.
 
-    Of `large` tasks, which carry images or bring pictures back, each has one frame.
+    Of `large` tasks, which carry images or bring pictures back, each has one frame. With `halves`,
+    one that has to compile has the kernels of lines and those of discs compiled by two others.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     chunk = 1 if large else _TOGETHER
     if jobs == 1:
-        return Workers(lambda _: _InProcess(), chunk, window=lambda: 1)
+        return Workers(lambda plan: _InProcess(plan, halves=halves), chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
-    return Workers(lambda plan: _ProcessPool(jobs, plan), chunk, lambda: window)
+    show = announcements_are_shown()
+    return Workers(lambda plan: _ProcessPool(jobs, plan, show=show), chunk, lambda: window)
 
 
 def cluster_workers(address: str, *, large: bool = False) -> Workers:
@@ -228,13 +233,30 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
-    def __init__(self) -> None:
-        on_compilation(say_compiling)
+    def __init__(self, plan: FramePlan, *, halves: bool) -> None:
+        both = halves and plan.lines and plan.circles and _cores() > 1
+        self._halves = [replace(plan, circles=None), replace(plan, lines=None)] if both else []
+        self._chunk: Chunk = ()
+        self._forget = on_compilation(self._before_compilation)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        self._chunk = cast("Chunk", args[-1])
         future: Future[R] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._forget()
+
+    def _before_compilation(self) -> None:
+        say_compiling()
+        halves, self._halves = self._halves, []  # only before the first kernel
+        # Where no process can be started, this one compiles all of them.
+        with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
+            pools = [started.enter_context(_ProcessPool(1, half, show=False)) for half in halves]
+            done = [p.submit(work_on_chunk, half, self._chunk) for p, half in zip(pools, halves)]
+            for future in done:
+                future.exception()  # what fails there fails here again, and is reported
 
 
 # They are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra have
@@ -249,9 +271,9 @@ class _ProcessPool(ProcessPoolExecutor):
     They inherit a blocked interrupt: it would reach them even while they start.
     """
 
-    def __init__(self, count: int, plan: FramePlan) -> None:
+    def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
         context = multiprocessing.get_context("spawn")
-        arguments = (plan, context.RLock(), announcements_are_shown())
+        arguments = (plan, context.RLock(), show)
         super().__init__(count, mp_context=context, initializer=_begin, initargs=arguments)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:

@@ -12,14 +12,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from numba.core import event
 
+import detect.runs.workers as workers_module
 from detect.cli import main
 from detect.errors import WorkerError
 from detect.line_settings import LineSettings
@@ -83,6 +85,39 @@ def test_as_many_processes_as_are_worth_it() -> None:
 def test_no_workers_are_refused() -> None:
     with pytest.raises(WorkerError, match="jobs is 0: expected 1 or more"):
         local_workers(0)
+
+
+def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) -> None:
+    """The kernels of lines and those of discs, each by a process of its own."""
+    began: list[str] = []
+
+    class Process(ThreadPoolExecutor):
+        def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
+            assert not show
+            super().__init__(count)
+
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            plan, chunk = args
+            began.append(f"{bool(plan.lines)} {bool(plan.circles)} {chunk}")
+            return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
+
+    def work(plan: FramePlan, chunk: str) -> int:
+        for _ in range(2):
+            with event.trigger_event("numba:compile"):
+                began.append(f"compiled {chunk}")
+        return 7
+
+    monkeypatch.setattr(workers_module, "_ProcessPool", Process)
+    monkeypatch.setattr(workers_module, "_cores", lambda: 2)
+    plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
+    with local_workers(1, halves=True).start(plan) as executor:
+        assert executor.submit(work, plan, "images").result() == 7
+    halves = ["True False images", "False True images"]
+    assert began == [*halves, "compiled images", "compiled images"]
+    only_lines = replace(plan, circles=None)
+    with local_workers(1, halves=True).start(only_lines) as executor:
+        executor.submit(work, only_lines, "more")
+    assert began[4:] == ["compiled more", "compiled more"]
 
 
 @pytest.mark.long
