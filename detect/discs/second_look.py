@@ -43,7 +43,7 @@ _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
 #: outside; the least share of directions in which the disc differs from the floor.
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
-_INNER, _OUTER = slice(1, 3), slice(5, 7)
+_INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.24
 #: Least share of the rim that is on a circle.
 _LEAST_RIM = 0.35
@@ -226,13 +226,16 @@ def pairs_of_steps(grey: FloatArray) -> FloatArray:
 def _contrast(grey: FloatArray, sought: Sought) -> float:
     """Median step over those directions that step enough; 0 where these are too few."""
     steps = np.empty(GLANCED)
-    count = 0
-    for k in range(GLANCED):
-        step = sought.sign * (np.mean(grey[k, _INNER]) - np.mean(grey[k, _OUTER]))
-        if step > sought.least_step:
-            steps[count] = step
-            count += 1
-    return median(steps[:count]) if count >= _LEAST_STEPS * GLANCED else 0.0
+    for inner in _INNER:
+        count = 0
+        for k in range(GLANCED):
+            step = sought.sign * (np.mean(grey[k, inner]) - np.mean(grey[k, _OUTER]))
+            if step > sought.least_step:
+                steps[count] = step
+                count += 1
+        if count >= _LEAST_STEPS * GLANCED:
+            return median(steps[:count])
+    return 0.0
 
 
 @kernel()
