@@ -153,7 +153,7 @@ def _with_fit(
     is_disc = more.log_odds >= 0.0
     if is_disc.any():
         placed = place_all_by_part(
-            first.scene, found.radius, more.floor_xy[is_disc], more.step[is_disc], working_space()
+            first.scene, found.radius, more.seen_from[is_disc], more.step[is_disc], working_space()
         )
         more_xy, more_covariance = fitted_positions(placed)
         last = [camera.width - 1, camera.height - 1]

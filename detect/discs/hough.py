@@ -42,7 +42,7 @@ _WIDE_PX, _HIGH_PX = 9.0, 6.0
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.45
 #: Least score of a candidate, and how many an image may have, at most, and before suppression.
-_LEAST_SCORE, _MOST, _MOST_PEAKS = 1.65, 60, 1000
+_LEAST_SCORE, _MOST, _MOST_PEAKS = 1.45, 80, 1000
 #: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
 _APART = 0.6
 #: Sobel's kernel multiplies a step per pixel by this.

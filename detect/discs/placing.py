@@ -20,7 +20,7 @@ from detect.discs.descent import Hope
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, Candidate, FitSettings
-from detect.discs.rim import PLACING_SIGMA, Rim, follow_again, follow_rim, median
+from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim, median
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
@@ -100,16 +100,15 @@ def _add_square(result: Any, share: float, x: float, y: float) -> None:
 def place_all_by_part(
     scene: Scene,
     radius: float,
-    floor_xy: NDArray[np.float64],
+    seen_from: NDArray[np.float64],
     step: NDArray[np.float64],
     space: NDArray[Any],
 ) -> Any:
-    """(N,) `RESULT` of discs near (N, 2) places, with the (N,) steps at their rims."""
-    results = np.zeros(len(floor_xy), RESULT)
-    for k in range(len(floor_xy)):
-        x, y = floor_xy[k, 0], floor_xy[k, 1]
+    """(N,) `RESULT` of discs whose rims are seen from (N, 2) places, with (N,) steps at them."""
+    results = np.zeros(len(seen_from), RESULT)
+    for k in range(len(seen_from)):
+        x, y = seen_from[k, 0], seen_from[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, step[k])
-        rim = follow_again(scene.image, scene.camera_numbers, radius, rim)
         place_by_part(scene, radius, rim, space[0], results[k])
     return results
 

@@ -45,8 +45,10 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.24
+#: Least log-odds of a glance.
+_LEAST_GLANCE = -2.0
 #: Least share of the rim that is on a circle.
-_LEAST_RIM = 0.35
+_LEAST_RIM = 0.3
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
 _WITHIN = 0.75
 #: Radius of a rim that fits best, relative to the nominal one.
@@ -78,6 +80,8 @@ class SecondLooks(NamedTuple):
     features : (N, len(FEATURES)) float64
     floor_xy : (N, 2) float64
         Metres.
+    seen_from : (N, 2) float64
+        Whence the rim was followed, metres.
     step : (N,) float64
         Of the grey value at the rim, inside minus outside.
     quality : (N,) float64
@@ -88,12 +92,13 @@ class SecondLooks(NamedTuple):
 
     features: FloatArray
     floor_xy: FloatArray
+    seen_from: FloatArray
     step: FloatArray
     quality: FloatArray
     log_odds: FloatArray
 
 
-NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), np.empty((0, 2)), *np.empty((3, 0)))
+NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((2, 0, 2)), *np.empty((3, 0)))
 
 
 def second_looks(
@@ -132,10 +137,8 @@ def _look_at_all(
     networks: Networks,
 ) -> SecondLooks:
     n = len(candidates.score)
-    features = np.empty((n, len(FEATURES)))
-    place = np.empty((n, 2))
-    step, quality = np.empty(n), np.empty(n)
-    log_odds = np.empty(n)
+    features, place, seen_from = np.empty((n, len(FEATURES))), np.empty((n, 2)), np.empty((n, 2))
+    step, quality, log_odds, noted = np.empty(n), np.empty(n), np.empty(n), np.empty(len(FEATURES))
     count = 0
     for i in range(n):
         x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
@@ -146,25 +149,38 @@ def _look_at_all(
         if contrast == 0.0:
             continue
         inputs, scales = network_inputs(grey, scale, sought.sign)
-        if network_log_odds(inputs, scales, candidates.score[i : i + 1], networks.glance) < 0.0:
+        if (
+            network_log_odds(inputs, scales, candidates.score[i : i + 1], networks.glance)
+            < _LEAST_GLANCE
+        ):
             continue
-        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
-        if rim.agreeing < _LEAST_RIM:
+        first = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
+        if first.agreeing < _LEAST_RIM:
             continue
-        rim = follow_again(image, camera_numbers, sought.radius, rim)
-        if _near_any(found_xy, rim.x, rim.y, sought.separation):
+        # From its own middle a rim is seen best, but that may lead to another circle.
+        again = follow_again(image, camera_numbers, sought.radius, first)
+        if _near_any(found_xy, again.x, again.y, sought.separation):
             continue
-        if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
-            continue
-        _note_rim(rim, sought.radius, candidates.score[i], features[count])
-        grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
-        inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
-        log_odds[count] = network_log_odds(inputs, scales, features[count], networks.look) - _TAKEN
-        step[count], quality[count] = rim.step, _quality(grey)
-        place[count, 0], place[count, 1] = rim.x, rim.y
-        count += 1
+        is_new = False
+        for rim, from_x, from_y in ((again, first.x, first.y), (first, x, y)):
+            if _near_any(found_xy, rim.x, rim.y, sought.separation):
+                continue
+            if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
+                continue
+            _note_rim(rim, sought.radius, candidates.score[i], noted)
+            grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+            inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
+            odds = network_log_odds(inputs, scales, noted, networks.look) - _TAKEN
+            if is_new and odds <= log_odds[count]:
+                continue
+            is_new = True
+            features[count], log_odds[count] = noted, odds
+            step[count], quality[count] = rim.step, _quality(grey)
+            place[count, 0], place[count, 1] = rim.x, rim.y
+            seen_from[count, 0], seen_from[count, 1] = from_x, from_y
+        count += is_new
     return SecondLooks(
-        features[:count], place[:count], step[:count], quality[:count],
+        features[:count], place[:count], seen_from[:count], step[:count], quality[:count],
         log_odds[:count],
     )  # fmt: skip
 
