@@ -57,6 +57,32 @@ def test_a_disc_that_a_sun_patch_touches_is_a_row(
     assert rows >= 7  # none without the second look
 
 
+def test_a_disc_with_a_leg_on_its_middle_is_a_row(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    """Only beside the leg is the disc seen: in most directions its middle is dark."""
+    found_here = 0
+    for seed in range(8):
+        place, lean = PLACES[seed % 2], 0.1 * (seed - 4)
+
+        def leg(
+            x: NDArray[np.float64], y: NDArray[np.float64], lean: float = lean
+        ) -> NDArray[np.bool_]:
+            return np.asarray((abs(x + lean * y) < 0.066) & (y < 0.085))
+
+        def on_disc(
+            x: NDArray[np.float64], y: NDArray[np.float64], leg: Shape = leg
+        ) -> NDArray[np.bool_]:
+            return np.asarray(leg(x, y) & (np.hypot(x, y) < 0.1))
+
+        # What is painted adds up.
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).shape(place, leg, DARK)
+        floor.shape(place, on_disc, FLOOR - (LIGHT - FLOOR))
+        found = detect_circles(floor.image(seed=seed), published_camera, table, SETTINGS)
+        found_here += bool((found_at(found, place) < 0.03).any())
+    assert found_here >= 7
+
+
 CLEAR_PLACES = [(-0.3, -1.4), (0.4, -1.5), (-0.9, -2.2)]
 
 
