@@ -150,21 +150,19 @@ def _with_fit(
     pixels, found_quality = centres.pixels[found.centre], centres.quality[found.centre]
     floor_xy, fitted, evidence = found.floor_xy, found.covariance, found.evidence
     more = second_look(image, camera, table, settings, first)
-    is_disc = more.log_odds >= 0.0
-    if is_disc.any():
-        placed = place_all_by_part(
-            first.scene, found.radius, more.seen_from[is_disc], more.step[is_disc], working_space()
-        )
+    discs = SecondLooks(*(values[more.log_odds >= 0.0] for values in more))
+    if len(discs.step):
+        placed = place_all_by_part(first.scene, found.radius, discs, working_space())
         more_xy, more_covariance = fitted_positions(placed)
         last = [camera.width - 1, camera.height - 1]
         more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
         pixels = np.concatenate([pixels, more_pixels])
         order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
         pixels = pixels[order]
-        found_quality = np.concatenate([found_quality, more.quality[is_disc]])[order]
+        found_quality = np.concatenate([found_quality, discs.quality])[order]
         floor_xy = np.concatenate([floor_xy, more_xy])[order]
         fitted = np.concatenate([fitted, more_covariance])[order]
-        evidence = np.concatenate([evidence, settings.evidence + more.log_odds[is_disc]])[order]
+        evidence = np.concatenate([evidence, settings.evidence + discs.log_odds])[order]
     covariance = refined_covariance(camera, floor_xy, fitted, settings)
     if not settings.refine:
         floor_xy, covariance = published_positions(camera, pixels)

@@ -25,12 +25,13 @@ from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
+    from detect.discs.second_look import SecondLooks
 
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
 WELL_EXPLAINED = 0.97
 #: The fit to what is in view is at most this far from the rim, radii.
 _MOST_OFF_RIM = 0.15
-#: Share of the squared difference of fit and rim that is added to the covariance of the fit.
+#: Share of the squared difference of fit and rim, or of two rims, that is added to the covariance.
 _DISAGREEMENT = 0.5
 #: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
@@ -100,16 +101,16 @@ def _add_square(result: Any, share: float, x: float, y: float) -> None:
 def place_all_by_part(
     scene: Scene,
     radius: float,
-    seen_from: NDArray[np.float64],
-    step: NDArray[np.float64],
+    looks: SecondLooks,
     space: NDArray[Any],
 ) -> Any:
-    """(N,) `RESULT` of discs whose rims are seen from (N, 2) places, with (N,) steps at them."""
-    results = np.zeros(len(seen_from), RESULT)
-    for k in range(len(seen_from)):
-        x, y = seen_from[k, 0], seen_from[k, 1]
-        rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, step[k])
+    """(N,) `RESULT` of the discs of N second looks."""
+    results = np.zeros(len(looks.step), RESULT)
+    for k in range(len(results)):
+        x, y = looks.seen_from[k, 0], looks.seen_from[k, 1]
+        rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, looks.step[k])
         place_by_part(scene, radius, rim, space[0], results[k])
+        _add_square(results[k], _DISAGREEMENT, looks.doubt[k, 0], looks.doubt[k, 1])
     return results
 
 

@@ -80,8 +80,9 @@ class SecondLooks(NamedTuple):
     features : (N, len(FEATURES)) float64
     floor_xy : (N, 2) float64
         Metres.
-    seen_from : (N, 2) float64
-        Whence the rim was followed, metres.
+    seen_from, doubt : (N, 2) float64
+        Whence the rim was followed, and how far that is apart which is come to from elsewhere,
+        metres.
     step : (N,) float64
         Of the grey value at the rim, inside minus outside.
     quality : (N,) float64
@@ -93,12 +94,13 @@ class SecondLooks(NamedTuple):
     features: FloatArray
     floor_xy: FloatArray
     seen_from: FloatArray
+    doubt: FloatArray
     step: FloatArray
     quality: FloatArray
     log_odds: FloatArray
 
 
-NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((2, 0, 2)), *np.empty((3, 0)))
+NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((3, 0, 2)), *np.empty((3, 0)))
 
 
 def second_looks(
@@ -137,7 +139,8 @@ def _look_at_all(
     networks: Networks,
 ) -> SecondLooks:
     n = len(candidates.score)
-    features, place, seen_from = np.empty((n, len(FEATURES))), np.empty((n, 2)), np.empty((n, 2))
+    features, place = np.empty((n, len(FEATURES))), np.empty((n, 2))
+    seen_from, doubt = np.empty((n, 2)), np.empty((n, 2))
     step, quality, log_odds, noted = np.empty(n), np.empty(n), np.empty(n), np.empty(len(FEATURES))
     count = 0
     for i in range(n):
@@ -178,10 +181,11 @@ def _look_at_all(
             step[count], quality[count] = rim.step, _quality(grey)
             place[count, 0], place[count, 1] = rim.x, rim.y
             seen_from[count, 0], seen_from[count, 1] = from_x, from_y
+            doubt[count, 0], doubt[count, 1] = again.x - first.x, again.y - first.y
         count += is_new
     return SecondLooks(
-        features[:count], place[:count], seen_from[:count], step[:count], quality[:count],
-        log_odds[:count],
+        features[:count], place[:count], seen_from[:count], doubt[:count], step[:count],
+        quality[:count], log_odds[:count],
     )  # fmt: skip
 
 
