@@ -152,10 +152,8 @@ def _look_at_all(
         if contrast == 0.0:
             continue
         inputs, scales = network_inputs(grey, scale, sought.sign)
-        if (
-            network_log_odds(inputs, scales, candidates.score[i : i + 1], networks.glance)
-            < _LEAST_GLANCE
-        ):
+        score = candidates.score[i : i + 1]
+        if network_log_odds(inputs, scales, score, networks.glance) < _LEAST_GLANCE:
             continue
         first = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
         if first.agreeing < _LEAST_RIM:
@@ -165,7 +163,7 @@ def _look_at_all(
         if _near_any(found_xy, again.x, again.y, sought.separation):
             continue
         is_new = False
-        for rim, from_x, from_y in ((again, first.x, first.y), (first, x, y)):
+        for rim, from_x, from_y in ((first, x, y), (again, first.x, first.y)):
             if _near_any(found_xy, rim.x, rim.y, sought.separation):
                 continue
             if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
