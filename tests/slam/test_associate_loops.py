@@ -117,7 +117,7 @@ def test_random_constellations_do_not_match_and_one_place_seen_twice_does() -> N
     right = [(80 + k, 600 + k) for k in range(14)]
     assert set(map(tuple, match.pairs.tolist())) >= set(right[2:4])
     assert len(set(map(tuple, match.pairs.tolist())) & set(right)) >= 12
-    assert match.turn_rad == pytest.approx(-0.3, abs=0.03)
+    assert match.motion[2] == pytest.approx(-0.3, abs=0.03)
     assert match.log10_false_alarms < -3
 
 
@@ -208,7 +208,9 @@ def test_a_path_bent_by_far_is_closed_by_matches() -> None:
     for frame in (0, 60, 119):
         turn = bent[frame + 1, 2] + 2 * np.pi - bent[frame + 121, 2]
         shift = bent[frame + 1, :2] - rotation(turn) @ bent[frame + 121, :2]
-        matches.append(Match(frame, frame + 120, np.zeros((0, 2), dtype=np.int64), turn, shift, -9))
+        matches.append(
+            Match(frame, frame + 120, np.zeros((0, 2), dtype=np.int64), np.append(shift, turn), -9)
+        )
     closed = closed_path(bent, matches)
     off = [np.linalg.norm(p[121:, :2] - p[1:121, :2], axis=1).max() for p in (bent, closed)]
     assert off[0] > 2.0

@@ -22,7 +22,7 @@ from redetect.slam.association.frame_to_frame import (
 )
 from redetect.slam.association.run import AssociateSettings, associate_run
 from redetect.slam.association.score import score_association
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.slam.models import OdometryNoise, bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 CAMERA_XY = (0.02, -0.08)
@@ -40,14 +40,24 @@ def circuit(laps: float, side_m: float = 8.0) -> FloatArray:
 
 
 def drive(
-    path: FloatArray, discs: FloatArray, lines: FloatArray, seed: int, bias_rad: float = 0.0
+    path: FloatArray,
+    discs: FloatArray,
+    lines: FloatArray,
+    seed: int,
+    step_covariance: FloatArray | None = None,
+    bias_rad: float = 0.0,
 ) -> Recording:
     """What a robot on a path measures: discs within 3.5 m ahead, lines within 6 m."""
     rng = np.random.default_rng(seed)
     count = len(path) - 1
-    steps = between(path[:-1], path[1:]) + STEP_SIGMA * rng.normal(size=(count, 3))
+    covariance = np.tile(np.diag(STEP_SIGMA**2), (count, 1, 1))
+    if step_covariance is not None:
+        covariance = step_covariance.copy()
+    root = np.linalg.cholesky(covariance)
+    error = np.einsum("nij,nj->ni", root, rng.normal(size=(count, 3)))
+    steps = between(path[:-1], path[1:]) + error
     steps[:, 2] += bias_rad
-    sigma = STEP_SIGMA + np.array([0.0, 0.0, abs(bias_rad)])
+    covariance[:, 2, 2] = (np.sqrt(covariance[:, 2, 2]) + abs(bias_rad)) ** 2
     seen: list[tuple[int, int, FloatArray]] = []
     upright: list[tuple[int, int, float]] = []
     for k, pose in enumerate(path[1:]):
@@ -62,7 +72,7 @@ def drive(
     return Recording(
         prefixes=tuple(f"s.{k}" for k in range(count)),
         steps=steps,
-        step_covariance=np.tile(np.diag(sigma**2), (count, 1, 1)),
+        step_covariance=covariance,
         circles=CircleRows.of((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, i, xy in seen),
         lines=LineRows.of((k, float(wrap_angle(b)), LINE_SIGMA, (i,)) for k, i, b in upright),
     )
@@ -227,6 +237,33 @@ def test_two_places_that_only_look_alike_in_part_stay_apart() -> None:
     found = associate_run(recording)
     assert found.matches == ()
     assert score_association(found.circle_labels, ids_of(recording)).pair_precision > 0.99
+
+
+def twin_rooms(seed: int, apart_m: float) -> FloatArray:
+    """Discs of a room, at random, and the same once more further on along the robot's way."""
+    rng = np.random.default_rng(seed)
+    room: list[FloatArray] = []
+    while len(room) < 20:
+        place = rng.uniform([-2.0, -6.0], [2.0, -1.0])
+        if all(np.linalg.norm(place - other) > 0.4 for other in room):
+            room.append(place)
+    return np.concatenate([room, np.array(room) - [0.0, apart_m]])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("laps", [1, 3])
+def test_rooms_that_look_alike_stay_apart_where_odometry_tells_them(laps: int) -> None:
+    """Two rooms without a difference, visited in turn, once or again and again."""
+    discs = twin_rooms(17, apart_m=7.0)
+    way, turn = [(0.0, -0.1, 0.0)] * 150, [(0.0, 0.0, np.pi / 20)] * 20
+    true = np.array(([*way, *turn] * laps)[: -len(turn)])
+    noise = OdometryNoise()
+    recording = drive(chain_steps(true), discs, NO_LINES, 18, noise.covariance(true))
+    found = associate_run(recording)
+    score = score_association(found.circle_labels, ids_of(recording))
+    assert (score.pair_precision, score.wrong_merges, score.splits) == (1.0, 0, 0)
+    assert score.found_landmarks == len(np.unique(recording.circles.ids))
+    assert (len(found.matches) > 0) == (laps > 1)
 
 
 def with_clutter(recording: Recording, count: int, seed: int) -> Recording:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.landmarks import squared_mahalanobis, write_frames
+from redetect.array_types import FloatArray
+from redetect.landmarks import LineLandmark, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import read_joint_covariance, read_map, read_path
 from redetect.plane import apply, between, invert
 from redetect.slam.association.joining import lay_together
@@ -16,8 +17,9 @@ from redetect.slam.association.loops import Stretch
 from redetect.slam.cli import main
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, frames_of_discs, joined, read_recording
-from tests.slam.test_associate_runs import NO_LINES, circuit, drive, scattered
+from tests.slam.test_associate_runs import LINE_SIGMA, NO_LINES, circuit, drive, scattered
 
+DEMO = Path(__file__).parents[2] / "images" / "e"
 DISCS = scattered(3, 45, 0.5, 5.0)
 # The first run begins at a corner, the second elsewhere, and both go round more than once.
 PATHS = circuit(1.2, 5.0), circuit(2.0, 5.0)[70:]
@@ -27,6 +29,10 @@ def write_run(file: Path, run: Recording, *, known: bool) -> str:
     """A run as a landmark file, with the simulation's identifiers or without."""
     rows = run.circles if known else replace(run.circles, ids=0 * run.circles.ids - 1)
     frames = frames_of_discs(run.prefixes, run.steps, run.step_covariance, rows, np.ones(len(rows)))
+    lines = run.lines
+    for k, bearing, ids in zip(lines.frame, lines.bearing_rad, lines.ids):
+        line = LineLandmark(0.0, -1.0, 0.0, 1.0, float(bearing), 0.0, 0.0, LINE_SIGMA, ids)
+        frames[k] = replace(frames[k], landmarks=(*frames[k].landmarks, line))
     write_frames(file, frames, head="simulated")
     return str(file)
 
@@ -88,6 +94,25 @@ def test_runs_whose_identifiers_agree_are_mapped_at_once(
     known = 3 * len(whole.steps) - 3 + 2 * len(whole.circles)
     unknown = 3 * len(whole.steps) + 2 * len(np.unique(whole.circles.ids))
     assert f'"expected": {known - unknown},' in (tmp_path / "map" / "table.json").read_text()
+
+
+@pytest.mark.parametrize("discs", [DISCS, DISCS[:0]], ids=["with discs", "alone"])
+def test_verticals_of_runs_whose_identifiers_agree_are_one(
+    tmp_path: Path, discs: FloatArray
+) -> None:
+    """Where the second run lies is said by its discs, or by the verticals alone."""
+    lines = scattered(5, 25, 1.0, 5.0)
+    runs = [drive(path, discs, lines, seed) for seed, path in enumerate(PATHS)]
+    files = [write_run(tmp_path / f"{k}.circles", run, known=True) for k, run in enumerate(runs)]
+    camera = ["--camera", str(DEMO / "e.cam")]
+    assert main(["map", *files, *camera, "-o", str(tmp_path / "map")]) == 0
+    found = read_map(tmp_path / "map" / "map.csv").lines
+    assert len(found) >= 18
+    first, second = (np.bincount(np.ravel(run.lines.ids), minlength=25) for run in runs)
+    assert np.all(np.minimum(first, second)[found.ids] > 0)
+    np.testing.assert_array_equal(found.rows, (first + second)[found.ids])
+    off = found.xy - disc_in_robot(PATHS[0][0], lines)[found.ids]
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.12
 
 
 def test_a_run_of_another_building_is_refused(

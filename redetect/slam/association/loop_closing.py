@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
-from redetect.plane import apply, between, rotation
+from redetect.plane import apply, between, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     Match,
@@ -115,6 +115,8 @@ def solve_path(
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
+# Largest squared error of a loop whose odometry errs at random.
+_MOST_SQUARED = float(chi2.isf(1e-6, 3))
 # Weight of a step that says nothing: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
 NO_STEPS = np.zeros(0, dtype=np.int64)
@@ -213,6 +215,54 @@ def pairs_in_place(
     return [(int(first[k]), int(second[k])) for k in ordered]
 
 
+def consistent_matches(
+    matches: Sequence[Match], closed: Sequence[Match], path: FloatArray, step_covariance: FloatArray
+) -> list[Match]:
+    """Matches that neither odometry nor other matches contradict: rooms may look alike.
+
+    Two loops make a third: from the earlier frame of one to that of the other, across, and back
+    along the later ones. It has to close as well as the odometry of these ways allows (J. G.
+    Mangelson, D. Dominic, R. M. Eustice, R. Vasudevan, "Pairwise consistent measurement set
+    maximization for robust multi-robot map merging", ICRA 2018), and so has each loop by itself.
+    Those that odometry agrees with best are taken first, each if all that were taken agree.
+
+    Odometry may err systematically: each step by a standard deviation, all in one direction.
+
+    Takes matches that are new and those that the path has `closed` already, `path` (N + 1, 3),
+    `step_covariance` (N, 3, 3).
+    """
+    # A step's error moves all that follows, and turns it about the pose after the step.
+    by_error = np.zeros((len(path) - 1, 3, 3))
+    by_error[:, :2, :2] = rotation(path[:-1, 2])
+    by_error[:, :, 2] = np.stack([path[1:, 1], -path[1:, 0], np.ones(len(path) - 1)], axis=1)
+    until = np.cumsum(by_error @ step_covariance @ by_error.swapaxes(1, 2), axis=0)
+    across = np.diag(np.square([_MATCH_SIGMA[1], _MATCH_SIGMA[1], _MATCH_SIGMA[0]]))
+
+    both = [*closed, *matches]
+    frames = np.array([(m.earlier_frame, m.later_frame) for m in both], dtype=np.int64)
+    motion = np.array([m.motion for m in both])
+    motion[: len(closed)] = 0.0
+
+    def excess(k: int, other_frames: IntArray, other_motion: FloatArray) -> FloatArray:
+        """By how much the squared errors of loops made of match k and others exceed the bound."""
+        low, high = np.minimum(frames[k], other_frames), np.maximum(frames[k], other_frames)
+        # The loop begins and ends with the later frame.
+        x, y = path[frames[k, 1] + 1, :2]
+        there = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        spread = there @ (until[high] - until[low]).sum(axis=1) @ there.T + 2.0 * across
+        gap = log_motion(compose(invert(other_motion), motion[k])) @ there.T
+        steps = (high - low).sum(axis=1)
+        return np.asarray(squared_mahalanobis(gap, spread) - steps - _MOST_SQUARED)
+
+    # By itself a match makes a loop with none: that of its earlier frame with itself.
+    alone = [excess(k, frames[[k]][:, [0, 0]], np.zeros((1, 3)))[0] for k in range(len(both))]
+    taken = np.arange(len(both)) < len(closed)
+    for k in np.argsort(alone, kind="stable"):
+        if k >= len(closed) and alone[k] <= 0.0:
+            taken[k] = np.all(excess(k, frames[taken], motion[taken]) <= 0.0)
+    return [match for match, right in zip(matches, taken[len(closed) :]) if right]
+
+
 def closed_path(
     path: FloatArray, matches: Sequence[Match], lost: IntArray = NO_STEPS
 ) -> FloatArray:
@@ -228,10 +278,8 @@ def closed_path(
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)
     second = np.array([m.later_frame + 1 for m in matches], dtype=np.int64)
-    moved = path[second].copy()
-    for k, match in enumerate(matches):
-        moved[k, :2] = rotation(match.turn_rad) @ moved[k, :2] + match.shift
-        moved[k, 2] += match.turn_rad
+    motion = np.array([m.motion for m in matches])
+    moved = np.column_stack([apply(motion, path[second, :2]), path[second, 2] + motion[:, 2]])
     before = np.concatenate([np.arange(count), first])
     after = np.concatenate([np.arange(1, count + 1), second])
     seen = between(np.concatenate([path[:-1], path[first]]), np.concatenate([path[1:], moved]))

@@ -193,10 +193,8 @@ class Match:
     earlier_frame: int
     later_frame: int
     pairs: IntArray  # (k, 2): labels of the earlier and of the later stretch that are one landmark
-    turn_rad: float
-    # (2,): motion that brings the later stretch's landmarks, in the map, onto the earlier one's: x
-    # -> R(turn) x + shift.
-    shift: FloatArray
+    # (3,): pose that takes the later stretch's landmarks, in the map, onto the earlier one's.
+    motion: FloatArray
     # Logarithm of the number of matches as good that chance would bring about.
     log10_false_alarms: float
 
@@ -366,8 +364,7 @@ def _refined(
         earlier.middle_frame,
         later.middle_frame,
         np.stack([earlier.labels[fixed][pairs[:, 0]], later.labels[moved][pairs[:, 1]]], axis=1),
-        float(pose[2]),
-        pose[:2],
+        pose,
         log10_false_alarms(len(pairs), present, chance, tried),
     )
 

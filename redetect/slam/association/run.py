@@ -36,6 +36,7 @@ from redetect.slam.association.joining import lay_together
 from redetect.slam.association.line_points import PointSettings, lines_by_points
 from redetect.slam.association.loop_closing import (
     closed_path,
+    consistent_matches,
     in_order,
     intersect_bearings,
     merge_labels,
@@ -295,7 +296,12 @@ def _closed(
     matches: list[Match] = []
     for number in range(1, setting.most_rounds + 1):
         stretches = stretches_of(frames, labels, xy, len(recording), loops)
-        found = find_matches(stretches, loops, partial(_of_round, report, number))
+        found = consistent_matches(
+            find_matches(stretches, loops, partial(_of_round, report, number)),
+            matches,
+            path,
+            recording.step_covariance,
+        )
         labels, matched = merge_labels(
             frames, labels, pairs_by_votes(match.pairs for match in found)
         )
