@@ -1,11 +1,14 @@
-"""Rows of single frames."""
+"""Rows of single frames, and a robot in a map."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
+from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.filters.frames import FrameRows
+from redetect.slam.filters.localizer import Localizer
 
 CAMERA_XY = np.array([0.0179777, -0.0808609])
 
@@ -36,3 +39,14 @@ def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
         bearing_rad=np.array([bearing for _, bearing, _ in lines]),
         sigma_rad=np.array([sigma for _, _, sigma in lines]),
     )
+
+
+def localizer(pose: ArrayLike, discs: ArrayLike, lines: ArrayLike) -> Localizer:
+    """A robot in a map whose discs and lines are numbered from 0."""
+
+    def landmarks(places: ArrayLike) -> Landmarks:
+        xy = np.reshape(places, (-1, 2))
+        count = len(xy)
+        return Landmarks(np.arange(count), xy, np.zeros((count, 2, 2)), np.ones(count, np.int64))
+
+    return Localizer(LandmarkMap(landmarks(discs), landmarks(lines)), pose, camera_xy=CAMERA_XY)

@@ -12,11 +12,11 @@ from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
+from redetect.slam.filters.frames import Associator, Prediction, predicted
 from redetect.slam.filters.joint_covariance import JointCovariance
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, rows_of, spd
+from tests.slam.ekf_rows import localizer, rows_of, spd
 
 
 def drive(
@@ -187,7 +187,7 @@ def test_two_rows_of_one_new_disc_are_both_used() -> None:
     ekf = EkfSlam()
     ekf.measure(rows_of([(1, np.array([0.0, -2.0]), noise), (1, np.array([0.02, -2.0]), noise)]))
     np.testing.assert_allclose(ekf.state[3:], [0.01, -2.0], atol=1e-12)
-    np.testing.assert_allclose(ekf.covariance.blocks(np.array([3])), [noise / 2], atol=1e-15)
+    np.testing.assert_allclose(ekf.block(np.array([3, 4])), noise / 2, atol=1e-15)
     assert ekf.count.discs == 2
 
 
@@ -261,15 +261,11 @@ def check_jacobian(of: Callable[[FloatArray], FloatArray], at: FloatArray) -> Fl
 
 
 def test_frame_jacobian_is_the_derivative_of_the_prediction() -> None:
-    rng = np.random.default_rng(13)
-    state = np.concatenate([[0.3, -0.2, 0.4], rng.uniform(-3, 3, 6)])
-    discs, covariance = rng.normal(0, 1, (2, 2)), np.tile(np.eye(2), (2, 1, 1))
+    state = np.append([0.3, -0.2, 0.4], np.random.default_rng(13).uniform(-3, 3, 6))
 
-    disc_rows = MeasuredDiscs(np.array([3, 5]), discs, covariance)
-    line_rows = MeasuredLines(np.array([7]), np.array([0, 1]), np.array([0.2]), np.array([0.1]))
+    def prediction(at: FloatArray) -> Prediction:
+        return predicted(localizer(at[:3], at[3:7], at[7:]), [3, 5], [7], at)
 
-    def innovation(x: FloatArray) -> FloatArray:
-        return frame_innovation(x, x, disc_rows, line_rows, CAMERA_XY)[0]
-
-    jacobian = frame_innovation(state, state, disc_rows, line_rows, CAMERA_XY)[1]
-    np.testing.assert_allclose(jacobian, -check_jacobian(innovation, state), atol=1e-7)
+    jacobian = prediction(state).jacobian
+    found = check_jacobian(lambda x: prediction(x).seen, state)
+    np.testing.assert_allclose(jacobian, found, atol=1e-7)

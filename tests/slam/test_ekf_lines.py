@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import MOST_KEPT_POSES, start_line, triangulate
 from redetect.slam.filters.ekf_slam import EkfSlam, JacobiansAt, run_ekf
-from redetect.slam.filters.frames import Associator, MeasuredDiscs, MeasuredLines, frame_innovation
-from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_jacobians, move
+from redetect.slam.filters.frames import Associator, FrameRows, innovation_of
+from redetect.slam.models import (
+    bearing_jacobians,
+    bearing_of_vertical,
+    disc_in_robot,
+    disc_jacobians,
+    move,
+)
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, bearings_of, spd
+from tests.slam.ekf_rows import CAMERA_XY, bearings_of, localizer, rows_of, spd
 
 
 def test_covariance_of_a_new_line_by_monte_carlo() -> None:
@@ -170,40 +177,32 @@ def test_lines_by_all_their_bearings_are_batch_least_squares(jacobians: Jacobian
 
 
 def test_a_row_of_several_lines_measures_the_mean_of_their_bearings() -> None:
-    rng = np.random.default_rng(8)
-    state = np.concatenate([[0.3, -0.2, 0.4], [1.0, -3.0], [0.8, -3.2], [-1.0, -2.0]])
-    innovation, jacobian, noise, index = frame_innovation(
-        state,
-        state,
-        MeasuredDiscs(np.array([7]), rng.normal(0, 1, (1, 2)), spd(rng, 2, 0.1)[None]),
-        MeasuredLines(np.array([3, 5]), np.array([0, 2]), np.array([0.5]), np.array([0.01])),
-        CAMERA_XY,
-    )
-    places = state[3:7].reshape(2, 2)
-    bearings = bearing_of_vertical(state[:3], places, CAMERA_XY)
-    by_pose, by_line = bearing_jacobians(state[:3], places, CAMERA_XY)
-    assert innovation[2] == pytest.approx(0.5 - bearings.mean(), abs=1e-12)
+    noise_xy = spd(np.random.default_rng(8), 2, 0.1)
+    robot = localizer([0.3, -0.2, 0.4], [[-1.0, -2.0]], [[1.0, -3.0], [0.8, -3.2]])
+    discs, lines = rows_of([(0, np.zeros(2), noise_xy)]), bearings_of([((0, 1), 0.5, 0.01)])
+    rows = FrameRows(
+        discs.disc_ids, discs.disc_xy, discs.disc_covariance,
+        lines.line_ids, lines.bearing_rad, lines.sigma_rad,
+    )  # fmt: skip
+    error, jacobian, index, noise = innovation_of(rows, robot, robot.state)
+    pose, disc, places = robot.state[:3], robot.state[3:5], robot.state[5:].reshape(2, 2)
+    bearings = bearing_of_vertical(pose, places, CAMERA_XY)
+    by_pose, by_line = bearing_jacobians(pose, places, CAMERA_XY)
+    assert error[2] == pytest.approx(0.5 - bearings.mean(), abs=1e-12)
     np.testing.assert_allclose(jacobian[2, :3], by_pose.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(jacobian[2, 3:], [0, 0, *(by_line.ravel() / 2)], atol=1e-12)
-    np.testing.assert_array_equal(index, [0, 1, 2, 7, 8, 3, 4, 5, 6])
-    assert noise[2, 2] == pytest.approx(1e-4)
-    by_pose, by_disc = disc_jacobians(state[:3], state[7:])
+    np.testing.assert_array_equal(index, np.arange(9))
+    by_pose, by_disc = disc_jacobians(pose, disc)
+    np.testing.assert_allclose(error[:2], -disc_in_robot(pose, disc), atol=1e-12)
     np.testing.assert_allclose(jacobian[:2, :3], by_pose, atol=1e-12)
     np.testing.assert_allclose(jacobian[:2, 3:5], by_disc, atol=1e-12)
+    np.testing.assert_allclose(noise, block_diag(noise_xy, 1e-4))
 
 
 def test_bearings_behind_do_not_jump() -> None:
-    state = np.array([0.0, 0.0, 0.0, 0.01, 5.0])
-    innovation = frame_innovation(
-        state,
-        state,
-        MeasuredDiscs(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))),
-        MeasuredLines(
-            np.array([3]), np.array([0, 1]), np.array([-np.pi + 0.001]), np.array([0.01])
-        ),
-        np.zeros(2),
-    )[0]
-    assert innovation[0] == pytest.approx(0.003, abs=1e-5)
+    robot = localizer([0.0, 0.0, 0.0], [], [[CAMERA_XY[0] + 0.01, CAMERA_XY[1] + 5.0]])
+    rows = bearings_of([((0,), -np.pi + 0.001, 0.01)])
+    assert innovation_of(rows, robot, robot.state).error[0] == pytest.approx(0.003, abs=1e-5)
 
 
 def test_jacobians_of_two_rays() -> None:

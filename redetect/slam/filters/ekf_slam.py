@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
@@ -29,10 +30,13 @@ from redetect.slam.filters.frames import (
     Associator,
     FilterRun,
     FrameRows,
+    Innovation,
     RowCount,
+    innovation_of,
     run_filter,
 )
 from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
+from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 JacobiansAt = Literal["first", "latest"]
@@ -41,7 +45,6 @@ JacobiansAt = Literal["first", "latest"]
 #: linear in its place.
 LARGEST_RANGE_SIGMA = 0.05
 
-_GIVEN_UP = "line without parallax"
 _POSE = np.arange(POSE_SIZE)
 
 
@@ -90,7 +93,7 @@ class EkfSlam:
     @property
     def pose_covariance(self) -> FloatArray:
         """(3, 3)."""
-        return self.covariance.block(_POSE)
+        return self.block(_POSE)
 
     @property
     def state(self) -> FloatArray:
@@ -103,15 +106,12 @@ class EkfSlam:
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
-        state, at = self._state, self._linearised
-        cos, sin = np.cos(state[2]), np.sin(state[2])
-        x = state[0] + cos * step[0] - sin * step[1]
-        y = state[1] + sin * step[0] + cos * step[1]
-        by_pose = np.array([[1.0, 0.0, at[1] - y], [0.0, 1.0, x - at[0]], [0.0, 0.0, 1.0]])
-        by_step = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        at = self._linearised
+        pose = move(self._state[:POSE_SIZE], step)
+        by_pose, by_step = move_jacobians(self._state[:POSE_SIZE], step)
+        by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
         self.covariance.move_pose(by_pose, by_step @ noise @ by_step.T)
-        state[0], state[1], state[2] = x, y, state[2] + step[2]
-        at[:POSE_SIZE] = state[:POSE_SIZE]
+        self._state[:POSE_SIZE] = at[:POSE_SIZE] = pose
         self.frame += 1
 
     def measure(self, rows: FrameRows) -> None:
@@ -143,20 +143,17 @@ class EkfSlam:
             else:
                 single.append(k)
         if discs or lines:
-            self._update(rows, discs, lines)
+            self._update(rows.only(discs, lines))
         for number, k in new_discs.items():
             self._add_disc(number, rows.disc_xy[k], rows.disc_covariance[k])
         if again:
-            self._update(rows, again, [])
+            self._update(rows.only(again, []))
         if single or self._waiting.slots:
             self._view_lines(rows, single)
 
     def finish(self) -> None:
         """The run is over: lines that were not initialised are dropped."""
-        given_up = self._waiting.forget_all()
-        if given_up:
-            self.count.left_out[_GIVEN_UP] += given_up
-        self._free_slots.extend(self._waiting.release())
+        self._give_up(self._waiting.forget_all())
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks that are in the state, with their marginal covariances."""
@@ -168,40 +165,30 @@ class EkfSlam:
     def map_covariance(self) -> FloatArray:
         """Joint covariance of `landmark_map`: discs, then lines; (2 M, 2 M), m^2."""
         slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
-        return self.covariance.block((slots[:, None] + np.arange(2)).ravel())
+        return self.block((slots[:, None] + np.arange(2)).ravel())
 
-    def _update(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
-        innovation, jacobian, noise, index = rows.innovation(
-            discs,
-            lines,
-            self.disc_slots,
-            self.line_slots,
-            self._state,
-            self._linearised,
-            self.camera_xy,
-        )
-        self._apply(innovation, jacobian, noise, index)
-        self.count.discs += len(discs)
-        self.count.lines += len(lines)
-        self.disc_rows.update([rows.disc_ids[k] for k in discs])
-        self.line_rows.update([i for k in lines for i in rows.line_ids[k]])
+    def _update(self, rows: FrameRows) -> None:
+        """Use rows whose landmarks are in the state."""
+        self._apply(innovation_of(rows, self, self._linearised))
+        self.count.discs += len(rows.disc_ids)
+        self.count.lines += len(rows.line_ids)
+        self.disc_rows.update(rows.disc_ids)
+        self.line_rows.update(number for numbers in rows.line_ids for number in numbers)
 
-    def _apply(
-        self, innovation: FloatArray, jacobian: FloatArray, noise: FloatArray, index: IntArray
-    ) -> None:
-        """Update the state by measurements that depend on the numbers `index` of it."""
+    def _apply(self, innovation: Innovation) -> None:
+        """Update the state."""
+        error, jacobian, index, noise = innovation
         projected = self.covariance.projected(index, jacobian)
         change, squared = self.covariance.measure(
-            projected, jacobian @ projected[index] + noise, innovation
+            projected, jacobian @ projected[index] + noise, error
         )
         self._state[: len(change)] += change
         self.count.innovation_squared += squared
-        self.count.innovation_numbers += len(innovation)
+        self.count.innovation_numbers += len(error)
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
         pose, at = self._state, self._linearised
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        by_seen = np.array([[cos, -sin], [sin, cos]])
+        by_seen = rotation(pose[2])
         xy = pose[:2] + by_seen @ seen_xy
         by_pose = np.array([[1.0, 0.0, at[1] - xy[1]], [0.0, 1.0, xy[0] - at[0]]])
         self.disc_slots[number] = self._append(_POSE, by_pose, by_seen @ noise @ by_seen.T, xy, xy)
@@ -226,9 +213,13 @@ class EkfSlam:
         if kept:
             waiting.slots[self.frame] = self._keep_pose()
             given_up += waiting.thin()
-        if given_up:
-            reasons[_GIVEN_UP] += given_up
-        self._free_slots.extend(waiting.release())
+        self._give_up(given_up)
+
+    def _give_up(self, views: int) -> None:
+        """Count views that are not used, and let go of the poses that none needs any more."""
+        if views:
+            self.count.left_out["line without parallax"] += views
+        self._free_slots.extend(self._waiting.release())
 
     def _start_line(self, number: int, views: list[View]) -> bool:
         """Add a line by all its views, the last from the present pose, if that places it well."""
@@ -257,7 +248,8 @@ class EkfSlam:
             index, start.by_poses, start.noise, start.xy + start.correction, start.xy
         )
         if len(views) > 2:
-            self._apply(start.residual, start.residual_by_poses, np.eye(len(start.residual)), index)
+            noise = np.eye(len(start.residual))
+            self._apply(Innovation(start.residual, start.residual_by_poses, index, noise))
         self._waiting.take(number)
         self.line_rows[number] = len(views)
         self.count.lines += len(views)
@@ -299,7 +291,9 @@ class EkfSlam:
         return Landmarks(
             ids=np.array(list(slots), dtype=np.int64),
             xy=np.stack([self._state[place], self._state[place + 1]], axis=-1),
-            covariance=self.covariance.blocks(place),
+            covariance=np.array([self.block(slot + np.arange(2)) for slot in place]).reshape(
+                -1, 2, 2
+            ),
             rows=np.array([rows[number] for number in slots], dtype=np.int64),
         )
 

@@ -7,87 +7,27 @@ each other, each frame for itself, by `redetect.slam.association.compatibility`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
-from redetect.plane import rotation
+from redetect.plane import apply, rotation
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
-    Pairing,
     chi_squared_gates,
     individual_distances,
     joint_compatible,
     nearest_compatible,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_jacobians, bearing_of_vertical
+from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import UNKNOWN_ID, Recording
-
-
-class MeasuredDiscs(NamedTuple):
-    """Rows of d discs."""
-
-    slot: IntArray  # (d,): where in the state the disc of each row begins
-    # (d, 2), (d, 2, 2): measured, in the robot frame (m).
-    xy: FloatArray
-    covariance: FloatArray
-
-
-class MeasuredLines(NamedTuple):
-    """Rows of l lines, each of which may be that of several of e lines of the state."""
-
-    slot: IntArray  # (e,): where in the state the lines of the rows begin
-    # (l + 1,): row i measures the mean of the bearings of lines slot[start[i] : start[i + 1]].
-    start: IntArray
-    # (l,): measured.
-    bearing_rad: FloatArray
-    sigma_rad: FloatArray
-
-
-def frame_innovation(
-    state: FloatArray,
-    linearised_at: FloatArray,
-    discs: MeasuredDiscs,
-    lines: MeasuredLines,
-    camera_xy: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Measured minus predicted, its Jacobian and its noise, for all rows of a frame.
-
-    Takes `state` (n,), `linearised_at` (n,), `camera_xy` (2,); returns `innovation` (m,),
-    `jacobian` (m, 3 + 2 d + 2 e), `noise` (m, m), `index` (3 + 2 d + 2 e,).
-    """
-    d, rows = len(discs.slot), 2 * len(discs.slot) + len(lines.bearing_rad)
-    slots = np.concatenate([discs.slot, lines.slot])
-    places = slots[:, None] + np.arange(2)
-    pose, xy, every_disc = state[:3], state[places], np.arange(d)
-    turn = rotation(pose[2]).T
-    innovation, by_place = np.empty(rows), np.zeros((rows, len(slots), 2))
-    innovation[: 2 * d] = (discs.xy - (xy[:d] - pose[:2]) @ turn.T).ravel()
-    by_place[: 2 * d].reshape(d, 2, len(slots), 2)[every_disc, :, every_disc] = turn
-    if len(lines.slot):
-        count = np.diff(lines.start)
-        row = np.repeat(np.arange(len(count)), count)  # of each line
-        off = wrap_angle(lines.bearing_rad[row] - bearing_of_vertical(pose, xy[d:], camera_xy))
-        innovation[2 * d :] = np.bincount(row, off / count[row], minlength=len(count))
-        _, by_line = bearing_jacobians(pose, xy[d:], camera_xy)
-        by_place[2 * d + row, np.arange(d, len(slots))] = by_line / count[row, None]
-    # Turning the robot is turning the landmarks about it the other way.
-    offset = linearised_at[places] - linearised_at[:2]
-    by_heading = by_place[:, :, 0] @ offset[:, 1] - by_place[:, :, 1] @ offset[:, 0]
-    by_landmarks = by_place.reshape(rows, 2 * len(slots))
-    jacobian = np.concatenate([-by_place.sum(axis=1), by_heading[:, None], by_landmarks], axis=1)
-
-    noise = np.diag(np.concatenate([np.zeros(2 * d), lines.sigma_rad**2]))
-    at = 2 * every_disc[:, None] + np.arange(2)
-    noise[at[:, :, None], at[:, None, :]] = discs.covariance
-    return innovation, jacobian, noise, np.concatenate([np.arange(3), places.ravel()])
-
 
 NO_CAMERA = np.zeros(2)
 
@@ -103,37 +43,87 @@ class FrameRows:
     bearing_rad: FloatArray  # (l,)
     sigma_rad: FloatArray  # (l,)
 
-    def innovation(
-        self,
-        discs: Sequence[int],
-        lines: Sequence[int],
-        disc_slots: Mapping[int, int],
-        line_slots: Mapping[int, int],
-        state: FloatArray,
-        linearised_at: FloatArray,
-        camera_xy: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """Innovation of some of the rows.
-
-        Takes `state, linearised_at` (n,), `camera_xy` (2,).
-        """
-        line_ids = [self.line_ids[k] for k in lines]
-        return frame_innovation(
-            state,
-            linearised_at,
-            MeasuredDiscs(
-                np.array([disc_slots[self.disc_ids[k]] for k in discs], dtype=np.int64),
-                self.disc_xy[discs],
-                self.disc_covariance[discs],
-            ),
-            MeasuredLines(
-                np.array([line_slots[i] for ids in line_ids for i in ids], dtype=np.int64),
-                np.cumsum([0, *map(len, line_ids)]),
-                self.bearing_rad[lines],
-                self.sigma_rad[lines],
-            ),
-            camera_xy,
+    def only(self, discs: Sequence[int], lines: Sequence[int]) -> FrameRows:
+        """Some of the rows."""
+        return FrameRows(
+            tuple(self.disc_ids[k] for k in discs),
+            self.disc_xy[discs],
+            self.disc_covariance[discs],
+            tuple(self.line_ids[k] for k in lines),
+            self.bearing_rad[lines],
+            self.sigma_rad[lines],
         )
+
+
+class Prediction(NamedTuple):
+    """How d discs and e lines of a filter's state are seen."""
+
+    seen: FloatArray  # (2 d + e,): discs' places in the robot frame (m), lines' bearings (rad)
+    jacobian: FloatArray  # (2 d + e, 3 + 2 d + 2 e): by these numbers of the state:
+    numbers: IntArray  # (3 + 2 d + 2 e,)
+
+
+class Innovation(NamedTuple):
+    """Measured less predicted of a frame's rows, m numbers."""
+
+    error: FloatArray  # (m,)
+    jacobian: FloatArray  # (m, k): of the prediction, by these numbers of the state:
+    numbers: IntArray  # (k,)
+    noise: FloatArray  # (m, m): covariance of the measurements
+
+
+def predicted(
+    estimate: Filter, discs: ArrayLike, lines: ArrayLike, linearised_at: FloatArray
+) -> Prediction:
+    """How discs and lines of a filter's state are seen.
+
+    Takes where in the state they begin, `discs` (d,) and `lines` (e,), and the state (n,) at which
+    derivatives by the heading are evaluated.
+    """
+    state, camera_xy = estimate.state, estimate.camera_xy
+    d = np.size(discs)
+    slots = np.concatenate([discs, lines]).astype(np.int64)
+    places = slots[:, None] + np.arange(2)
+    pose, disc_xy, line_xy = state[:3], state[places[:d]], state[places[d:]]
+    seen = disc_in_robot(pose, disc_xy).ravel()
+    by_place = np.zeros((d + len(slots), len(slots), 2))
+    every = np.arange(d)
+    by_place[: 2 * d].reshape(d, 2, len(slots), 2)[every, :, every] = rotation(pose[2]).T
+    if d < len(slots):
+        seen = np.append(seen, bearing_of_vertical(pose, line_xy, camera_xy))
+        every = np.arange(d, len(slots))
+        by_place[d + every, every] = bearing_jacobians(pose, line_xy, camera_xy)[1]
+    # Turning the robot is turning the landmarks about it the other way.
+    offset = linearised_at[places] - linearised_at[:2]
+    by_heading = by_place[:, :, 0] @ offset[:, 1] - by_place[:, :, 1] @ offset[:, 0]
+    by_landmarks = by_place.reshape(len(seen), 2 * len(slots))
+    jacobian = np.concatenate([-by_place.sum(axis=1), by_heading[:, None], by_landmarks], axis=1)
+    return Prediction(seen, jacobian, np.concatenate([np.arange(3), places.ravel()]))
+
+
+def innovation_of(rows: FrameRows, estimate: Filter, linearised_at: FloatArray) -> Innovation:
+    """Innovation of rows whose landmarks are in a filter's state; see `predicted`.
+
+    A row of several lines measures the mean of their bearings.
+    """
+    seen, jacobian, index = predicted(
+        estimate,
+        [estimate.disc_slots[number] for number in rows.disc_ids],
+        [estimate.line_slots[number] for numbers in rows.line_ids for number in numbers],
+        linearised_at,
+    )
+    d = 2 * len(rows.disc_ids)
+    error = rows.disc_xy.ravel() - seen[:d]
+    if rows.line_ids:
+        members = np.array([len(numbers) for numbers in rows.line_ids])
+        mean = np.repeat(np.diag(1.0 / members), members, axis=1)
+        off = wrap_angle(np.repeat(rows.bearing_rad, members) - seen[d:])
+        error = np.append(error, mean @ off)
+        jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
+    noise = np.diag(np.append(np.zeros(d), rows.sigma_rad**2))
+    at = np.arange(d).reshape(-1, 2)
+    noise[at[:, :, None], at[:, None, :]] = rows.disc_covariance
+    return Innovation(error, jacobian, index, noise)
 
 
 @dataclass
@@ -219,10 +209,6 @@ FARTHEST_LINE_M = 15.0
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
-_NONE = np.zeros(0, dtype=np.int64)
-_NO_DISCS = MeasuredDiscs(_NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-_NO_LINES = MeasuredLines(_NONE, np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0))
-
 
 @dataclass(frozen=True)
 class Associator:
@@ -251,21 +237,13 @@ class Associator:
         found = np.full(len(rows.disc_xy), UNKNOWN_ID, dtype=np.int64)
         closest = np.full(len(found), np.inf)
         if len(slots):
-            prediction, jacobian, _, index = frame_innovation(
-                estimate.state,
-                estimate.state,
-                MeasuredDiscs(slots, np.zeros((len(slots), 2)), np.zeros((len(slots), 2, 2))),
-                _NO_LINES,
-                estimate.camera_xy,
-            )
-            predicted = jacobian @ estimate.block(index) @ jacobian.T
-            innovation = rows.disc_xy[:, None] + prediction.reshape(-1, 2)
-            pairing = self._paired(innovation, predicted, rows.disc_covariance)
-            paired = pairing.landmark >= 0
-            found[paired] = names[pairing.landmark[paired]]
-            closest = np.min(
-                individual_distances(innovation, predicted, rows.disc_covariance), axis=1
-            )
+            seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
+            spread = jacobian @ estimate.block(index) @ jacobian.T
+            innovation = rows.disc_xy[:, None] - seen.reshape(-1, 2)
+            landmark = self._paired(innovation, spread, rows.disc_covariance)
+            found[landmark >= 0] = names[landmark[landmark >= 0]]
+            distances = individual_distances(innovation, spread, rows.disc_covariance)
+            closest = np.min(distances, axis=1)
         if new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
@@ -280,23 +258,16 @@ class Associator:
         slots, names = slots[away < FARTHEST_LINE_M], names[away < FARTHEST_LINE_M]
         if not len(slots):
             return ((),) * len(rows.line_ids)
-        zeros = np.zeros(len(slots))
-        prediction, jacobian, _, index = frame_innovation(
-            state,
-            state,
-            _NO_DISCS,
-            MeasuredLines(slots, np.arange(len(slots) + 1), zeros, zeros),
-            estimate.camera_xy,
-        )
-        innovation = wrap_angle(rows.bearing_rad[:, None] + prediction)
-        predicted = jacobian @ estimate.block(index) @ jacobian.T
+        seen, jacobian, index = predicted(estimate, [], slots, state)
+        innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
+        spread = jacobian @ estimate.block(index) @ jacobian.T
         noise = rows.sigma_rad[:, None, None] ** 2
-        landmark = self._paired(innovation[:, :, None], predicted, noise).landmark
+        landmark = self._paired(innovation[:, :, None], spread, noise)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
-    def _paired(self, innovation: FloatArray, predicted: FloatArray, noise: FloatArray) -> Pairing:
+    def _paired(self, innovation: FloatArray, spread: FloatArray, noise: FloatArray) -> IntArray:
         pair = joint_compatible if self.method == "joint" else nearest_compatible
-        return pair(innovation, predicted, noise, gate_probability=self.gate_probability)
+        return pair(innovation, spread, noise, gate_probability=self.gate_probability).landmark
 
 
 def run_filter(
@@ -341,13 +312,12 @@ def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArr
     names = np.array(list(estimate.disc_slots), dtype=np.int64)
     if not len(slots):
         return names, slots
-    state = estimate.state
-    cos, sin = np.cos(state[2]), np.sin(state[2])
-    rotated = seen_xy @ np.array([[cos, sin], [-sin, cos]])
-    offset = np.stack([state[slots], state[slots + 1]], axis=-1)[:, None] - state[:2] - rotated
-    pose = estimate.block(np.arange(3))
-    reach = np.sqrt(pose[0, 0] + pose[1, 1]) + np.sqrt(pose[2, 2]) * np.hypot(*seen_xy.T)
-    near = np.any(np.hypot(*offset.transpose(2, 0, 1)) < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
+    state, spread = estimate.state, estimate.pose_covariance
+    away = np.linalg.norm(
+        state[slots[:, None, None] + np.arange(2)] - apply(state[:3], seen_xy), axis=2
+    )
+    reach = np.sqrt(spread[0, 0] + spread[1, 1]) + np.sqrt(spread[2, 2]) * np.hypot(*seen_xy.T)
+    near = np.any(away < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
     return names[near], slots[near]
 
 

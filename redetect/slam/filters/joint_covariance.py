@@ -12,18 +12,12 @@ by congruences (F P F^T) and by symmetric products alone.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.filters.frames import innovation_root
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 POSE_SIZE = 3
 
@@ -43,8 +37,6 @@ class JointCovariance:
     """
 
     def __init__(self, pose_covariance: FloatArray) -> None:
-        self._subtract: Callable[..., FloatArray] = dsyrk
-        self._solve: Callable[..., tuple[FloatArray, int]] = dtrtrs
         self.size = POSE_SIZE
         self._base = np.zeros((_CHUNK, _CHUNK), order="F")
         self._base[:POSE_SIZE, :POSE_SIZE] = pose_covariance
@@ -56,15 +48,6 @@ class JointCovariance:
         factor = self._factor[index, : self._pending]
         low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
         return np.asarray(self._base[high, low] - factor @ factor.T)
-
-    def blocks(self, slots: IntArray) -> FloatArray:
-        """Covariances of pairs of numbers that begin at `slots`: (k, 2, 2)."""
-        self._settle()
-        found = np.empty((len(slots), 2, 2))
-        found[:, 0, 0] = self._base[slots, slots]
-        found[:, 1, 1] = self._base[slots + 1, slots + 1]
-        found[:, 0, 1] = found[:, 1, 0] = self._base[slots + 1, slots]
-        return found
 
     def projected(self, index: IntArray, jacobian: FloatArray) -> FloatArray:
         """Covariance of the state with a measurement: P[:, index] @ jacobian.T, (size, m)."""
@@ -102,7 +85,7 @@ class JointCovariance:
                 self._factor = np.zeros((self._factor.shape[0], rows), order="F")
         right = np.empty((self.size + 1, rows))
         right[:-1], right[-1] = projected, innovation
-        whitened = self._solve(root, right.T, lower=1, overwrite_b=1)[0].T
+        whitened = dtrtrs(root, right.T, lower=1, overwrite_b=1)[0].T
         factor, last = whitened[:-1], whitened[-1]
         self._factor[: self.size, self._pending : self._pending + rows] = factor
         self._pending += rows
@@ -143,7 +126,7 @@ class JointCovariance:
         """Subtract W W^T from B."""
         if self._pending:
             used = self._factor[:, : self._pending]
-            self._base = self._subtract(-1.0, used, 1.0, self._base, lower=1, overwrite_c=1)
+            self._base = dsyrk(-1.0, used, 1.0, self._base, lower=1, overwrite_c=1)
             self._pending = 0
             # The pose's block is read and written whole.
             lower = np.tril(self._base[:POSE_SIZE, :POSE_SIZE])

@@ -19,7 +19,13 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap
-from redetect.slam.filters.frames import NO_CAMERA, FrameRows, RowCount, innovation_root
+from redetect.slam.filters.frames import (
+    NO_CAMERA,
+    FrameRows,
+    RowCount,
+    innovation_of,
+    innovation_root,
+)
 from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID
 
@@ -68,12 +74,12 @@ class Localizer:
         self.pose_covariance = np.zeros((3, 3))
         if start_covariance is not None:
             self.pose_covariance += np.asarray(start_covariance, dtype=np.float64)
-        self._state = np.concatenate(
+        self.state = np.concatenate(
             [np.asarray(start, dtype=np.float64), discs.xy.ravel(), lines.xy.ravel()]
         )
         self._map_errors = map_errors
         self._predicted = np.array(start, dtype=np.float64)
-        numbers = len(self._state) - _POSE_SIZE
+        numbers = len(self.state) - _POSE_SIZE
         self._map_covariance = np.zeros((numbers, numbers))
         if map_errors == "considered" and joint_covariance is not None:
             self._map_covariance += joint_covariance
@@ -82,17 +88,7 @@ class Localizer:
                 own = slice(2 * k, 2 * k + 2)
                 self._map_covariance[own, own] = block
         # Of the pose with the landmarks' errors.
-        self._cross = np.zeros((_POSE_SIZE, len(self._state) - _POSE_SIZE))
-
-    @property
-    def state(self) -> FloatArray:
-        """The pose, then the landmarks: (n,)."""
-        return self._state
-
-    @property
-    def pose(self) -> FloatArray:
-        """x, y (m), theta (rad): (3,)."""
-        return self._state[:_POSE_SIZE]
+        self._cross = np.zeros((_POSE_SIZE, len(self.state) - _POSE_SIZE))
 
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns of the joint covariance of pose and map.
@@ -106,14 +102,14 @@ class Localizer:
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
-        by_pose, by_step = move_jacobians(self.pose, step)
-        self._state[:_POSE_SIZE] = move(self.pose, step)
+        by_pose, by_step = move_jacobians(self.state[:3], step)
+        self.state[:_POSE_SIZE] = move(self.state[:3], step)
         if self._map_errors == "considered":
             # From prediction to prediction, as with first estimates in EKF-SLAM: else corrections
             # would look like knowledge of how the map as a whole is turned.
-            by_pose[0, 2] = self._predicted[1] - self._state[1]
-            by_pose[1, 2] = self._state[0] - self._predicted[0]
-            self._predicted = self.pose.copy()
+            by_pose[0, 2] = self._predicted[1] - self.state[1]
+            by_pose[1, 2] = self.state[0] - self._predicted[0]
+            self._predicted = self.state[:3].copy()
         moved = by_pose @ self.pose_covariance @ by_pose.T + by_step @ noise @ by_step.T
         self.pose_covariance = 0.5 * (moved + moved.T)
         self._cross = by_pose @ self._cross
@@ -132,22 +128,13 @@ class Localizer:
         self._count(rows, discs, lines)
         if not discs and not lines:
             return
-        innovation, jacobian, noise, index = rows.innovation(
-            discs,
-            lines,
-            self.disc_slots,
-            self.line_slots,
-            self._state,
-            self._state,
-            self.camera_xy,
-        )
+        error, jacobian, index, noise = innovation_of(rows.only(discs, lines), self, self.state)
         block = self.block(index)
-        covariance = jacobian @ block @ jacobian.T + noise
-        root = innovation_root(covariance)
-        whitened = np.linalg.solve(root, innovation)
+        root = innovation_root(jacobian @ block @ jacobian.T + noise)
+        whitened = np.linalg.solve(root, error)
         # The pose's part of P H^T, over the root of S.
         factor = np.linalg.solve(root, jacobian @ block[:, :_POSE_SIZE]).T
-        self._state[:_POSE_SIZE] += factor @ whitened
+        self.state[:_POSE_SIZE] += factor @ whitened
         if self._map_errors == "considered":
             # Of the measurement with the landmarks' errors: H P[index, landmarks].
             by_map = jacobian[:, :_POSE_SIZE] @ self._cross
@@ -157,7 +144,7 @@ class Localizer:
             self._cross -= factor @ np.linalg.solve(root, by_map)
         self.pose_covariance = self.pose_covariance - factor @ factor.T
         self.count.innovation_squared += float(whitened @ whitened)
-        self.count.innovation_numbers += len(innovation)
+        self.count.innovation_numbers += len(error)
 
     def _count(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
         used_discs, used_lines = set(discs), set(lines)
