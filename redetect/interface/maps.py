@@ -23,10 +23,9 @@ from redetect.landmarks.map_file import (
     write_path,
 )
 from redetect.slam.commands.files import MAP_NAME, PATH_NAME
-from redetect.slam.commands.localize import localized_run_of
+from redetect.slam.commands.filters import localized_run_of, path_distance
 from redetect.slam.commands.map import mapped_run_of, weighting_of
 from redetect.slam.filters.frames import FilterRun
-from redetect.slam.filters.report import path_distance
 from redetect.slam.mapping.run_map import MappedRun, landmark_map, path_of
 from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Localize, Map

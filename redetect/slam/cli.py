@@ -18,8 +18,8 @@ PROGRAM = Program(
     {
         Map: "redetect.slam.commands.map",
         Audit: "redetect.slam.commands.audit",
-        Localize: "redetect.slam.commands.localize",
-        Ekf: "redetect.slam.commands.ekf",
+        Localize: "redetect.slam.commands.filters",
+        Ekf: "redetect.slam.commands.filters",
         Associate: "redetect.slam.commands.associate",
         Noise: "redetect.slam.commands.noise",
         Export: "redetect.slam.commands.export",

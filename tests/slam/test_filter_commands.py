@@ -18,8 +18,8 @@ from redetect.landmarks.map_file import (
     read_path,
 )
 from redetect.slam.cli import main
+from redetect.slam.commands.filters import map_distance, path_distance
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.report import map_distance, path_distance
 
 STEP = "STEP a.{k} 0.0 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
 DISC = "LANDMARK_C {x} -2 0.9 0.002 0.0001 0.003 {id}\n"

@@ -1,27 +1,22 @@
-"""Files of the commands: the run, its camera, a path to compare with; summaries and pictures."""
+"""Files of the commands: the run and its camera, what they write."""
 
 from __future__ import annotations
 
 import json
 import sys
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
 from camera import Camera, read_camera
-from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, read_path, write_path
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import NO_CAMERA, FilterRun
-from redetect.slam.filters.report import path_distance, summary, table
+from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.models import OdometryNoise
-from redetect.slam.options import FilterFlags, RunFlags
-from redetect.slam.pictures import draw_errors, draw_map
+from redetect.slam.options import RunFlags
 from redetect.slam.recording import (
     Recording,
     demand_landmarks,
@@ -116,7 +111,7 @@ def landmark_files(flags: RunFlags, run: Path) -> list[Path]:
     return [landmark_file(run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
-MAP_NAME, PATH_NAME, MAP_PICTURE, ERROR_PICTURE = "map.csv", "path.csv", "map.png", "errors.png"
+MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
 
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
@@ -139,73 +134,3 @@ def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
     """Write a summary."""
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())
-
-
-def filtered(work: Callable[[], FilterRun]) -> tuple[FilterRun, str]:
-    """Take a filter through a run; also returned is what to print of its time."""
-    began, began_working = time.perf_counter(), time.thread_time()
-    run = work()
-    seconds, working = time.perf_counter() - began, time.thread_time() - began_working
-    steps = len(run.path.poses) - 1
-    return run, (
-        f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s; of processor "
-        f"{working:.2f} s, {steps / working:.0f} steps/s"
-    )
-
-
-def filter_output(command: FilterFlags, name: str, more: tuple[str, ...] = ()) -> Path:
-    """The folder for a filter's results, in which nothing of their names may be."""
-    output = command.output or default_output(command.run, name)
-    names = [PATH_NAME, f"{name}.json", MAP_PICTURE, *more]
-    names += [ERROR_PICTURE] * (command.reference is not None)
-    demand_free([output / name for name in names], overwrite=command.force)
-    return output
-
-
-class FilterResults(NamedTuple):
-    """What a filter's command writes and prints."""
-
-    name: str  # of the command
-    run: FilterRun
-    landmark_map: LandmarkMap
-    source: str  # of the path, for its head
-    title: str  # of the pictures
-    figures: dict[str, Any]  # for the JSON file
-    lines: list[str]  # for the terminal
-
-
-def write_filtered(command: FilterFlags, output: Path, results: FilterResults) -> None:
-    """Write a filter's path, figures and pictures, and print its table."""
-    run, reference, distance = results.run, None, None
-    if command.reference:
-        reference = read_path(command.reference)
-        if len(reference.poses) != len(run.path.poses):
-            raise SlamError(
-                f"{command.reference}: {len(reference.poses)} poses: expected "
-                f"{len(run.path.poses)}, the start and one after each step of the run"
-            )
-        distance = path_distance(run.path, reference.poses)
-    output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam {results.name} {slam.__version__}: {results.source}"]
-    write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
-    content = summary(run, flags_of(command), distance) | results.figures
-    write_json(output / f"{results.name}.json", content, overwrite=command.force)
-    print("\n".join([*table(run, distance), *results.lines]))
-    draw_map(
-        output / MAP_PICTURE,
-        results.landmark_map,
-        run.path,
-        reference=reference,
-        title=results.title,
-        overwrite=command.force,
-        interactive=command.interactive,
-    )
-    if reference is not None:
-        draw_errors(
-            output / ERROR_PICTURE,
-            run.path,
-            reference.poses,
-            title=results.title,
-            overwrite=command.force,
-            interactive=command.interactive,
-        )

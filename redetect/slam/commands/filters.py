@@ -1,0 +1,332 @@
+"""``slam localize`` and ``slam ekf``: a run through a filter; path, figures and pictures out."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from redetect import slam
+from redetect.array_types import FloatArray
+from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    Path2D,
+    covariance_file,
+    read_joint_covariance,
+    read_map,
+    read_path,
+    write_joint_covariance,
+    write_map,
+    write_path,
+)
+from redetect.slam.association.waking import wake_up
+from redetect.slam.commands.files import (
+    MAP_NAME,
+    MAP_PICTURE,
+    PATH_NAME,
+    camera_xy_of,
+    default_output,
+    demand_free,
+    flags_of,
+    recording_of,
+    write_json,
+)
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.frames import Associator, FilterRun, run_filter
+from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.options import Ekf, Localize
+from redetect.slam.pictures import draw_errors, draw_map
+from redetect.slam.recording import Recording
+from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
+
+ERROR_PICTURE = "errors.png"
+
+
+class _Result(NamedTuple):
+    """What a filter found."""
+
+    run: FilterRun
+    landmark_map: LandmarkMap
+    source: str  # of the path, for its head
+    title: str  # of the pictures
+    figures: dict[str, Any]  # of its own, for the JSON file
+    said: list[str]  # of its own, for the terminal
+    joint: FloatArray | None = None  # covariance of a map that it made
+
+
+def perform(command: Localize | Ekf) -> int:
+    """Carry the command out; returns the exit code."""
+    demand(command, SlamError, start=FINITE)
+    name = type(command).__name__.lower()
+    output = command.output or default_output(command.run, name)
+    names = [PATH_NAME, f"{name}.json", MAP_PICTURE]
+    names += [ERROR_PICTURE] * (command.reference is not None)
+    if isinstance(command, Ekf):
+        names += [MAP_NAME, covariance_file(Path(MAP_NAME)).name]
+    demand_free([output / name for name in names], overwrite=command.force)
+    recording = recording_of(command)
+    if isinstance(command, Localize):
+        result = _localized(command, recording)
+    else:
+        result = _mapped(command, recording)
+    run = result.run
+    reference, distance = None, None
+    if command.reference:
+        reference = read_path(command.reference)
+        if len(reference.poses) != len(run.path.poses):
+            raise SlamError(
+                f"{command.reference}: {len(reference.poses)} poses: expected "
+                f"{len(run.path.poses)}, the start and one after each step of the run"
+            )
+        distance = path_distance(run.path, reference.poses)
+
+    output.mkdir(parents=True, exist_ok=True)
+    head = [f"slam {name} {slam.__version__}: {result.source}"]
+    write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
+    content = {
+        "version": slam.__version__,
+        "settings": flags_of(command),
+        "figures": _figures(run, distance),
+        **result.figures,
+    }
+    write_json(output / f"{name}.json", content, overwrite=command.force)
+    print("\n".join([*_table(run, distance), *result.said]))
+    drawing: dict[str, Any] = {
+        "title": result.title,
+        "overwrite": command.force,
+        "interactive": command.interactive,
+    }
+    draw_map(output / MAP_PICTURE, result.landmark_map, run.path, reference=reference, **drawing)
+    if reference is not None:
+        draw_errors(output / ERROR_PICTURE, run.path, reference.poses, **drawing)
+    if result.joint is not None:
+        write_map(output / MAP_NAME, result.landmark_map, head, overwrite=command.force)
+        write_joint_covariance(output / MAP_NAME, result.joint, overwrite=command.force)
+    return 0
+
+
+def _localized(command: Localize, recording: Recording) -> _Result:
+    landmark_map = read_map(command.map)
+    map_errors = _map_errors(command)
+    joint, said = None, []
+    if map_errors == "considered":
+        joint = read_joint_covariance(command.map, landmark_map)
+        if joint is None:
+            name = covariance_file(command.map).name
+            said.append(f"errors of the map taken as independent: no {name}")
+    began = _now()
+    run = localized_run_of(command, recording, landmark_map, joint)
+    return _Result(
+        run,
+        landmark_map,
+        f"{command.run} in {command.map}",
+        f"{command.run.name}: localised",
+        {"map_errors": map_errors if joint is None else f"{map_errors}, jointly"},
+        [*said, _time_line(began, len(recording))],
+    )
+
+
+def localized_run_of(
+    command: Localize, recording: Recording, landmark_map: LandmarkMap, joint: FloatArray | None
+) -> FilterRun:
+    """What a command asks for: a run's rows localised in a map, whose joint covariance is `joint`.
+
+    Raises
+    ------
+    SlamError
+        If no row shows a landmark of the map, or a flag is out of its range.
+    """
+    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
+    start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))
+    if command.lost:
+        start, covariance = _woken_up(command, recording, landmark_map)
+    localizer = Localizer(
+        landmark_map,
+        start,
+        covariance,
+        camera_xy_of(recording, command.run, command.camera),
+        map_errors=_map_errors(command),
+        joint_covariance=joint,
+    )
+    associator = Associator(command.association, command.gate_probability)
+    run = run_filter(recording, localizer, associator)
+    if not run.count.discs and not run.count.lines:
+        raise SlamError(
+            f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
+            "same run, or --association joint"
+        )
+    return run
+
+
+def _woken_up(
+    command: Localize, recording: Recording, landmark_map: LandmarkMap
+) -> tuple[FloatArray, FloatArray]:
+    """The pose at the start and its covariance, by the discs of the first frames."""
+    if any(command.start) or any(command.start_sigma):
+        raise SlamError("--lost and --start: expected one of them")
+    woken = wake_up(recording, landmark_map.discs.xy)
+    if woken is None:
+        raise SlamError(
+            f"{command.run}: no place in {command.map} is certain by the discs of the first frames:"
+            " expected five or more that no other place has as well; --start says where"
+        )
+    x, y, heading = woken.pose
+    print(
+        f"woke up at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {woken.agreeing} "
+        f"of {woken.discs} discs of the first {woken.frames} frames are in the map"
+    )
+    return woken.pose, woken.covariance
+
+
+def _map_errors(command: Localize) -> MapErrors:
+    """How the map's errors are treated, where that is not said."""
+    if command.map_errors != "auto":
+        return command.map_errors
+    # Considering them makes the filter slow to pull itself back onto the map, which costs little
+    # as long as the pairs are right, and the track if they are to be found.
+    return "considered" if command.association == "known" else "ignored"
+
+
+def _mapped(command: Ekf, recording: Recording) -> _Result:
+    camera_xy = camera_xy_of(recording, command.run, command.camera)
+    ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
+    associator = Associator(command.association, command.gate_probability)
+    began = _now()
+    run = run_ekf(recording, ekf, associator)
+    time_line = _time_line(began, len(recording))
+    landmark_map = ekf.landmark_map()
+    discs, lines = len(landmark_map.discs), len(landmark_map.lines)
+    if not discs and not lines:
+        raise SlamError(
+            f"{command.run}: no landmark in the map: expected rows with identifiers, or "
+            "--association joint"
+        )
+    figures: dict[str, Any] = {"landmarks": {"discs": discs, "lines": lines}}
+    said = [f"landmarks         {discs} discs, {lines} lines"]
+    if command.reference_map:
+        off = map_distance(landmark_map, read_map(command.reference_map))
+        figures["distance_from_reference_map"] = off
+        said.append(
+            "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
+            "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
+        )
+    return _Result(
+        run,
+        landmark_map,
+        str(command.run),
+        f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end",
+        figures,
+        [*said, time_line],
+        ekf.map_covariance(),
+    )
+
+
+def _now() -> tuple[float, float]:
+    """Seconds on the clock, and of the processor."""
+    return time.perf_counter(), time.thread_time()
+
+
+def _time_line(began: tuple[float, float], steps: int) -> str:
+    seconds, working = (now - then for now, then in zip(_now(), began))
+    return (
+        f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s; of processor "
+        f"{working:.2f} s, {steps / working:.0f} steps/s"
+    )
+
+
+def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
+    """How far a path is from another one of the same run in the same map, `reference` (N, 3).
+
+    Root mean square, median and largest distance of positions (m) and headings (rad), and those of
+    the last pose.
+    """
+    other = np.asarray(reference, dtype=np.float64)
+    position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
+    heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
+    return {
+        f"{name}_{figure}_{unit}": float(value)
+        for name, unit, distance in (("position", "m", position), ("heading", "rad", heading))
+        for figure, value in (
+            ("rms", math.sqrt(float(np.mean(distance**2)))),
+            ("median", np.median(distance)),
+            ("max", np.max(distance)),
+            ("last", distance[-1]),
+        )
+    }
+
+
+def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
+    """How far landmarks are from those of another map with the same identifiers."""
+    offsets, covariances = [], []
+    for some, others in (
+        (landmark_map.discs, reference.discs),
+        (landmark_map.lines, reference.lines),
+    ):
+        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
+        offsets.append(some.xy[own] - others.xy[other])
+        covariances.append(some.covariance[own])
+    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
+    if not len(offset):
+        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
+    distance = np.hypot(*offset.T)
+    return {
+        "landmarks": float(len(distance)),
+        "rms_m": math.sqrt(float(np.mean(distance**2))),
+        "median_m": float(np.median(distance)),
+        "max_m": float(np.max(distance)),
+        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
+    }
+
+
+def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any]:
+    """What the JSON file says of any filter."""
+    count = run.count
+    figures: dict[str, Any] = {
+        "steps": len(run.path.poses) - 1,
+        "disc_rows_used": count.discs,
+        "line_rows_used": count.lines,
+        "rows_left_out": dict(sorted(count.left_out.items())),
+        "innovation_squared": count.innovation_squared,
+        "innovation_expected": count.innovation_numbers,
+    }
+    if distance is not None:
+        figures["distance_from_reference"] = distance
+    return figures
+
+
+def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
+    """Lines for the terminal."""
+    count = run.count
+    lines = [f"steps             {len(run.path.poses) - 1}"]
+    used = [f"{count.discs} of discs"] * bool(count.discs) + [f"{count.lines} of lines"] * bool(
+        count.lines
+    )
+    lines.append(f"rows used         {', '.join(used) or 'none'}")
+    for reason, number in sorted(count.left_out.items()):
+        lines.append(f"left out          {number} ({reason})")
+    if count.innovation_numbers:
+        factor = count.innovation_squared / count.innovation_numbers
+        lines.append(
+            f"innovations       chi2 {count.innovation_squared:.1f}, expected "
+            f"{count.innovation_numbers}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
+        )
+    if distance is not None:
+        lines.append(
+            "from reference    position rms {position_rms_m:.3f} m, median "
+            "{position_median_m:.3f}, max {position_max_m:.3f}, last {position_last_m:.3f}".format(
+                **distance
+            )
+        )
+        degrees = {k: math.degrees(v) for k, v in distance.items() if k.startswith("heading")}
+        lines.append(
+            "                  heading rms {heading_rms_rad:.2f} deg, median "
+            "{heading_median_rad:.2f}, max {heading_max_rad:.2f}, last {heading_last_rad:.2f}"
+            "".format(**degrees)
+        )
+    return lines
