@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy import sparse
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.least_squares.solver import NormalEquations, factor, scaled_inverse
 
 # Columns of the inverse that are computed at once.
@@ -101,7 +101,7 @@ def inverse_blocks(
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
     """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns."""
     n = len(indptr) - 1
@@ -141,7 +141,7 @@ def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntAr
     return start, rows[: start[n]].copy()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def selected_inverse(
     indptr: IntArray, indices: IntArray, lower: FloatArray, diagonal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -21,7 +21,7 @@ PROGRAM = Program(
         Localize: "redetect.slam.commands.filters",
         Ekf: "redetect.slam.commands.filters",
         Associate: "redetect.slam.commands.associate",
-        Noise: "redetect.slam.commands.noise",
+        Noise: "redetect.slam.noise",
         Export: "redetect.slam.commands.export",
         Import: "redetect.slam.commands.export",
     },

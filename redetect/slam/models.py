@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
-from redetect.plane import between, rotation
+from redetect.plane import apply, between, rotation
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
@@ -50,21 +50,22 @@ class OdometryNoise:
 
 
 def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
-    """Motion model f: the pose after an odometry step.
+    """Motion model f: the pose after an odometry step; theta is not wrapped.
 
     Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
     """
-    before = np.asarray(pose, dtype=np.float64)
-    moved = np.asarray(step, dtype=np.float64)
-    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
-    return np.stack(
-        [
-            before[..., 0] + cos * moved[..., 0] - sin * moved[..., 1],
-            before[..., 1] + sin * moved[..., 0] + cos * moved[..., 1],
-            before[..., 2] + moved[..., 2],
-        ],
-        axis=-1,
+    before, moved = np.broadcast_arrays(pose, step)
+    return np.concatenate(
+        [apply(before, moved[..., :2]), (before + moved)[..., 2:]], axis=-1, dtype=np.float64
     )
+
+
+def _with_heading(matrices: FloatArray) -> FloatArray:
+    """(..., 3, 3) of (..., 2, 2) by a pose's place, 1 by its heading."""
+    whole = np.zeros((*matrices.shape[:-2], 3, 3))
+    whole[..., :2, :2] = matrices
+    whole[..., 2, 2] = 1.0
+    return whole
 
 
 def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -72,19 +73,12 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
 
     Takes `pose, step` (..., 3); returns `by_pose, by_step` (..., 3, 3).
     """
-    before = np.asarray(pose, dtype=np.float64)
-    moved = np.asarray(step, dtype=np.float64)
-    shape = np.broadcast_shapes(before.shape, moved.shape)[:-1]
-    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
-    by_pose = np.zeros((*shape, 3, 3))
-    by_pose[..., 0, 0] = by_pose[..., 1, 1] = by_pose[..., 2, 2] = 1.0
-    by_pose[..., 0, 2] = -sin * moved[..., 0] - cos * moved[..., 1]
-    by_pose[..., 1, 2] = cos * moved[..., 0] - sin * moved[..., 1]
-    by_step = np.zeros((*shape, 3, 3))
-    by_step[..., 0, 0] = by_step[..., 1, 1] = cos
-    by_step[..., 0, 1], by_step[..., 1, 0] = -sin, sin
-    by_step[..., 2, 2] = 1.0
-    return by_pose, by_step
+    before, moved = np.broadcast_arrays(pose, step)
+    turn = rotation(before[..., 2])
+    way = np.einsum("...ij,...j->...i", turn, moved[..., :2])
+    by_pose = _with_heading(np.broadcast_to(np.eye(2), turn.shape))
+    by_pose[..., 0, 2], by_pose[..., 1, 2] = -way[..., 1], way[..., 0]
+    return by_pose, _with_heading(turn)
 
 
 def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -92,13 +86,9 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
 
     Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
     """
-    before = np.asarray(first, dtype=np.float64)
+    before, _ = np.broadcast_arrays(first, second)
     step = between(first, second)
-    cos, sin = np.cos(before[..., 2]), np.sin(before[..., 2])
-    by_second = np.zeros((*step.shape, 3))
-    by_second[..., 0, 0] = by_second[..., 1, 1] = cos
-    by_second[..., 0, 1], by_second[..., 1, 0] = sin, -sin
-    by_second[..., 2, 2] = 1.0
+    by_second = _with_heading(np.swapaxes(rotation(before[..., 2]), -1, -2))
     by_first = -by_second
     by_first[..., 0, 2], by_first[..., 1, 2] = step[..., 1], -step[..., 0]
     return by_first, by_second
@@ -135,16 +125,11 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 
     Returns `by_pose` (..., 2, 3), `by_disc` (..., 2, 2).
     """
-    robot = np.asarray(pose, dtype=np.float64)
     seen = disc_in_robot(pose, disc_xy)
-    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
-    by_disc = np.zeros((*seen.shape, 2))
-    by_disc[..., 0, 0] = by_disc[..., 1, 1] = cos
-    by_disc[..., 0, 1], by_disc[..., 1, 0] = sin, -sin
-    by_pose = np.zeros((*seen.shape, 3))
-    by_pose[..., :2] = -by_disc
-    by_pose[..., 0, 2], by_pose[..., 1, 2] = seen[..., 1], -seen[..., 0]
-    return by_pose, by_disc
+    turn = np.swapaxes(rotation(np.asarray(pose)[..., 2]), -1, -2)
+    by_disc = np.array(np.broadcast_to(turn, (*seen.shape, 2)))
+    turned = np.stack([seen[..., 1], -seen[..., 0]], axis=-1)
+    return np.concatenate([-by_disc, turned[..., None]], axis=-1), by_disc
 
 
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:

@@ -40,28 +40,18 @@ def nominal_mounting(camera: Camera) -> FloatArray:
     return np.column_stack([camera.rotation, camera.centre])
 
 
-def directions_of_rows(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """Rays from the camera as calibrated to rows' places on the floor.
-
-    Takes `floor_xy` (n, 2); returns (n, 3).
-    """
-    on_floor = np.concatenate([floor_xy, np.zeros((len(floor_xy), 1))], axis=1)
-    return np.asarray(on_floor - camera.centre)
-
-
 def rows_through_mounting(
-    camera: Camera, directions: FloatArray, mounting: FloatArray
+    camera: Camera, floor_xy: FloatArray, mounting: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Where rows' rays meet the floor if the camera is mounted otherwise.
 
-    Takes `directions` (n, 3), see `directions_of_rows`, and robot_from_camera as mounted (3, 4).
-    Returns `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and
+    Takes `floor_xy` (n, 2) as the rows have it, and robot_from_camera as mounted (3, 4). Returns `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and
     `by_mounting` (n, 2, 4): derivatives by a rotation vector in the robot frame, applied to the
     mounting from the left, and by the height.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
-    ray = directions @ turn.T
+    ray = (np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre) @ turn.T
     slope, by_ray = _on_floor(ray, centre[2])
     by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
     return centre[:2] - centre[2] * slope, by_mounting

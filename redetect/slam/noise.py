@@ -1,17 +1,28 @@
-"""White Gaussian noise on a run's rows, which say so in their covariances: rows in, rows out."""
+"""White Gaussian noise on a run's rows, which say so in their covariances: ``slam noise``."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
-from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, wrap_angle
+from redetect.landmarks import (
+    CircleLandmark,
+    LineLandmark,
+    Record,
+    Row,
+    Step,
+    read_rows,
+    wrap_angle,
+    write_rows,
+)
 from redetect.slam.errors import SlamError
-from redetect.slam.recording import Recording
+from redetect.slam.options import Noise
+from redetect.slam.recording import Recording, landmark_files
 from redetect.storage.bounds import NotNegative, demand_fields, whole
 
 
@@ -46,6 +57,24 @@ class AddedNoise:
         )
 
 
+def perform(options: Noise) -> int:
+    """Carry the command out; returns the exit code."""
+    noise = AddedNoise(
+        disc_m=options.sigma,
+        bearing_rad=options.bearing_sigma,
+        step_m=options.step_sigma,
+        turn_rad=options.turn_sigma,
+        seed=options.seed,
+    )
+    (source,) = landmark_files(
+        options.run, circles=not options.lines, lines=options.lines, stem=options.stem
+    )
+    target = options.output or source.with_name(f"noisy{source.suffix}")
+    write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
+    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
+    return 0
+
+
 def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
     """Rows of a landmark file with noise added.
 
@@ -61,14 +90,37 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
             yield Row(None, b"# " + noise.comment.encode() + line_end)
         first = False
         record = row.record
-        if isinstance(record, Step) and (noise.step_m or noise.turn_rad):
-            yield row.with_record(_noisy_step(record, noise, of_steps))
-        elif isinstance(record, CircleLandmark) and noise.disc_m:
-            yield row.with_record(_noisy_circle(record, noise.disc_m, of_landmarks))
-        elif isinstance(record, LineLandmark) and noise.bearing_rad:
-            yield row.with_record(_noisy_line(record, noise.bearing_rad, of_landmarks))
-        else:
-            yield row
+        rng = of_steps if isinstance(record, Step) else of_landmarks
+        yield row if record is None else row.with_record(_noisy(record, noise, rng))
+
+
+def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Record:
+    """A row with noise, as it is where its kind gets none."""
+    if isinstance(record, Step) and (noise.step_m or noise.turn_rad):
+        x, y, turn = rng.standard_normal(3).tolist()
+        return replace(
+            record,
+            dx=record.dx + noise.step_m * x,
+            dy=record.dy + noise.step_m * y,
+            dphi=record.dphi + noise.turn_rad * turn,
+            cxx=record.cxx + noise.step_m**2,
+            cyy=record.cyy + noise.step_m**2,
+            cphiphi=record.cphiphi + noise.turn_rad**2,
+        )
+    if isinstance(record, CircleLandmark) and noise.disc_m:
+        x, y = rng.standard_normal(2).tolist()
+        return replace(
+            record,
+            px=record.px + noise.disc_m * x,
+            py=record.py + noise.disc_m * y,
+            cxx=record.cxx + noise.disc_m**2,
+            cyy=record.cyy + noise.disc_m**2,
+        )
+    if isinstance(record, LineLandmark) and noise.bearing_rad:
+        alpha = record.alpha + noise.bearing_rad * float(rng.standard_normal())
+        sigma = math.hypot(record.sigma, noise.bearing_rad)
+        return replace(record, alpha=float(wrap_angle(alpha)), sigma=sigma)
+    return record
 
 
 def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recording:
@@ -96,32 +148,3 @@ def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recor
             sigma_rad=lines.sigma_rad * math.sqrt(1.0 + factor**2),
         ),
     )
-
-
-def _noisy_step(step: Step, noise: AddedNoise, rng: np.random.Generator) -> Step:
-    x, y, turn = rng.standard_normal(3).tolist()
-    return replace(
-        step,
-        dx=step.dx + noise.step_m * x,
-        dy=step.dy + noise.step_m * y,
-        dphi=step.dphi + noise.turn_rad * turn,
-        cxx=step.cxx + noise.step_m**2,
-        cyy=step.cyy + noise.step_m**2,
-        cphiphi=step.cphiphi + noise.turn_rad**2,
-    )
-
-
-def _noisy_circle(disc: CircleLandmark, sigma_m: float, rng: np.random.Generator) -> CircleLandmark:
-    x, y = rng.standard_normal(2).tolist()
-    return replace(
-        disc,
-        px=disc.px + sigma_m * x,
-        py=disc.py + sigma_m * y,
-        cxx=disc.cxx + sigma_m**2,
-        cyy=disc.cyy + sigma_m**2,
-    )
-
-
-def _noisy_line(line: LineLandmark, sigma_rad: float, rng: np.random.Generator) -> LineLandmark:
-    alpha = line.alpha + sigma_rad * float(rng.standard_normal())
-    return replace(line, alpha=float(wrap_angle(alpha)), sigma=math.hypot(line.sigma, sigma_rad))

@@ -165,8 +165,8 @@ def joined(runs: Sequence[Recording]) -> Recording:
     if len(runs) == 1:
         return runs[0]
     starts = first_poses(runs)
-    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
     lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
+    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
     # The first run's start is no step.
     return Recording(
         tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
@@ -188,38 +188,44 @@ def joined(runs: Sequence[Recording]) -> Recording:
     )
 
 
-def landmark_file(run: Path, suffix: str, stem: str | None = None) -> Path:
-    """The landmark file of a run folder."""
-    candidates = [run / f"{name}{suffix}" for name in ([stem] if stem else ["map", "detected"])]
-    for path in candidates:
-        if path.is_file():
-            return path
-    expected = " or ".join(path.name for path in candidates)
-    command = "circles" if suffix == ".circles" else "lines"
-    raise SlamError(
-        f"{run}: no landmarks: expected {expected} in it: `detect {command}` writes "
-        f"detected{suffix}, --stem says how another file is called"
-    )
+def landmark_files(
+    run: Path, *, circles: bool = True, lines: bool = False, stem: str | None = None
+) -> list[Path]:
+    """The landmark files of a run folder, of the kinds that are wanted; of a file, itself.
+
+    They are called `stem`, by default map, or else detected.
+    """
+    if not run.is_dir():
+        _demand_landmarks(run)
+        return [run]
+    if not circles and not lines:
+        raise SlamError(f"{run}: neither circles nor lines: expected at least one to be used")
+    found = []
+    for kind, wanted in (("circles", circles), ("lines", lines)):
+        candidates = [run / f"{name}.{kind}" for name in ([stem] if stem else ["map", "detected"])]
+        present = [path for path in candidates if path.is_file()]
+        if wanted and not present:
+            expected = " or ".join(path.name for path in candidates)
+            raise SlamError(
+                f"{run}: no landmarks: expected {expected} in it: `detect {kind}` writes "
+                f"detected.{kind}, --stem says how another file is called"
+            )
+        found += present[:1] if wanted else []
+    return found
 
 
-def demand_landmarks(path: Path) -> Path:
-    """A file that is named as a run, refused where it can't be one."""
+def _demand_landmarks(path: Path) -> None:
+    """Refuse what is named as a run, and can't be one."""
+    expected = "expected a run folder, or a .circles or .lines file"
     if not path.exists():
-        raise SlamError(
-            f"{path}: no such landmark file or folder: expected a run folder, or a .circles or "
-            ".lines file"
-        )
+        raise SlamError(f"{path}: no such landmark file or folder: {expected}")
     if path.suffix.lower() in PICTURES:
         raise SlamError(
-            f"{path}: is a picture: expected a run folder, or a .circles or .lines file: `detect "
-            "circles` and `detect lines` find the landmarks in pictures"
+            f"{path}: is a picture: {expected}: `detect circles` and `detect lines` find the "
+            "landmarks in pictures"
         )
     if path.suffix.lower() == ".cam":
-        raise SlamError(
-            f"{path}: is a calibration: expected a run folder, or a .circles or .lines file; "
-            "calibrations are named by --camera"
-        )
-    return path
+        raise SlamError(f"{path}: is a calibration: {expected}; calibrations are named by --camera")
 
 
 def read_recording(
@@ -239,7 +245,7 @@ def read_recording(
     circles, lines : bool
         Which landmarks to read from a folder. A file's own rows are all read.
     stem : str, optional
-        Name of the files in the folder without suffix; see `landmark_file`.
+        Name of the files in the folder without suffix; see `landmark_files`.
     noise : OdometryNoise
         Of the steps that state no covariance.
 
@@ -255,15 +261,7 @@ def read_recording(
         If there is no file, no step, two files are not of the same run, or a covariance is not
         positive definite; the message names file, step and row.
     """
-    path = Path(run)
-    if not path.is_dir():
-        return recording_of_frames(
-            list(read_frames(demand_landmarks(path))), os.fspath(path), noise
-        )
-    if not circles and not lines:
-        raise SlamError(f"{path}: neither circles nor lines: expected at least one to be used")
-    kinds = (".circles", circles), (".lines", lines)
-    files = [landmark_file(path, suffix, stem) for suffix, wanted in kinds if wanted]
+    files = landmark_files(Path(run), circles=circles, lines=lines, stem=stem)
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)
@@ -325,17 +323,16 @@ def frames_of_discs(
 
 
 def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
-    seen = [row for frame in frames for row in frame.circles]
+    seen = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
     rows = CircleRows.of(
         (
             *(k, (r.px, r.py), ((r.cxx, r.cxy), (r.cxy, r.cyy))),
             next((i for i in r.ids if i >= 0), UNKNOWN_ID),
         )
-        for k, frame in enumerate(frames)
-        for r in frame.circles
+        for k, r in seen
     )
     for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
-        k, row = rows.frame[bad], seen[bad]
+        k, row = seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
             "has a covariance that is not positive definite"
@@ -344,17 +341,15 @@ def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
 
 
 def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
-    for k, frame in enumerate(frames):
-        for row in frame.lines:
-            if not row.sigma > 0.0:
-                raise SlamError(
-                    f"{name}: step {k + 1} ({frame.step.prefix}): the line at bearing "
-                    f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
-                )
+    seen = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
+    for k, row in seen:
+        if not row.sigma > 0.0:
+            raise SlamError(
+                f"{name}: step {k + 1} ({frames[k].step.prefix}): the line at bearing "
+                f"{row.alpha:g} has sigma {row.sigma:g}: expected above 0"
+            )
     return LineRows.of(
-        (k, row.alpha, row.sigma, tuple(i for i in row.ids if i >= 0))
-        for k, frame in enumerate(frames)
-        for row in frame.lines
+        (k, row.alpha, row.sigma, tuple(i for i in row.ids if i >= 0)) for k, row in seen
     )
 
 

@@ -36,7 +36,7 @@ def test_only_ids_change_and_scores_stand_beside(project_root: Path, tmp_path: P
     assert score["pair_precision"] == 1.0
     assert score["splits"] == 0
     assert score["unlabelled_rows"] == sum(own == (-1,) for own in ids) <= 6
-    assert report["settings"]["local"]["method"] == "joint"
+    assert report["settings"]["method"] == "joint"
 
 
 @pytest.mark.long

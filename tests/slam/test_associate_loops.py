@@ -20,8 +20,8 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.loops import (
-    LoopSettings,
     Match,
+    Search,
     Stretch,
     best_motion,
     find_matches,
@@ -31,8 +31,6 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
-
-SETTINGS = LoopSettings()
 
 
 def _search(moved: FloatArray, fixed: FloatArray) -> tuple[float, float, float, int, float, int]:
@@ -107,12 +105,12 @@ def test_random_constellations_do_not_match_and_one_place_seen_twice_does() -> N
     stretches = [
         _stretch(100 * k, range(20 * k, 20 * k + 20), rng.uniform(0, 5, (20, 2))) for k in range(30)
     ]
-    assert find_matches(stretches, LoopSettings(earlier_step=1)) == []
+    assert find_matches(stretches, Search(earlier_step=1)) == []
     place = stretches[4].xy[:14]
     again = np.concatenate([place + rng.normal(0, 0.02, place.shape), rng.uniform(0, 5, (6, 2))])
     again = again @ rotation(0.3).T + [1.0, 2.0]
     stretches.append(_stretch(3000, range(600, 620), again))
-    (match,) = find_matches(stretches, LoopSettings(earlier_step=1))
+    (match,) = find_matches(stretches, Search(earlier_step=1))
     assert (match.earlier_frame, match.later_frame) == (400, 3000)
     right = [(80 + k, 600 + k) for k in range(14)]
     assert set(map(tuple, match.pairs.tolist())) >= set(right[2:4])
@@ -126,11 +124,11 @@ def test_stretches_that_share_landmarks_already_are_not_matched() -> None:
     xy = rng.uniform(0, 5, (20, 2))
     shared = np.r_[0:3, 20:37]
     stretches = [_stretch(0, range(20), xy), Stretch(500, shared, xy)]
-    assert find_matches(stretches, SETTINGS) == []
+    assert find_matches(stretches, Search()) == []
     apart = [_stretch(0, range(20), xy), _stretch(500, range(20, 40), xy)]
-    assert len(find_matches(apart, SETTINGS)) == 1
+    assert len(find_matches(apart, Search())) == 1
     close = [_stretch(0, range(20), xy), _stretch(30, range(20, 40), xy)]
-    assert find_matches(close, SETTINGS) == []
+    assert find_matches(close, Search()) == []
 
 
 def test_stretches_hold_what_their_frames_saw() -> None:
@@ -138,9 +136,9 @@ def test_stretches_hold_what_their_frames_saw() -> None:
     labels = np.repeat(np.arange(100), 2) // 5
     xy = np.stack([np.arange(20.0), np.zeros(20)], axis=1)
     xy[3] = np.nan
-    found = stretches_of(frames, labels, xy, 100, LoopSettings(stretch_frames=40))
-    assert found[0].labels.tolist() == [0, 1, 2, 4, 5, 6, 7]
-    assert [s.middle_frame for s in found[:3]] == [20, 30, 40]
+    found = stretches_of(frames, labels, xy, 100)
+    assert found[0].labels.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert [s.middle_frame for s in found[:3]] == [25, 35, 45]
     assert found[0].xy[3].tolist() == [4.0, 0.0]
 
 

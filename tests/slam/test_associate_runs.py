@@ -13,14 +13,14 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
 from redetect.slam.association.frame_to_frame import (
+    AssociateSettings,
     LocalMap,
-    LocalSettings,
     Method,
     associate_locally,
     moved,
     tilt_jacobian,
 )
-from redetect.slam.association.run import AssociateSettings, associate_run
+from redetect.slam.association.run import associate_run
 from redetect.slam.association.score import score_association
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
@@ -168,8 +168,8 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
     # What is left of the measurement noise is told; the sway is not.
     swaying = replace(recording, circles=replace(circles, xy=place))
     ids = ids_of(swaying)
-    blind = associate_locally(swaying, LocalSettings(sigma_scale=1.0))
-    told = associate_locally(swaying, LocalSettings(sigma_scale=1.0, tilt_sigma_rad=0.012))
+    blind = associate_locally(swaying, AssociateSettings(sigma_scale=1.0))
+    told = associate_locally(swaying, AssociateSettings(sigma_scale=1.0, tilt_sigma_rad=0.012))
     assert score_association(blind.circle_labels, ids).pair_recall < 0.9
     score = score_association(told.circle_labels, ids)
     assert score.pair_recall > 0.95
@@ -180,7 +180,7 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
 def test_well_separated_landmarks_are_followed_without_a_mistake(method: Method) -> None:
     path = circuit(0.9)
     recording = drive(path, scattered(1, 60, 0.6), scattered(2, 25, 1.0), seed=3)
-    found = associate_locally(recording, LocalSettings(method=method), camera_xy=CAMERA_XY)
+    found = associate_locally(recording, AssociateSettings(method=method), camera_xy=CAMERA_XY)
     discs = score_association(found.circle_labels, ids_of(recording))
     assert (discs.pair_precision, discs.wrong_merges) == (1.0, 0)
     assert discs.pair_recall > 0.98

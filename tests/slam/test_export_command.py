@@ -20,7 +20,7 @@ from redetect.landmarks.map_file import (
     write_path,
 )
 from redetect.slam.cli import main
-from redetect.slam.formats.g2o_reading import read_g2o
+from redetect.slam.formats.g2o import read_g2o
 from redetect.slam.formats.text import covariance_from_dataset, from_dataset
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording

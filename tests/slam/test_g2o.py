@@ -21,10 +21,10 @@ from redetect.slam.formats.g2o import (
     first_disc_vertex,
     frames_of_graph,
     graph_of_frames,
+    read_g2o,
     start_covariance,
     write_g2o,
 )
-from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.text import Axes
 from redetect.slam.models import disc_in_robot
 

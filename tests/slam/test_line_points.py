@@ -10,14 +10,12 @@ import pytest
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.association.line_points import (
-    PointSettings,
     Rays,
     find_points,
     lines_by_points,
     rays_of,
 )
 from redetect.slam.association.score import score_association
-from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
@@ -74,7 +72,7 @@ def test_exact_rows_give_exact_points() -> None:
         CAMERA_XY,
     )
     recording = replace(recording, lines=replace(recording.lines, bearing_rad=exact))
-    labels, points = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0), PointSettings())
+    labels, points = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0))
     assert score_association(labels, list(recording.lines.ids)).right_rows == 1.0
     for label, point in enumerate(points):
         true = recording.lines.ids[int(np.flatnonzero(labels == label)[0])][0]
@@ -85,7 +83,7 @@ def test_exact_rows_give_exact_points() -> None:
 def test_points_are_where_the_verticals_stand(seed: int) -> None:
     lines = edges_along_walls(seed)
     recording, path = seen(lines, seed)
-    labels, points = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0), PointSettings())
+    labels, points = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0))
     score = score_association(labels, list(recording.lines.ids))
     assert score.pair_precision > 0.75
     assert score.right_rows > 0.8
@@ -108,7 +106,7 @@ def test_headings_that_are_off_are_found() -> None:
     true = chain_steps(recording.steps)[:, 2]
     before, after = (np.diff(wrap_angle(p[:, 2] - true)) for p in (path, better))
     assert np.std(after) < 0.4 * np.std(before)
-    first, _ = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0), PointSettings())
+    first, _ = find_points(rays_of(recording, path, CAMERA_XY, 1.0, 0.0))
     rows = list(recording.lines.ids)
     assert score_association(found, rows).right_rows > 0.75
     assert (
@@ -117,16 +115,9 @@ def test_headings_that_are_off_are_found() -> None:
 
 
 def test_rows_without_a_point_keep_the_label_they_had() -> None:
-    recording, path = seen(np.zeros((0, 2)), 5, frames=12, clutter=1)
-    before = np.array([0, 0, 1, 1, 1, 2, 3, 3, 4, 4, 4, 4])
-    after, _ = lines_by_points(
-        recording,
-        path,
-        np.zeros(0, np.int64),
-        before,
-        PointSettings(least_score=50.0),
-        camera_xy=CAMERA_XY,
-    )
+    recording, path = seen(np.array([[500.0, -5000.0]]), 5, frames=14, clutter=0)
+    before = np.repeat(np.arange(7), [2, 3, 1, 2, 4, 1, 1])[: len(recording.lines)]
+    after, _ = lines_by_points(recording, path, np.zeros(0, np.int64), before, camera_xy=CAMERA_XY)
     same = before[:, None] == before
     np.testing.assert_array_equal(after[:, None] == after, same)
 
@@ -137,7 +128,7 @@ def test_frames_without_rows_and_runs_without_crossings_do_no_harm() -> None:
     ahead = np.tile([1.0, 0.0], (5, 1))
     row = start[:0]
     empty = Rays(row, none.reshape(0, 2), none, none, none, row, start, ahead, 0.7)
-    labels, points = find_points(empty, PointSettings())
+    labels, points = find_points(empty)
     assert labels.shape == (0,)
     assert points.shape == (0, 2)
     # Rows in the first two and the last of five frames, none of them crossing another.
@@ -152,7 +143,7 @@ def test_frames_without_rows_and_runs_without_crossings_do_no_harm() -> None:
         heading=ahead,
         widest_rad=0.7,
     )
-    labels, points = find_points(rays, PointSettings())
+    labels, points = find_points(rays)
     np.testing.assert_array_equal(labels, [-1, -1, -1])
     assert points.shape == (0, 2)
 
@@ -160,12 +151,6 @@ def test_frames_without_rows_and_runs_without_crossings_do_no_harm() -> None:
 def test_the_same_rows_give_the_same_labels() -> None:
     recording, path = seen(edges_along_walls(6), 6)
     rays = rays_of(recording, path, CAMERA_XY, 1.5, 0.002)
-    first, second = (find_points(rays, PointSettings()) for _ in range(2))
+    first, second = (find_points(rays) for _ in range(2))
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_array_equal(first[1], second[1])
-
-
-@pytest.mark.parametrize("name", ["sigma_scale", "gate_sigmas", "least_score", "farthest_m"])
-def test_settings_that_cannot_be_are_refused(name: str) -> None:
-    with pytest.raises(SlamError, match=name):
-        replace(PointSettings(), **{name: 0.0})  # type: ignore[arg-type]

@@ -12,8 +12,8 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import LineLandmark, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import read_joint_covariance, read_map, read_path
 from redetect.plane import apply, between, invert
-from redetect.slam.association.joining import lay_together
 from redetect.slam.association.loops import Stretch
+from redetect.slam.association.placing import lay_together
 from redetect.slam.cli import main
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, frames_of_discs, joined, read_recording

@@ -10,7 +10,7 @@ import pytest
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply, compose, invert
-from redetect.slam.association.waking import wake_up
+from redetect.slam.association.placing import wake_up
 from redetect.slam.cli import main
 from redetect.slam.recording import CircleRows, LineRows, Recording
 

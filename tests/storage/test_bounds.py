@@ -30,8 +30,6 @@ ENDLESS = {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
         "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",
     },
-    "LocalSettings": {"forget_sigma_m"},
-    "LoopSettings": {"most_turn_rad", "most_shift_m"},
 }  # fmt: skip
 
 #: Which may be negative.
@@ -87,7 +85,7 @@ def test_there_are_settings_of_all_kinds() -> None:
     names = {parameter.values[0].__name__ for parameter in NUMBERS}
     assert {
         "CircleSettings", "LineSettings", "MarkerSettings", "DiscShape", "PoseSettings",
-        "LaserSettings", "FuseSettings", "SyncSettings", "LocalSettings", "LoopSettings",
+        "LaserSettings", "FuseSettings", "SyncSettings", "AssociateSettings",
     } <= names  # fmt: skip
     assert len(NUMBERS) > 150
 

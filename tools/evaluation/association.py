@@ -14,9 +14,9 @@ from tyro.conf import Positional
 
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.slam.association.frame_to_frame import LocalSettings
-from redetect.slam.association.run import AssociateSettings, associate_run
-from redetect.slam.association.waking import wake_up
+from redetect.slam.association.frame_to_frame import AssociateSettings
+from redetect.slam.association.placing import wake_up
+from redetect.slam.association.run import associate_run
 from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
 from redetect.slam.errors import SlamError
@@ -52,16 +52,13 @@ class Association:
             name = path.name if path.is_dir() else f"{path.parent.name}/"
             recording = read_recording(path, circles=self.circles or not self.lines,
                                        lines=self.lines)  # fmt: skip
-            centre = camera_xy_of(recording, path)
-            camera_xy = (float(centre[0]), float(centre[1]))
+            camera_xy = camera_xy_of(recording, path)
             for factor in self.noise:
                 noisy = with_relative_noise(recording, factor, self.seed)
                 for method in self.methods:
-                    local = LocalSettings(method=method, sigma_scale=self.sigma_scale)
+                    settings = AssociateSettings(method=method, sigma_scale=self.sigma_scale)
                     began = time.thread_time()
-                    found = associate_run(
-                        noisy, AssociateSettings(local=local), camera_xy=camera_xy
-                    )
+                    found = associate_run(noisy, settings, camera_xy=camera_xy)
                     seconds = time.thread_time() - began
                     scores = score_run(recording, found)
                     for kind, level in ((k, v) for k in scores for v in scores[k]):

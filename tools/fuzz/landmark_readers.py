@@ -11,7 +11,7 @@ from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
 from redetect.landmarks.map_file import covariance_file, read_joint_covariance, read_map, read_path
 from redetect.landmarks.tilts import read_tilts
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.g2o_reading import read_g2o
+from redetect.slam.formats.g2o import read_g2o
 from redetect.slam.formats.tum import read_tum
 from tools.fuzz.reader import NUMBERS, Reader
 

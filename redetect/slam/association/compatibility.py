@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
 
@@ -101,7 +101,7 @@ def _contiguous(values: ArrayLike) -> FloatArray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _append(
     factor: FloatArray,
     whitened: FloatArray,
@@ -165,7 +165,7 @@ def pair_nearest_first(squared: FloatArray, gate: float) -> IntArray:
     return partner
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def search_jointly(
     innovations: FloatArray,
     predicted: FloatArray,

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
@@ -26,10 +27,47 @@ from redetect.plane import rotation
 from redetect.slam.association.compatibility import Pairing, joint_compatible, nearest_compatible
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from redetect.storage.bounds import PROBABILITY, Bounds, Limit, Positive, demand_fields, whole
+from redetect.storage.bounds import PROBABILITY, Bounds, Positive, demand_fields, whole
 
-# Up to this distance discs have to be equally certain.
-_NEAR_M = 4.0
+Method = Literal["nearest", "joint"]
+
+# Of the first sight of a line: half a metre to infinity within two standard deviations.
+_INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
+
+
+_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
+#: Of the camera above the floor (m).
+CAMERA_HEIGHT_M = 1.5
+# A landmark that is unseen for longer is forgotten (frames); so is a disc whose position relative
+# to the robot has become less certain than this (m), beyond some distance in proportion to it.
+_FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
+# At most this many landmarks of each kind are kept, those seen last.
+_MOST_LANDMARKS = 40
+# Bound of the joint search.
+_MOST_NODES = 30_000
+
+
+@dataclass(frozen=True)
+class AssociateSettings:
+    """How a run is associated."""
+
+    method: Method = "joint"  # see `redetect.slam.association.compatibility`
+    # Share of right rows (or sets of rows) that pass the gate.
+    gate_probability: Annotated[float, PROBABILITY] = 0.999
+    # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
+    # by more than the file says. Bearings are compensated for tilt.
+    sigma_scale: Positive = 1.4
+    # Standard deviation of the robot's tilt about both axes of the floor, which moves all discs of
+    # a frame together, by the camera's height above the floor.
+    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0035
+    map_level: bool = True  # whether loops are detected
+    # Share of a disc's right rows that keep its label at the end, by their covariances as stated;
+    # those farther from its place in the map lose it.
+    kept_probability: Annotated[float, PROBABILITY] = 0.99
+    fewest_rows: Annotated[int, whole(1)] = 3  # a disc of fewer such rows is taken for clutter
+
+    def __post_init__(self) -> None:
+        demand_fields(self, SlamError)
 
 
 @dataclass(eq=False)
@@ -51,7 +89,7 @@ class LocalMap:
 
 
 def moved(
-    local: LocalMap, step: FloatArray, step_covariance: FloatArray, camera_xy: tuple[float, float]
+    local: LocalMap, step: FloatArray, step_covariance: FloatArray, camera_xy: ArrayLike
 ) -> LocalMap:
     """The map in the frame of the robot after a step.
 
@@ -106,7 +144,7 @@ def moved(
     return LocalMap(mean, covariance, local.is_line, local.number, local.last_frame)
 
 
-def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
+def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
     """How a small tilt of the robot moves the places on the floor that a camera seems to see.
 
     Takes `disc_xy` (n, 2); returns (n, 2, 2).
@@ -117,22 +155,20 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float) -> FloatArray:
     return np.stack([np.stack(rows, -1), np.stack(others, -1)], axis=1)
 
 
-def kept(
-    local: LocalMap, frame: int, *, forget_frames: int, forget_sigma_m: float, most_landmarks: int
-) -> LocalMap:
+def kept(local: LocalMap, frame: int) -> LocalMap:
     """The map without landmarks that were not seen for long or have become too uncertain."""
     m = len(local.mean)
     if m == 0:
         return local
     variance = np.diagonal(local.covariance).reshape(m, 2).sum(axis=1)
-    keep = frame - local.last_frame <= forget_frames
+    keep = frame - local.last_frame <= _FORGET_FRAMES
     farther = np.maximum(np.linalg.norm(local.mean, axis=1) / _NEAR_M, 1.0)
-    keep &= local.is_line | (variance <= (farther * forget_sigma_m) ** 2)
+    keep &= local.is_line | (variance <= (farther * _FORGET_SIGMA_M) ** 2)
     for kind in (False, True):
         some = np.flatnonzero(keep & (local.is_line == kind))
-        if len(some) > most_landmarks:
+        if len(some) > _MOST_LANDMARKS:
             oldest_first = some[np.argsort(local.last_frame[some], kind="stable")]
-            keep[oldest_first[:-most_landmarks]] = False
+            keep[oldest_first[:-_MOST_LANDMARKS]] = False
     if np.all(keep):
         return local
     index = np.flatnonzero(np.repeat(keep, 2))
@@ -143,41 +179,6 @@ def kept(
         local.number[keep],
         local.last_frame[keep],
     )
-
-
-Method = Literal["nearest", "joint"]
-
-# Of the first sight of a line: half a metre to infinity within two standard deviations.
-_INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
-
-
-_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
-
-
-@dataclass(frozen=True)
-class LocalSettings:
-    """How rows are associated from frame to frame."""
-
-    method: Method = "joint"  # see `redetect.slam.association.compatibility`
-    # Share of right rows (or sets of rows) that pass the gate.
-    gate_probability: Annotated[float, PROBABILITY] = 0.999
-    # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
-    # by more than the file says. Bearings are compensated for tilt.
-    sigma_scale: Positive = 1.4
-    # Standard deviation of the robot's tilt about both axes of the floor, which moves all discs of
-    # a frame together, by the camera's height above the floor.
-    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0035
-    camera_height_m: Positive = 1.5
-    forget_frames: Annotated[int, whole(0)] = 60  # a landmark unseen for longer is forgotten
-    # So is a disc whose position relative to the robot has become less certain than this, beyond
-    # 4 m in proportion to its distance.
-    forget_sigma_m: Limit = 0.35
-    # At most this many landmarks of each kind are kept, those seen last.
-    most_landmarks: Annotated[int, whole(1)] = 40
-    most_nodes: Annotated[int, whole(1)] = 30_000  # bound of the joint search
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +193,13 @@ class LocalAssociation:
 
 def associate_locally(
     recording: Recording,
-    settings: LocalSettings | None = None,
+    settings: AssociateSettings | None = None,
     *,
-    camera_xy: tuple[float, float] = (0.0, 0.0),
+    camera_xy: ArrayLike = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
 ) -> LocalAssociation:
     """Label the rows of a run, frame by frame, ignoring IDs in the file."""
-    setting = settings or LocalSettings()
+    setting = settings or AssociateSettings()
     circles, lines = recording.circles, recording.lines
     circle_labels = np.full(len(circles), -1, dtype=np.int64)
     line_labels = np.full(len(lines), -1, dtype=np.int64)
@@ -212,13 +213,7 @@ def associate_locally(
         if frame in lost:
             local = LocalMap.empty()
         local = moved(local, recording.steps[frame], recording.step_covariance[frame], camera_xy)
-        local = kept(
-            local,
-            frame,
-            forget_frames=setting.forget_frames,
-            forget_sigma_m=setting.forget_sigma_m,
-            most_landmarks=setting.most_landmarks,
-        )
+        local = kept(local, frame)
         for is_line, starts, labels in (
             (False, circle_starts, circle_labels),
             (True, line_starts, line_labels),
@@ -236,7 +231,7 @@ def associate_locally(
 
 
 def _measured(
-    circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: LocalSettings
+    circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: AssociateSettings
 ) -> tuple[FloatArray, FloatArray]:
     """Measurements of a frame's rows (n, d), and their covariances (n, d, d)."""
     if is_line:
@@ -252,7 +247,7 @@ def _observed(
     noise: FloatArray,
     is_line: bool,
     counts: list[int],
-    setting: LocalSettings,
+    setting: AssociateSettings,
 ) -> tuple[LocalMap, IntArray, bool]:
     """The map after rows of one kind, and their labels; new landmarks raise `counts`."""
     width = seen.shape[1]
@@ -265,10 +260,8 @@ def _observed(
     sway = np.zeros((len(index), 2))
     sway_of_rows = np.zeros((len(seen), width, 2))
     if not is_line:
-        sway = setting.tilt_sigma_rad * tilt_jacobian(
-            local.mean[candidates], setting.camera_height_m
-        ).reshape(-1, 2)
-        sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen, setting.camera_height_m)
+        sway = setting.tilt_sigma_rad * tilt_jacobian(local.mean[candidates]).reshape(-1, 2)
+        sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen)
     predicted = local.covariance[np.ix_(index, index)] + sway @ sway.T
     pairing = _pairing(innovations, predicted, noise, setting)
     rows = np.flatnonzero(pairing.landmark >= 0)
@@ -320,11 +313,11 @@ def _observed(
 
 
 def _pairing(
-    innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: LocalSettings
+    innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: AssociateSettings
 ) -> Pairing:
     gate = setting.gate_probability
     if setting.method == "nearest":
         return nearest_compatible(innovations, predicted, noise, gate_probability=gate)
     return joint_compatible(
-        innovations, predicted, noise, gate_probability=gate, most_nodes=setting.most_nodes
+        innovations, predicted, noise, gate_probability=gate, most_nodes=_MOST_NODES
     )

@@ -19,20 +19,19 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from redetect.slam.association.loop_closing import intersect_bearings, solve_path
-from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import Recording
-from redetect.storage.bounds import ABOVE_0, PROBABILITY, Positive, demand_fields, whole
 
 
 class Rays(NamedTuple):
@@ -53,11 +52,11 @@ class Rays(NamedTuple):
 class Search(NamedTuple):
     """How points are searched."""
 
-    detected: float  # probability that a vertical in view gives a row
-    gate: float  # standard deviations within which a ray may be that row
-    window: int  # frames before and after a crossing that are considered
-    least_score: float  # of a point
     widest_sigma: float  # of all rays (rad)
+    detected: float = 0.7  # probability that a vertical in view gives a row
+    gate: float = 3.0  # standard deviations within which a ray may be that row
+    window: int = 40  # frames before and after a crossing that are considered
+    least_score: float = 4.0  # of a point: log likelihood ratio of the rows with it to without
 
 
 _NEAREST_M = 0.3
@@ -65,12 +64,12 @@ _FEWEST_ROWS = 3
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _wrapped(angle: float) -> float:
     return float((angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[float, float]:
     """How far from their origins two rays cross; negative behind."""
     ux, uy = math.sin(angle[i]), -math.cos(angle[i])
@@ -82,7 +81,7 @@ def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[fl
     return (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def crossings(
     rays: Rays,
     gaps: IntArray,
@@ -114,7 +113,7 @@ def crossings(
     return np.array(points, dtype=np.float64).reshape(-1, 2), np.array(frames, dtype=np.int64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _best_run(
     point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, search: Search
 ) -> tuple[float, IntArray]:
@@ -166,7 +165,7 @@ def _best_run(
     return best, used[used >= 0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
     """The point that some rays pass closest to: robust least squares, from a point near it."""
     for _ in range(4):
@@ -191,7 +190,7 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
     return point
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def take_points(
     points: FloatArray, frames: IntArray, rays: Rays, search: Search
 ) -> tuple[IntArray, FloatArray]:
@@ -240,32 +239,17 @@ def take_points(
 _WIDER_RAD = 0.005
 # Number of times that the frame-to-frame association corrects the path.
 _FIRST_ROUNDS = 2
-
-
-@dataclass(frozen=True)
-class PointSettings:
-    """Settings of the search for points."""
-
-    # Standard deviation of the path's heading in a single frame, for each round (degrees).
-    heading_sigma_deg: Annotated[tuple[float, ...], ABOVE_0] = (0.2, 0.15, 0.1, 0.1)
-    # Factor on the rows' standard deviations, which do not include the detector's errors at edges
-    # that are close together.
-    sigma_scale: Positive = 1.5
-    path_sigma_scale: Positive = 2.0  # the same factor for rows that correct the path
-    detected: Annotated[float, PROBABILITY] = 0.7  # probability that a vertical in view gives a row
-    gate_sigmas: Positive = 3.0  # a ray that passes farther from a point does not support it
-    # Least log likelihood ratio of the rows with a point to those without
-    least_score: Positive = 4.0
-    # Numbers of steps between frames whose rays are intersected.
-    gaps: Annotated[tuple[int, ...], whole(1)] = (2, 4, 7, 11)
-    least_parallax_sigmas: Positive = 4.0  # least angle between two rays that are intersected
-    farthest_m: Positive = 14.0  # intersections farther away are ignored
-    # Number of frames before and after an intersection that are scored
-    window_frames: Annotated[int, whole(1)] = 40
-    path_rows: Annotated[int, whole(1)] = 6  # points of fewer rows do not correct the path
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
+# Standard deviation of the path's heading in a single frame, for each round (degrees).
+_HEADING_SIGMA_DEG = (0.2, 0.15, 0.1, 0.1)
+# Factor on the rows' standard deviations, which do not include the detector's errors at edges that
+# are close together; the same for rows that correct the path.
+_SIGMA_SCALE, _PATH_SIGMA_SCALE = 1.5, 2.0
+# Points of fewer rows do not correct the path.
+_PATH_ROWS = 6
+# Numbers of steps between frames whose rays are intersected.
+_GAPS = np.array([2, 4, 7, 11])
+# Least angle between two rays that are intersected, in standard deviations, and how far away.
+_LEAST_PARALLAX_SIGMAS, _FARTHEST_M = 4.0, 14.0
 
 
 def lines_by_points(
@@ -273,9 +257,8 @@ def lines_by_points(
     path: FloatArray,
     circle_labels: IntArray,
     line_labels: IntArray,
-    settings: PointSettings | None = None,
     *,
-    camera_xy: tuple[float, float] = (0.0, 0.0),
+    camera_xy: ArrayLike = (0.0, 0.0),
     disc_sigma_scale: float = 1.0,
 ) -> tuple[IntArray, FloatArray]:
     """Labels of the rows of verticals, by the points in which they meet.
@@ -283,15 +266,14 @@ def lines_by_points(
     Takes `path` (N + 1, 3), `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,); returns
     `labels` (m,), `path` (N + 1, 3).
     """
-    setting = settings or PointSettings()
-    sigma = setting.path_sigma_scale * recording.lines.sigma_rad
+    sigma = _PATH_SIGMA_SCALE * recording.lines.sigma_rad
     scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
 
     def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
         """Least squares over poses, discs and points, again without the rows that are far off."""
         count = len(points)
         used = (labels >= 0) & (
-            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= setting.path_rows
+            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= _PATH_ROWS
         )
         for _ in range(3):
             solution = solve_path(
@@ -318,10 +300,10 @@ def lines_by_points(
         label_of = np.where(known, np.cumsum(known) - 1, -1)
         path = corrected(path, label_of[line_labels], places[known])
     labels = np.full(len(line_labels), -1, dtype=np.int64)
-    last = len(setting.heading_sigma_deg) - 1
-    for number, sigma_deg in enumerate(setting.heading_sigma_deg):
-        rays = rays_of(recording, path, camera_xy, setting.sigma_scale, np.radians(sigma_deg))
-        labels, points = find_points(rays, setting)
+    last = len(_HEADING_SIGMA_DEG) - 1
+    for number, sigma_deg in enumerate(_HEADING_SIGMA_DEG):
+        rays = rays_of(recording, path, camera_xy, _SIGMA_SCALE, np.radians(sigma_deg))
+        labels, points = find_points(rays)
         if number < last and len(points):
             path = corrected(path, labels, points)
     rest = labels < 0
@@ -333,7 +315,7 @@ def lines_by_points(
 def rays_of(
     recording: Recording,
     path: FloatArray,
-    camera_xy: tuple[float, float],
+    camera_xy: ArrayLike,
     sigma_scale: float,
     heading_sigma_rad: float,
 ) -> Rays:
@@ -358,24 +340,13 @@ def rays_of(
     )
 
 
-def find_points(rays: Rays, setting: PointSettings) -> tuple[IntArray, FloatArray]:
+def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
     """The points in which rays meet, the best first.
 
     Returns `labels` (n,), `points` (k, 2).
     """
-    points, frames = crossings(
-        rays,
-        np.array(setting.gaps, dtype=np.int64),
-        setting.least_parallax_sigmas,
-        setting.farthest_m,
-    )
-    search = Search(
-        setting.detected,
-        setting.gate_sigmas,
-        setting.window_frames,
-        setting.least_score,
-        float(rays.sigma.max(initial=0.0)),
-    )
+    points, frames = crossings(rays, _GAPS, _LEAST_PARALLAX_SIGMAS, _FARTHEST_M)
+    search = Search(widest_sigma=float(rays.sigma.max(initial=0.0)))
     taken, found = take_points(points, frames, rays, search)
     labels = np.empty(len(taken), dtype=np.int64)
     labels[rays.row] = taken

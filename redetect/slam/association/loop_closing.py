@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
@@ -27,7 +28,7 @@ from redetect.slam.association.loops import (
     shared_landmarks,
     sightings,
 )
-from redetect.slam.mapping.graph import Estimate, graph_of_recording
+from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
@@ -51,7 +52,7 @@ def intersect_bearings(
     path: FloatArray,
     labels: IntArray,
     *,
-    camera_xy: tuple[float, float] = (0.0, 0.0),
+    camera_xy: ArrayLike = (0.0, 0.0),
 ) -> FloatArray:
     """Places of lines from the bearings of all rows that saw them, the path being known.
 
@@ -73,7 +74,7 @@ def solve_path(
     path: FloatArray | None = None,
     line_xy: FloatArray | None = None,
     *,
-    camera_xy: tuple[float, float] = (0.0, 0.0),
+    camera_xy: ArrayLike = (0.0, 0.0),
     sigma_scale: float = 1.0,
     tolerance: float = 1e-4,
 ) -> LabelledMap:
@@ -89,20 +90,14 @@ def solve_path(
     if line_xy is not None:
         places[:] = line_xy
     known = np.isfinite(places[:, 0])
-    rows = np.flatnonzero(known[line_labels])
-    covariance = sigma_scale**2 * circles.covariance
-    labelled = replace(circles, ids=circle_labels, covariance=covariance)
-    graph = replace(
-        graph_of_recording(replace(recording, circles=labelled)),
-        line_ids=np.flatnonzero(known),
-        line_pose=lines.frame[rows] + 1,
-        bearing_rad=lines.bearing_rad[rows],
-        bearing_sigma_rad=lines.sigma_rad[rows],
-        member_row=np.arange(len(rows)),
-        member_line=(np.cumsum(known) - 1)[line_labels[rows]],
-        camera_xy=np.asarray(camera_xy, dtype=np.float64),
-        line_prior=places[known],
+    labelled = replace(
+        recording,
+        circles=replace(circles, ids=circle_labels, covariance=sigma_scale**2 * circles.covariance),
+        lines=replace(lines, ids=tuple((int(k),) for k in line_labels)),
     )
+    graph = with_lines(graph_of_recording(labelled), labelled.lines, np.flatnonzero(known))
+    camera = np.asarray(camera_xy, dtype=np.float64)
+    graph = replace(graph, camera_xy=camera, line_prior=places[known])
     seen = apply(poses[graph.disc_pose], graph.disc_xy)
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]

@@ -13,17 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_array
 from scipy.stats import binom
 
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.plane import apply, fitted, rotation
-from redetect.slam.errors import SlamError
-from redetect.storage.bounds import Limit, NotNegative, Positive, demand_fields, whole
 
 # Width of the cells in which the nearest landmark is looked up.
 _CELL_M = 0.05
@@ -31,7 +29,7 @@ _CELL_M = 0.05
 _NEIGHBOURS = 5
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def _nearest_by_cell(fixed: FloatArray, reach_m: float) -> tuple[float, float, IntArray]:
     """Low corner, and for every cell the landmark next to its centre, -1 with none in reach."""
     margin = reach_m + _CELL_M
@@ -55,7 +53,7 @@ def _nearest_by_cell(fixed: FloatArray, reach_m: float) -> tuple[float, float, I
     return low_x, low_y, nearest
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel()
 def best_motion(
     moved: FloatArray,
     fixed: FloatArray,
@@ -143,37 +141,34 @@ def best_motion(
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
 _GRID_M = 0.15
+#: Frames whose landmarks form a constellation, and from one constellation to the next.
+STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
+# By how much the lengths of two pairs of landmarks may differ to vote, and how long these have to
+# be (m).
+_LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
+#: Largest distance of landmarks that agree (m).
+REACH_M = 0.12
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 
 
-@dataclass(frozen=True)
-class LoopSettings:
-    """Settings of the search for loops."""
+class Search(NamedTuple):
+    """How constellations are compared, and which."""
 
-    stretch_frames: Annotated[int, whole(1)] = 50  # frames whose landmarks form a constellation
-    stride_frames: Annotated[int, whole(1)] = 10  # frames from one constellation to the next
-    # By how much the lengths of two pairs of landmarks may differ to vote.
-    length_tolerance_m: Positive = 0.08
-    least_length_m: NotNegative = 0.8  # pairs shorter than this do not vote
-    reach_m: Positive = 0.12  # largest distance of landmarks that agree
     # Largest motion that brings one constellation onto the other.
-    most_turn_rad: Limit = 0.8
-    most_shift_m: Limit = 8.0
+    most_turn_rad: float = 0.8
+    most_shift_m: float = 8.0
     # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: Annotated[int, whole(2)] = 7
+    least_agreeing: int = 7
     # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: Positive = 1e-3
+    false_alarms: float = 1e-3
     # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
     # `earlier_step`-th of these.
-    later_step: Annotated[int, whole(1)] = 1
-    earlier_step: Annotated[int, whole(1)] = 2
+    later_step: int = 1
+    earlier_step: int = 2
     # A stretch that shares landmarks with one at least this many frames earlier is part of the map
     # already and not matched again; 0 to match all.
-    attached_frames: Annotated[int, whole(0)] = 0
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
+    attached_frames: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +178,11 @@ class Stretch:
     middle_frame: int
     labels: IntArray  # (n,): ascending
     xy: FloatArray  # (n, 2): their places in the map (m)
+
+    def without(self, other: Stretch) -> Stretch:
+        """The landmarks that another stretch has not."""
+        own = ~np.isin(self.labels, other.labels)
+        return Stretch(self.middle_frame, self.labels[own], self.xy[own])
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,19 +200,25 @@ class Match:
 
 
 def stretches_of(
-    frames: IntArray, labels: IntArray, xy: FloatArray, count: int, settings: LoopSettings
+    frames: IntArray,
+    labels: IntArray,
+    xy: FloatArray,
+    count: int,
+    *,
+    stride: int = STRIDE_FRAMES,
+    least: int = Search().least_agreeing,
 ) -> list[Stretch]:
-    """The constellations along a run.
+    """The constellations of at least some landmarks along a run of `count` frames.
 
     Takes `frames, labels` (n,), `xy` (M, 2).
     """
     found = []
-    for start in range(0, max(count - settings.stretch_frames // 2, 1), settings.stride_frames):
-        first, last = np.searchsorted(frames, [start, start + settings.stretch_frames])
+    for start in range(0, max(count - STRETCH_FRAMES // 2, 1), stride):
+        first, last = np.searchsorted(frames, [start, start + STRETCH_FRAMES])
         seen = np.unique(labels[first:last])
         seen = seen[np.isfinite(xy[seen, 0])]
-        if len(seen) >= settings.least_agreeing:
-            middle = min(start + settings.stretch_frames // 2, count - 1)
+        if len(seen) >= least:
+            middle = min(start + STRETCH_FRAMES // 2, count - 1)
             found.append(Stretch(middle, seen, xy[seen]))
     return found
 
@@ -233,84 +239,76 @@ def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
 
 
 def find_matches(
-    stretches: list[Stretch], settings: LoopSettings, progress: Callable[[str], None] | None = None
+    stretches: list[Stretch], search: Search, progress: Callable[[str], None] | None = None
 ) -> list[Match]:
-    """All pairs of stretches that show one place more surely than by chance.
+    """All pairs of stretches that show one place more surely than by chance, the surest first.
 
     Landmarks that two stretches share already are left out; stretches that share three or more need
     no match.
     """
-    candidates: list[tuple[Stretch, Stretch, BoolArray, BoolArray, float, FloatArray]] = []
-    tried = 0
+    candidates: list[tuple[Stretch, Stretch, Motion]] = []
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
     extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in stretches])
     together = shared_landmarks(stretches)
-    for k, later in enumerate(stretches):
-        if k % settings.later_step:
-            continue
+    for k in range(0, len(stretches), search.later_step):
+        later = stretches[k]
         if progress:
             progress(f"stretch {k + 1} of {len(stretches)}")
         shared = together[[k], :k].toarray()[0]
         gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
-        apart = (gap >= settings.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
-        if settings.attached_frames and np.any(~apart & (gap >= settings.attached_frames)):
+        apart = (gap >= STRETCH_FRAMES) & (shared < SHARED_BY_ONE_PLACE)
+        if search.attached_frames and np.any(~apart & (gap >= search.attached_frames)):
             continue
         near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (
-            settings.most_shift_m + extents[:k] + extents[k]
+            search.most_shift_m + extents[:k] + extents[k]
         )
-        near[np.arange(k) % settings.earlier_step != 0] = False
+        near[np.arange(k) % search.earlier_step != 0] = False
         for i in np.flatnonzero(near & apart):
-            earlier = stretches[i]
-            fixed = ~np.isin(earlier.labels, later.labels)
-            moved = ~np.isin(later.labels, earlier.labels)
-            if min(fixed.sum(), moved.sum()) < settings.least_agreeing:
-                continue
-            turn, x, y, agreeing, hypotheses = motion_onto(
-                later.xy[moved], earlier.xy[fixed], settings
-            )
-            tried += hypotheses
-            if agreeing >= settings.least_agreeing:
-                candidates.append((earlier, later, fixed, moved, turn, np.array([x, y])))
-    matches = []
-    for earlier, later, fixed, moved, turn, offset in candidates:
-        match = _refined(earlier, later, fixed, moved, turn, offset, tried, settings)
-        if match is not None and match.log10_false_alarms <= np.log10(settings.false_alarms):
-            matches.append(match)
-    order = sorted(
-        range(len(matches)),
-        key=lambda n: (
-            matches[n].log10_false_alarms,
-            matches[n].later_frame,
-            matches[n].earlier_frame,
-        ),
+            fixed, moved = stretches[i].without(later), later.without(stretches[i])
+            if min(len(fixed.labels), len(moved.labels)) >= search.least_agreeing:
+                candidates.append((fixed, moved, motion_onto(moved.xy, fixed.xy, search)))
+    tried = sum(motion.tried for _, _, motion in candidates)
+    matches = [
+        _refined(earlier, later, motion.pose, tried, search)
+        for earlier, later, motion in candidates
+        if motion.agreeing >= search.least_agreeing
+    ]
+    return sorted(
+        (m for m in matches if m and m.log10_false_alarms <= np.log10(search.false_alarms)),
+        key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame),
     )
-    return [matches[n] for n in order]
 
 
-def motion_onto(
-    moved: FloatArray, fixed: FloatArray, settings: LoopSettings
-) -> tuple[float, float, float, int, int]:
-    """`best_motion` by settings: `turn_rad`, `shift_x, shift_y`, `agreeing`, `tried`."""
+class Motion(NamedTuple):
+    """A motion that lays landmarks on others."""
+
+    pose: FloatArray  # (3,)
+    agreeing: int  # landmarks that fall on others; 0 if too few do
+    tried: int  # motions that were tried
+
+
+def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
+    """The motion under which most landmarks (n, 2) fall on those of another constellation."""
     turn, x, y, agreeing, _, tried = best_motion(
-        moved, fixed, settings.length_tolerance_m, settings.least_length_m, settings.reach_m,
-        settings.most_turn_rad, settings.most_shift_m, settings.least_agreeing,
+        moved, fixed, _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M, REACH_M,
+        search.most_turn_rad, search.most_shift_m, search.least_agreeing,
     )  # fmt: skip
-    return turn, x, y, agreeing, tried
+    centre = moved.mean(axis=0)
+    pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
+    return Motion(pose, agreeing, tried)
 
 
 def settled(
-    place: FloatArray, target: FloatArray, turn: float, offset: FloatArray, settings: LoopSettings
+    place: FloatArray, target: FloatArray, pose: FloatArray, least_agreeing: int
 ) -> tuple[FloatArray, IntArray] | None:
     """The pose that lays landmarks on those they agree with, by least squares, and which these are.
 
-    From a turn about the landmarks' middle and an offset of that; None if too few agree. Pairs are
-    (k, 2), as of `mutual_pairs`: first the target's.
+    From a pose nearby; None if too few agree. Pairs are (k, 2), as of `mutual_pairs`: first the
+    target's.
     """
-    centre = place.mean(axis=0)
-    pose = np.array([*(centre + offset - rotation(turn) @ centre), turn])
     for _ in range(5):
-        pairs = mutual_pairs(target, apply(pose, place), settings.reach_m)
-        if len(pairs) < settings.least_agreeing:
+        pairs = mutual_pairs(target, apply(pose, place), REACH_M)
+        if len(pairs) < least_agreeing:
             return None
         pose = fitted(place[pairs[:, 1]], target[pairs[:, 0]])
     return pose, pairs
@@ -340,32 +338,28 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
     return float(np.log10(max(tried, 1)) + tail / np.log(10.0))
 
 
+def chance_of_agreeing(xy: FloatArray) -> float:
+    """Probability that a landmark anywhere falls on one of (n, 2) landmarks by chance."""
+    return float(len(xy) * np.pi * REACH_M**2 / covered_area(xy))
+
+
 def _refined(
-    earlier: Stretch,
-    later: Stretch,
-    fixed: BoolArray,
-    moved: BoolArray,
-    turn: float,
-    offset: FloatArray,
-    tried: int,
-    settings: LoopSettings,
+    earlier: Stretch, later: Stretch, pose: FloatArray, tried: int, search: Search
 ) -> Match | None:
     """Match by least squares over all landmarks that agree; None if too few agree then."""
-    place, target = later.xy[moved], earlier.xy[fixed]
-    found = settled(place, target, turn, offset, settings)
+    found = settled(later.xy, earlier.xy, pose, search.least_agreeing)
     if found is None:
         return None
     pose, pairs = found
-    after = apply(pose, place)
-    nearest = np.linalg.norm(after[:, None] - target[None], axis=2).min(axis=1)
+    after = apply(pose, later.xy)
+    nearest = np.linalg.norm(after[:, None] - earlier.xy[None], axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
-    chance = len(target) * np.pi * settings.reach_m**2 / covered_area(target)
     return Match(
         earlier.middle_frame,
         later.middle_frame,
-        np.stack([earlier.labels[fixed][pairs[:, 0]], later.labels[moved][pairs[:, 1]]], axis=1),
+        np.stack([earlier.labels[pairs[:, 0]], later.labels[pairs[:, 1]]], axis=1),
         pose,
-        log10_false_alarms(len(pairs), present, chance, tried),
+        log10_false_alarms(len(pairs), present, chance_of_agreeing(earlier.xy), tried),
     )
 
 

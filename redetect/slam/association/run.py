@@ -9,31 +9,32 @@ distortion. Verticals, which the local association often confuses, are then asso
 the path that the discs give (`redetect.slam.association.line_points`).
 
 Several runs are one with steps of which nothing is known (`redetect.slam.recording.joined`). Loops
-are closed in each, their maps laid on each other (`redetect.slam.association.joining`), and loops
+are closed in each, their maps laid on each other (`redetect.slam.association.placing`), and loops
 closed again in the whole.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import compose, rotation
 from redetect.slam.association.frame_to_frame import (
+    AssociateSettings,
     LocalAssociation,
-    LocalSettings,
     associate_locally,
     tilt_jacobian,
 )
-from redetect.slam.association.joining import lay_together
-from redetect.slam.association.line_points import PointSettings, lines_by_points
+from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
     closed_path,
     consistent_matches,
@@ -45,17 +46,18 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.loops import (
-    LoopSettings,
+    REACH_M,
+    STRETCH_FRAMES,
     Match,
+    Search,
     Stretch,
     find_matches,
     stretches_of,
 )
-from redetect.slam.association.waking import ANYWHERE
+from redetect.slam.association.placing import ANYWHERE, lay_together
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import LineRows, Recording
-from redetect.storage.bounds import PROBABILITY, demand_fields, whole
 
 Progress = Callable[[str], None]
 
@@ -63,29 +65,12 @@ Progress = Callable[[str], None]
 _SAME_PLACE = 0.999
 # Edges of one door frame may be 0.1 m apart.
 _LINE_REACH_M = 0.05
-# Longer than a landmark is in view or waited for by the local map.
-_ATTACHED_FRAMES = 200
 # Covariance of a step that leads nowhere (m^2, rad^2).
 _HARDLY_ANY = 1e-6 * np.eye(3)
-
-
-@dataclass(frozen=True)
-class AssociateSettings:
-    """How a run is associated."""
-
-    local: LocalSettings = field(default_factory=LocalSettings)  # from frame to frame
-    map_level: bool = True  # whether loops are detected
-    loops: LoopSettings = field(default_factory=LoopSettings)  # of the first round
-    # How verticals are then associated along the path that the discs give.
-    points: PointSettings = field(default_factory=PointSettings)
-    most_rounds: Annotated[int, whole(1)] = 6
-    # Share of a disc's right rows that keep its label at the end, by their covariances as stated;
-    # those farther from its place in the map lose it.
-    kept_probability: Annotated[float, PROBABILITY] = 0.99
-    fewest_rows: Annotated[int, whole(1)] = 3  # a disc of fewer such rows is taken for clutter
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
+# Rounds of closing loops at most.
+_MOST_ROUNDS = 6
+# Frames are attached that are farther apart than a landmark is in view or waited for locally.
+_EVERYWHERE = Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +92,7 @@ def associate_run(
     recording: Recording,
     settings: AssociateSettings | None = None,
     *,
-    camera_xy: tuple[float, float] = (0.0, 0.0),
+    camera_xy: ArrayLike = (0.0, 0.0),
     progress: Progress | None = None,
 ) -> RunAssociation:
     """Find which rows show the same landmark, ignoring IDs in the file.
@@ -128,7 +113,7 @@ def associate_run(
     """
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)
-    local = _associated_locally(recording, setting.local, camera_xy, report)
+    local = _associated_locally(recording, setting, camera_xy, report)
     circle_labels, line_labels = local.circle_labels, local.line_labels
     matches: tuple[Match, ...] = ()
     path = None
@@ -152,9 +137,8 @@ def associate_run(
                     path,
                     labels,
                     line_labels,
-                    setting.points,
                     camera_xy=camera_xy,
-                    disc_sigma_scale=setting.local.sigma_scale,
+                    disc_sigma_scale=setting.sigma_scale,
                 )
                 line_labels = _merged_lines(
                     recording, path_of_both, line_labels, setting, camera_xy
@@ -173,7 +157,7 @@ def associate_run(
 
 
 def _associated_locally(
-    recording: Recording, setting: LocalSettings, camera_xy: tuple[float, float], report: Progress
+    recording: Recording, setting: AssociateSettings, camera_xy: ArrayLike, report: Progress
 ) -> LocalAssociation:
     """Labels from frame to frame; of a run with discs and lines, discs are associated alone."""
     both = len(recording.circles) > 0 and len(recording.lines) > 0
@@ -204,7 +188,7 @@ def _closed_by_parts(
     recording: Recording,
     labels: IntArray,
     setting: AssociateSettings,
-    camera_xy: tuple[float, float],
+    camera_xy: ArrayLike,
     report: Progress,
 ) -> _Closed:
     """Loops closed in each part between which odometry is lost, and then in the whole.
@@ -215,10 +199,6 @@ def _closed_by_parts(
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
     stretches: list[list[Stretch]] = []
-    loops = setting.loops
-    apart = replace(
-        loops, stride_frames=loops.stretch_frames, least_agreeing=ANYWHERE.least_agreeing
-    )
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # it begins with its own start, not with the end of the part before
@@ -228,7 +208,11 @@ def _closed_by_parts(
         closed = _closed(part, in_order(labels[rows]), setting, camera_xy, report)
         parts.append(closed)
         stretches.append(
-            stretches_of(_frames_of_labels(part), closed.labels, closed.xy, len(part), apart)
+            stretches_of(
+                *(_frames_of_labels(part), closed.labels, closed.xy, len(part)),
+                stride=STRETCH_FRAMES,
+                least=ANYWHERE.least_agreeing,
+            )
         )
     if len(parts) == 1:
         return parts[0]
@@ -253,26 +237,18 @@ def _closed(
     recording: Recording,
     labels: IntArray,
     setting: AssociateSettings,
-    camera_xy: tuple[float, float],
+    camera_xy: ArrayLike,
     report: Progress,
     path: FloatArray | None = None,
 ) -> _Closed:
     """All loops closed, from a path (by default odometry) on."""
     by_discs = len(recording.circles) > 0
     frames = _frames_of_labels(recording)
-    swayed, loops = _swayed(recording, setting.local), setting.loops
+    swayed, search = _swayed(recording, setting), Search()
     none = np.zeros(0, dtype=np.int64)
-    everywhere = replace(
-        loops,
-        most_turn_rad=np.pi,
-        most_shift_m=np.inf,
-        later_step=2,
-        earlier_step=3,
-        attached_frames=_ATTACHED_FRAMES,
-    )
     if path is not None:  # most of it is in its place already
-        loops = replace(
-            everywhere, most_turn_rad=loops.most_turn_rad, most_shift_m=loops.most_shift_m
+        search = _EVERYWHERE._replace(
+            most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
         )
 
     def solved(path: FloatArray | None) -> tuple[FloatArray, FloatArray]:
@@ -288,16 +264,16 @@ def _closed(
             path,
             line_xy,
             camera_xy=camera_xy,
-            sigma_scale=setting.local.sigma_scale,
+            sigma_scale=setting.sigma_scale,
         )
         return found.path, found.circle_xy if by_discs else found.line_xy
 
     path, xy = solved(path)
     matches: list[Match] = []
-    for number in range(1, setting.most_rounds + 1):
-        stretches = stretches_of(frames, labels, xy, len(recording), loops)
+    for number in range(1, _MOST_ROUNDS + 1):
+        stretches = stretches_of(frames, labels, xy, len(recording))
         found = consistent_matches(
-            find_matches(stretches, loops, partial(_of_round, report, number)),
+            find_matches(stretches, search, partial(_of_round, report, number)),
             matches,
             path,
             recording.step_covariance,
@@ -306,18 +282,18 @@ def _closed(
             frames, labels, pairs_by_votes(match.pairs for match in found)
         )
         path, xy = solved(closed_path(path, found, recording.lost) if found else path)
-        stretches = stretches_of(frames, labels, xy, len(recording), loops)
-        spread = _isotropic(len(xy), loops.reach_m)
+        stretches = stretches_of(frames, labels, xy, len(recording))
+        spread = _isotropic(len(xy), REACH_M)
         if by_discs:
-            spread = _spread(swayed, path, labels, setting.local.sigma_scale)
+            spread = _spread(swayed, path, labels, setting.sigma_scale)
         pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
         labels, in_place = merge_labels(frames, labels, pairs)
         if in_place:
             path, xy = solved(path)
         matches += found
-        if matched + in_place == 0 and loops == everywhere:
+        if matched + in_place == 0 and search == _EVERYWHERE:
             break
-        loops = everywhere
+        search = _EVERYWHERE
     return _Closed(labels, path, xy, tuple(matches))
 
 
@@ -334,11 +310,11 @@ def _without_lines(recording: Recording) -> Recording:
     return replace(recording, lines=LineRows.of())
 
 
-def _swayed(recording: Recording, setting: LocalSettings) -> Recording:
+def _swayed(recording: Recording, setting: AssociateSettings) -> Recording:
     """The run with the robot's sway in its discs' covariances."""
     if setting.tilt_sigma_rad == 0.0:
         return recording
-    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy, setting.camera_height_m)
+    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy)
     covariance = recording.circles.covariance + moving @ moving.swapaxes(1, 2)
     return replace(recording, circles=replace(recording.circles, covariance=covariance))
 
@@ -392,14 +368,14 @@ def _merged_lines(
     path: FloatArray,
     labels: IntArray,
     setting: AssociateSettings,
-    camera_xy: tuple[float, float],
+    camera_xy: ArrayLike,
 ) -> IntArray:
     """Labels of lines, those at the same position in the map merged, -1 for clutter."""
     if len(labels) == 0:
         return labels
-    for _ in range(setting.most_rounds):
+    for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
-        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording), setting.loops)
+        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording))
         pairs = pairs_in_place(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:

@@ -43,67 +43,44 @@ def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> Assoc
 
     Takes `labels` (n,).
     """
-    known = [k for k, listed in enumerate(ids) if listed]
-    names = {name: k for k, name in enumerate(sorted({i for k in known for i in ids[k]}))}
+    known = np.array([len(listed) > 0 for listed in ids], dtype=np.bool_)
     given = np.asarray(labels, dtype=np.int64)[known]
     unlabelled = given < 0
     given = np.where(unlabelled, given.max(initial=0) + 1 + np.arange(len(given)), given)
-    _, label = np.unique(given, return_inverse=True)
-    row = np.array([n for n, k in enumerate(known) for _ in ids[k]], dtype=np.int64)
-    column = np.array([names[i] for k in known for i in ids[k]], dtype=np.int64)
-    count = len(known)
-    found = int(label.max()) + 1 if count else 0
+    found, label = np.unique(given, return_inverse=True)
+    # Rows with the same IDs are counted together: pairs of rows are too many in long runs.
+    sets = [frozenset(listed) for listed in ids if listed]
+    kinds = {some: k for k, some in enumerate(dict.fromkeys(sets))}
+    kind = np.array([kinds[some] for some in sets], dtype=np.int64)
+    names = sorted(frozenset().union(*kinds))
+    shows = np.array([[name in some for name in names] for some in kinds], dtype=np.int64)
+    shows = shows.reshape(len(kinds), len(names))
+    one = np.ones(len(sets), dtype=np.int64)
+    cells = csr_array((one, (kind, label)), shape=(len(kinds), len(found)))
 
-    listed = csr_array((np.ones(len(row)), (row, column)), shape=(count, len(names)))
-    labelled = csr_array((np.ones(count), (np.arange(count), label)), shape=(count, found))
-    of_landmark, of_label, right = _pairs(ids, known, label, found)
-
-    # What each row counts as: the ID of its own that most rows of its label have.
-    votes = np.asarray((labelled.T @ listed).todense()).reshape(found, len(names))
-    chosen = np.zeros(count, dtype=np.int64)
-    for n, k in enumerate(known):
-        own = sorted(names[i] for i in ids[k])
-        chosen[n] = own[int(np.argmax(votes[label[n], own]))]
-    cells = np.zeros((found, len(names)), dtype=np.int64)
-    np.add.at(cells, (label[~unlabelled], chosen[~unlabelled]), 1)
-    matched = linear_sum_assignment(cells, maximize=True)
-    return AssociationScore(
-        rows=count,
-        unlabelled_rows=int(np.count_nonzero(unlabelled)),
-        true_landmarks=len(set(chosen.tolist())),
-        found_landmarks=found - int(np.count_nonzero(unlabelled)),
-        pair_precision=right / of_label if of_label else 1.0,
-        pair_recall=right / of_landmark if of_landmark else 1.0,
-        right_rows=float(cells[matched].sum() / count) if count else 1.0,
-        wrong_merges=int(np.sum(np.maximum(np.count_nonzero(cells, axis=1) - 1, 0))),
-        splits=int(np.sum(np.maximum(np.count_nonzero(cells, axis=0) - 1, 0))),
-    )
-
-
-def _pairs(
-    ids: Sequence[tuple[int, ...]], known: list[int], label: IntArray, found: int
-) -> tuple[int, int, int]:
-    """Pairs of rows that show one landmark, that have one label, and both.
-
-    Rows with the same IDs are counted together: pairs of rows themselves are too many in long runs.
-    """
-    kinds: dict[frozenset[int], int] = {}
-    kind = np.array(
-        [kinds.setdefault(frozenset(ids[k]), len(kinds)) for k in known], dtype=np.int64
-    )
-    names = {name: k for k, name in enumerate(sorted({i for some in kinds for i in some}))}
-    row = np.array([n for n, some in enumerate(kinds) for _ in some], dtype=np.int64)
-    column = np.array([names[i] for some in kinds for i in some], dtype=np.int64)
-    listed = csr_array(
-        (np.ones(len(row), dtype=np.int64), (row, column)), shape=(len(kinds), len(names))
-    )
-    alike = ((listed @ listed.T) > 0).astype(np.int64)
-    cells = csr_array(
-        (np.ones(len(kind), dtype=np.int64), (kind, label)), shape=(len(kinds), found)
-    )
-    rows = np.bincount(kind, minlength=len(kinds))
-    of_label = np.bincount(label, minlength=found)
+    alike = (csr_array(shows) @ csr_array(shows.T) > 0).astype(np.int64)
+    rows, of_label = np.bincount(kind), np.bincount(label)
     totals = rows @ (alike @ rows), of_label @ of_label, (alike @ cells).multiply(cells).sum()
     # Each pair was counted twice, and each row with itself.
-    of_landmark, of_one_label, of_both = ((int(total) - len(known)) // 2 for total in totals)
-    return of_landmark, of_one_label, of_both
+    same_landmark, same_label, both = ((int(total) - len(sets)) // 2 for total in totals)
+
+    # A row counts as the one of its IDs that most rows of its label have.
+    votes = cells.T @ shows
+    counted = cells.tocoo()
+    of_kind, of_found = counted.row, counted.col
+    chosen = np.where(shows[of_kind] > 0, votes[of_found], -1).argmax(axis=1) if names else of_kind
+    table = np.zeros((len(found), len(names)), dtype=np.int64)
+    np.add.at(table, (of_found, chosen), counted.data)
+    table[label[unlabelled]] = 0
+    matched = linear_sum_assignment(table, maximize=True)
+    return AssociationScore(
+        rows=len(sets),
+        unlabelled_rows=int(np.count_nonzero(unlabelled)),
+        true_landmarks=len(np.unique(chosen)),
+        found_landmarks=len(found) - int(np.count_nonzero(unlabelled)),
+        pair_precision=both / same_label if same_label else 1.0,
+        pair_recall=both / same_landmark if same_landmark else 1.0,
+        right_rows=float(table[matched].sum() / len(sets)) if len(sets) else 1.0,
+        wrong_merges=int(np.sum(np.maximum(np.count_nonzero(table, axis=1) - 1, 0))),
+        splits=int(np.sum(np.maximum(np.count_nonzero(table, axis=0) - 1, 0))),
+    )

@@ -15,13 +15,13 @@ import numpy as np
 from redetect import slam
 from redetect.array_types import IntArray
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
-from redetect.slam.association.frame_to_frame import LocalSettings
-from redetect.slam.association.run import AssociateSettings, RunAssociation, associate_run
+from redetect.slam.association.frame_to_frame import AssociateSettings
+from redetect.slam.association.run import RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
 from redetect.slam.commands.files import (
     camera_xy_of,
     demand_free,
-    landmark_files,
+    files_of,
     recordings_of,
     write_json,
 )
@@ -45,17 +45,15 @@ def perform(options: Associate) -> int:
         seed=whole(0),
     )
     settings = AssociateSettings(
-        local=LocalSettings(
-            method=options.method,
-            gate_probability=options.gate_probability,
-            sigma_scale=options.sigma_scale,
-            tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
-        ),
+        method=options.method,
+        gate_probability=options.gate_probability,
+        sigma_scale=options.sigma_scale,
+        tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
         map_level=options.map_level,
         kept_probability=options.kept_probability,
         fewest_rows=options.fewest_rows,
     )
-    sources = [(k, f) for k, run in enumerate(options.runs) for f in landmark_files(options, run)]
+    sources = [(k, f) for k, run in enumerate(options.runs) for f in files_of(options, run)]
     targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
@@ -63,8 +61,7 @@ def perform(options: Associate) -> int:
     demand_free([*targets, report], overwrite=options.force)
     runs = recordings_of(options)
     recording = joined(runs)
-    centre = camera_xy_of(recording, options.run, options.camera)
-    camera_xy = (float(centre[0]), float(centre[1]))
+    camera_xy = camera_xy_of(recording, options.run, options.camera)
 
     tries: list[dict[str, Any]] = []
     for factor in (0.0, *options.noise):

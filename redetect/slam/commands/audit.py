@@ -19,7 +19,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
-from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_file
+from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_files
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
@@ -34,9 +34,7 @@ _WORD = re.compile(rb"\S+")
 def perform(options: Options) -> int:
     """Carry the command out; returns the exit code."""
     demand(options, SlamError, gate=ABOVE_0)
-    source = options.run
-    if source.is_dir():
-        source = landmark_file(source, ".circles", options.stem)
+    (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")
     demand_free((target, target.with_suffix(".csv")), overwrite=options.force)
     recording = recording_of(options)

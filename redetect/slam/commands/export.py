@@ -18,7 +18,7 @@ from redetect.landmarks.map_file import (
     write_path,
     write_table,
 )
-from redetect.slam.commands.files import demand_free, print_assumed, read_run_of, recording_of
+from redetect.slam.commands.files import camera_xy_of, demand_free, print_assumed, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import data_sets
 from redetect.slam.formats.g2o import (
@@ -26,9 +26,9 @@ from redetect.slam.formats.g2o import (
     frames_of_graph,
     graph_of_frames,
     poses_of_run,
+    read_g2o,
     write_g2o,
 )
-from redetect.slam.formats.g2o_reading import read_g2o
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.text import (
     MEANING,
@@ -39,7 +39,7 @@ from redetect.slam.formats.text import (
 )
 from redetect.slam.formats.tum import read_times, read_tum, write_tum
 from redetect.slam.options import Export, Import
-from redetect.slam.recording import demand_landmarks, landmark_file
+from redetect.slam.recording import landmark_files
 from redetect.storage.bounds import ABOVE_0, demand
 
 _LANDMARKS = (".circles", ".lines", ".markers")
@@ -60,11 +60,7 @@ def perform(command: Export | Import) -> int:
 def _export_g2o(command: Export) -> int:
     if command.lines:
         raise SlamError("bearings of verticals have no edge in g2o: expected --to csv for --lines")
-    file = command.run
-    if file.is_dir():
-        file = landmark_file(file, ".circles", command.stem)
-    else:
-        demand_landmarks(file)
+    (file,) = landmark_files(command.run, stem=command.stem)
     frames = list(read_frames(file))
     graph = graph_of_frames(frames, str(file), command.solution, command.odometry_noise)
     print_assumed(graph.unstated_steps, len(graph.steps), command.odometry_noise)
@@ -121,13 +117,14 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
 
 
 def _export_tables(command: Export) -> int:
-    recording, camera_xy = read_run_of(command)
+    recording = recording_of(command)
     axes, folder, force = command.axes, command.output, command.force
     tables = {
         "odometry.csv": odometry_table(recording, axes),
         "discs.csv": disc_table(recording, axes),
     }
     if len(recording.lines):
+        camera_xy = camera_xy_of(recording, command.run, command.camera)
         tables["bearings.csv"] = bearing_table(recording, camera_xy, axes)
     solution = ("path.csv", "map.csv") if command.solution is not None else ()
     demand_free([folder / name for name in (*tables, *solution)], overwrite=force)

@@ -17,25 +17,22 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import RunFlags
-from redetect.slam.recording import (
-    Recording,
-    demand_landmarks,
-    joined,
-    landmark_file,
-    read_recording,
-)
+from redetect.slam.recording import Recording, landmark_files, read_recording
 from redetect.storage import OutputExistsError, write_whole
+
+
+def files_of(flags: RunFlags, run: Path) -> list[Path]:
+    """The landmark files of a run, of the kinds that a command names."""
+    circles = flags.circles or not flags.lines
+    return landmark_files(run, circles=circles, lines=flags.lines, stem=flags.stem)
 
 
 def recordings_of(flags: RunFlags) -> list[Recording]:
     """Read the rows of the runs that a command names; assumptions on their odometry are printed."""
+    circles = flags.circles or not flags.lines
     recordings = [
         read_recording(
-            run,
-            circles=flags.circles or not flags.lines,
-            lines=flags.lines,
-            stem=flags.stem,
-            noise=flags.odometry_noise,
+            run, circles=circles, lines=flags.lines, stem=flags.stem, noise=flags.odometry_noise
         )
         for run in flags.runs
     ]
@@ -45,8 +42,9 @@ def recordings_of(flags: RunFlags) -> list[Recording]:
 
 
 def recording_of(flags: RunFlags) -> Recording:
-    """`recordings_of` the runs that a command names, as one."""
-    return joined(recordings_of(flags))
+    """`recordings_of` the one run that a command names."""
+    (recording,) = recordings_of(flags)
+    return recording
 
 
 def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
@@ -81,15 +79,6 @@ def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
     return read_camera(own if own in found else found[0])
 
 
-def read_run_of(flags: RunFlags) -> tuple[Recording, FloatArray]:
-    """Rows of the run that a command names, and where its camera is.
-
-    Returns `recording`, `camera_xy` (2,).
-    """
-    recording = recording_of(flags)
-    return recording, camera_xy_of(recording, flags.run, flags.camera)
-
-
 def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
     """(2,) the camera's centre in the robot frame (m); zero where no line needs it."""
     if not len(recording.lines):
@@ -101,14 +90,6 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
 def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
-
-
-def landmark_files(flags: RunFlags, run: Path) -> list[Path]:
-    """The landmark files of a run, of the kinds that a command names."""
-    if not run.is_dir():
-        return [demand_landmarks(run)]
-    kinds = (".circles", flags.circles or not flags.lines), (".lines", flags.lines)
-    return [landmark_file(run, suffix, flags.stem) for suffix, wanted in kinds if wanted]
 
 
 MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"

@@ -24,7 +24,7 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.slam.association.waking import wake_up
+from redetect.slam.association.placing import wake_up
 from redetect.slam.commands.files import (
     MAP_NAME,
     MAP_PICTURE,

@@ -55,10 +55,13 @@ class WaitingLines:
     ----------
     slots : dict of int to int
         Where in the state the pose of a frame is kept.
+    free_slots : list of int
+        Where poses were kept that no view needs any more.
     """
 
     def __init__(self) -> None:
         self.slots: dict[int, int] = {}
+        self.free_slots: list[int] = []
         self._views: dict[int, list[View]] = {}
         self._tried_rad: dict[int, float] = {}
 
@@ -78,26 +81,20 @@ class WaitingLines:
         self._views.setdefault(number, []).append(view)
 
     def take(self, number: int) -> None:
-        """Forget a line: it joined the state."""
+        """Forget a line: it joined the state, or is given up."""
         self._views.pop(number, None)
         self._tried_rad.pop(number, None)
 
-    def forget_absent(self, frame: int) -> int:
-        """Forget lines that are out of sight for long; returns how many views were dropped."""
-        absent = [
-            number
+    def forget(self, frame: int | None = None) -> int:
+        """Forget lines that are out of sight for long, or all; returns how many views they had."""
+        absent = {
+            number: len(views)
             for number, views in self._views.items()
-            if frame - views[-1].frame > LONGEST_ABSENCE_FRAMES
-        ]
+            if frame is None or frame - views[-1].frame > LONGEST_ABSENCE_FRAMES
+        }
         for number in absent:
-            self._tried_rad.pop(number, None)
-        return sum(len(self._views.pop(number)) for number in absent)
-
-    def forget_all(self) -> int:
-        """Forget all lines; returns how many views were dropped."""
-        given_up = sum(map(len, self._views.values()))
-        self._views.clear()
-        return given_up
+            self.take(number)
+        return sum(absent.values())
 
     def thin(self) -> int:
         """Drop every other pose if there are too many; returns how many views were dropped, too."""
@@ -112,11 +109,11 @@ class WaitingLines:
         self._views = {number: views for number, views in kept.items() if views}
         return before - sum(map(len, self._views.values()))
 
-    def release(self) -> list[int]:
-        """Slots of poses that no view needs any more; they may be used for others."""
+    def release(self) -> None:
+        """Let go of the poses that no view needs any more."""
         needed = {view.frame for views in self._views.values() for view in views}
-        free = [frame for frame in self.slots if frame not in needed]
-        return [self.slots.pop(frame) for frame in free]
+        for frame in [frame for frame in self.slots if frame not in needed]:
+            self.free_slots.append(self.slots.pop(frame))
 
 
 @dataclass(frozen=True, eq=False)

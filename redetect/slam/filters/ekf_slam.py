@@ -88,7 +88,6 @@ class EkfSlam:
         # The same array unless Jacobians are evaluated elsewhere.
         self._linearised = self._state.copy() if jacobians == "first" else self._state
         self._waiting = WaitingLines()
-        self._free_slots: list[int] = []
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -153,7 +152,7 @@ class EkfSlam:
 
     def finish(self) -> None:
         """The run is over: lines that were not initialised are dropped."""
-        self._give_up(self._waiting.forget_all())
+        self._give_up(self._waiting.forget())
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks that are in the state, with their marginal covariances."""
@@ -198,7 +197,7 @@ class EkfSlam:
     def _view_lines(self, rows: FrameRows, single: list[int]) -> None:
         """Lines that are not in the state yet: they join it, or wait."""
         waiting, reasons = self._waiting, self.count.left_out
-        given_up = waiting.forget_absent(self.frame)
+        given_up = waiting.forget(self.frame)
         kept = False
         for k in single:
             number = rows.line_ids[k][0]
@@ -219,7 +218,7 @@ class EkfSlam:
         """Count views that are not used, and let go of the poses that none needs any more."""
         if views:
             self.count.left_out["line without parallax"] += views
-        self._free_slots.extend(self._waiting.release())
+        self._waiting.release()
 
     def _start_line(self, number: int, views: list[View]) -> bool:
         """Add a line by all its views, the last from the present pose, if that places it well."""
@@ -259,9 +258,9 @@ class EkfSlam:
         """Put a copy of the pose into the state; returns where."""
         copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
         pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
-        if not self._free_slots:
+        if not self._waiting.free_slots:
             return self._append(_POSE, copy, none, pose, at)
-        slot = self._free_slots.pop()
+        slot = self._waiting.free_slots.pop()
         self.covariance.replace(slot, _POSE, copy, none)
         self._linearised[slot : slot + POSE_SIZE] = at
         self._state[slot : slot + POSE_SIZE] = pose

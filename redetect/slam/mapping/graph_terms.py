@@ -22,8 +22,6 @@ from redetect.slam.models import (
     disc_jacobians,
 )
 from redetect.slam.mounting import (
-    RecordedJacobians,
-    directions_of_rows,
     nominal_mounting,
     rows_as_recorded,
     rows_through_mounting,
@@ -99,7 +97,7 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
         tilt = estimate.tilt[1:] / weighting.tilt_sigma_rad
     return Errors(
         odometry=_apply(graph.step_whitening, step),
-        discs=_apply(graph.disc_whitening, _disc_errors(graph, estimate, weighting)),
+        discs=_apply(graph.disc_whitening, _disc_rows(graph, estimate, weighting)[0]),
         lines=_bearing_errors(graph, estimate),
         tilt=tilt,
         prior=np.zeros((0, 2)) if near is None else (estimate.line_xy - near) / LINE_PRIOR_M,
@@ -131,7 +129,9 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     loss = Loss(weighting.loss, weighting.loss_scale)
     by_first, by_second = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     step = 3 * np.arange(len(graph.steps), dtype=np.int64)
-    by_pose, by_tilt, by_disc, by_mounting = _disc_derivatives(graph, estimate, weighting)
+    by_pose, by_tilt, by_disc, by_mounting = (
+        graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
+    )
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
     tilted, lines = weighting.tilt_sigma_rad > 0.0, len(graph.line_ids)
@@ -158,52 +158,28 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", matrices, vectors))
 
 
-def _disc_errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
-    """(n, 2) discs as rows would have them, less the rows (m)."""
-    if estimate.mounting is None and estimate.tilt is None:
-        return _seen_discs(graph, estimate) - graph.disc_xy
-    assert graph.camera is not None
-    if estimate.mounting is not None and weighting.row_errors == "corrected":
-        directions = directions_of_rows(graph.camera, graph.disc_xy)
-        rows, _ = rows_through_mounting(graph.camera, directions, estimate.mounting)
-        return _seen_discs(graph, estimate) - rows
-    return _as_recorded(graph, estimate)[0] - graph.disc_xy
+def _disc_rows(
+    graph: Graph, estimate: Estimate, weighting: Weighting
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """(n, 2) discs as rows would have them, less the rows (m).
 
-
-def _as_recorded(graph: Graph, estimate: Estimate) -> tuple[FloatArray, RecordedJacobians]:
+    And its derivatives (n, 2, k) by pose, tilt, disc and mounting.
+    """
+    pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
+    seen, (by_pose, by_disc) = disc_in_robot(pose, disc), disc_jacobians(pose, disc)
+    none = np.zeros((len(seen), 2, 0))
+    mounting, tilt = estimate.mounting, estimate.tilt
+    if mounting is None and tilt is None:
+        return seen - graph.disc_xy, by_pose, none, by_disc, none
     assert graph.camera is not None
-    tilt = np.zeros((len(estimate.poses), 2)) if estimate.tilt is None else estimate.tilt
-    mounting = estimate.mounting
+    if mounting is not None and weighting.row_errors == "corrected":
+        rows, moves = rows_through_mounting(graph.camera, graph.disc_xy, mounting)
+        return seen - rows, by_pose, none, by_disc, -moves
     if mounting is None:
         mounting = nominal_mounting(graph.camera)
-    return rows_as_recorded(
-        graph.camera, _seen_discs(graph, estimate), mounting, tilt[graph.disc_pose]
-    )
-
-
-def _seen_discs(graph: Graph, estimate: Estimate) -> FloatArray:
-    return disc_in_robot(estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index])
-
-
-def _disc_derivatives(
-    graph: Graph, estimate: Estimate, weighting: Weighting
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Derivatives of whitened disc errors by pose, tilt, disc and mounting."""
-    whiten = graph.disc_whitening
-    by_pose, by_disc = disc_jacobians(
-        estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
-    )
-    none = np.zeros((len(whiten), 2, 0))
-    if estimate.mounting is None and estimate.tilt is None:
-        return whiten @ by_pose, none, whiten @ by_disc, none
-    assert graph.camera is not None
-    if estimate.mounting is not None and weighting.row_errors == "corrected":
-        directions = directions_of_rows(graph.camera, graph.disc_xy)
-        _, moves = rows_through_mounting(graph.camera, directions, estimate.mounting)
-        return whiten @ by_pose, none, whiten @ by_disc, -whiten @ moves
-    _, by = _as_recorded(graph, estimate)
-    by_floor = whiten @ by.floor
-    return by_floor @ by_pose, whiten @ by.tilt, by_floor @ by_disc, whiten @ by.mounting
+    tilted = np.zeros((len(seen), 2)) if tilt is None else tilt[graph.disc_pose]
+    rows, by = rows_as_recorded(graph.camera, seen, mounting, tilted)
+    return rows - graph.disc_xy, by.floor @ by_pose, by.tilt, by.floor @ by_disc, by.mounting
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:

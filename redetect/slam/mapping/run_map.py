@@ -229,15 +229,8 @@ def map_run(
         graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
     if only_start:
         fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
-        if fixed.loss != "none":
-            estimate = keep(solve(graph, estimate, plain, tolerance=_COARSE))
-        if fixed.loss == "geman-mcclure":
-            # Graduated non-convexity: from where it is nearly least squares, rows that do not fit
-            # are let go one by one (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
-            for factor in _GRADUATION:
-                scale = factor * fixed.loss_scale
-                wide = replace(fixed, loss_scale=scale)
-                estimate = keep(solve(graph, estimate, wide, tolerance=_COARSE))
+        for weighting in _on_the_way(fixed):
+            estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
     as_calibrated = trail[-1].cost
     if wanted.calibrate or wanted.tilt_sigma_rad > 0.0:
@@ -326,6 +319,19 @@ def _with_lines(
         if np.all(good):
             return graph, estimate
         ids, xy = ids[good], estimate.line_xy[good]
+
+
+def _on_the_way(wanted: Weighting) -> list[Weighting]:
+    """By what a robust loss is reached: least squares; then, if it isn't convex, wider scales.
+
+    Graduated non-convexity: from where it is nearly least squares, rows that do not fit are let go
+    one by one (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
+    """
+    if wanted.loss == "none":
+        return []
+    factors = _GRADUATION if wanted.loss == "geman-mcclure" else ()
+    wider = [replace(wanted, loss_scale=factor * wanted.loss_scale) for factor in factors]
+    return [Weighting(), *wider]
 
 
 def _descent(solver: Solver, loss: LossKind) -> Callable[[Graph, Estimate, Weighting], Solution]:
