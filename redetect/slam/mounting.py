@@ -45,9 +45,10 @@ def rows_through_mounting(
 ) -> tuple[FloatArray, FloatArray]:
     """Where rows' rays meet the floor if the camera is mounted otherwise.
 
-    Takes `floor_xy` (n, 2) as the rows have it, and robot_from_camera as mounted (3, 4). Returns `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and
-    `by_mounting` (n, 2, 4): derivatives by a rotation vector in the robot frame, applied to the
-    mounting from the left, and by the height.
+    Takes `floor_xy` (n, 2) as the rows have it, and robot_from_camera as mounted (3, 4). Returns
+    `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and `by_mounting`
+    (n, 2, 4): derivatives by a rotation vector in the robot frame, applied to the mounting from the
+    left, and by the height.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
+from redetect.slam.association.compatibility import Method
 from redetect.slam.association.frame_to_frame import (
     AssociateSettings,
     LocalMap,
-    Method,
     associate_locally,
     moved,
     tilt_jacobian,

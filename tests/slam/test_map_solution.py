@@ -19,7 +19,7 @@ from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models import move
-from redetect.slam.mounting import directions_of_rows, rotation_exp, rows_through_mounting
+from redetect.slam.mounting import rotation_exp, rows_through_mounting
 from redetect.slam.recording import LineRows, Recording, read_recording, recording_of_frames
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
@@ -163,7 +163,7 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
     matrix = np.column_stack([turn @ published_camera.rotation, place])
     mounted = _mounted(published_camera, matrix)
     backward = np.column_stack([published_camera.rotation, published_camera.centre])
-    written, _ = rows_through_mounting(mounted, directions_of_rows(mounted, circles.xy), backward)
+    written, _ = rows_through_mounting(mounted, circles.xy, backward)
     spoilt = replace(_only_discs(run), circles=replace(circles, xy=written))
     plain = map_run(spoilt, published_camera)
     mapped = map_run(
@@ -185,10 +185,9 @@ def test_verticals_tell_a_camera_turned_to_the_left(published_camera: Camera) ->
     turn, _ = rotation_exp(np.array([0.0, 0.0, 0.02]))
     mounting = np.column_stack([turn @ camera.rotation, camera.centre])
     circles, lines = run.recording.circles, run.recording.lines
-    rays = directions_of_rows(_mounted(camera, mounting), circles.xy)
     nominal = np.column_stack([camera.rotation, camera.centre])
     # Seen by the turned camera, everything lies further to the right of its nose.
-    written, _ = rows_through_mounting(camera, rays @ turn, nominal)
+    written, _ = rows_through_mounting(_mounted(camera, mounting), circles.xy, nominal)
     spoilt = replace(
         run.recording,
         circles=replace(circles, xy=written),

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +25,11 @@ from redetect.compiled import kernel
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
 
+Method = Literal["nearest", "joint"]
+
 DEFAULT_GATE_PROBABILITY = 0.999
-MOST_NODES = 20_000
+#: Bound of the joint search.
+MOST_NODES = 30_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,18 @@ class Pairing:
     # ones for `nearest_compatible`.
     squared_distance: float
     complete: bool = True  # whether the search was finished: only then is no better pairing left
+
+
+def compatible(
+    method: str,
+    innovations: ArrayLike,
+    predicted_covariance: ArrayLike,
+    noise: ArrayLike,
+    gate_probability: float,
+) -> Pairing:
+    """By the method `nearest` `nearest_compatible`, by `joint` `joint_compatible`."""
+    pair = joint_compatible if method == "joint" else nearest_compatible
+    return pair(innovations, predicted_covariance, noise, gate_probability=gate_probability)
 
 
 def nearest_compatible(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,12 +24,10 @@ from numpy.typing import ArrayLike
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import rotation
-from redetect.slam.association.compatibility import Pairing, joint_compatible, nearest_compatible
+from redetect.slam.association.compatibility import Method, compatible
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage.bounds import PROBABILITY, Bounds, Positive, demand_fields, whole
-
-Method = Literal["nearest", "joint"]
 
 # Of the first sight of a line: half a metre to infinity within two standard deviations.
 _INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
@@ -43,8 +41,6 @@ CAMERA_HEIGHT_M = 1.5
 _FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
 # At most this many landmarks of each kind are kept, those seen last.
 _MOST_LANDMARKS = 40
-# Bound of the joint search.
-_MOST_NODES = 30_000
 
 
 @dataclass(frozen=True)
@@ -263,7 +259,7 @@ def _observed(
         sway = setting.tilt_sigma_rad * tilt_jacobian(local.mean[candidates]).reshape(-1, 2)
         sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen)
     predicted = local.covariance[np.ix_(index, index)] + sway @ sway.T
-    pairing = _pairing(innovations, predicted, noise, setting)
+    pairing = compatible(setting.method, innovations, predicted, noise, setting.gate_probability)
     rows = np.flatnonzero(pairing.landmark >= 0)
     paired = pairing.landmark[rows]
     mean, covariance = local.mean, local.covariance
@@ -310,14 +306,3 @@ def _observed(
         np.concatenate([last_frame, np.full(k, frame)]),
     )
     return local, labels, pairing.complete
-
-
-def _pairing(
-    innovations: FloatArray, predicted: FloatArray, noise: FloatArray, setting: AssociateSettings
-) -> Pairing:
-    gate = setting.gate_probability
-    if setting.method == "nearest":
-        return nearest_compatible(innovations, predicted, noise, gate_probability=gate)
-    return joint_compatible(
-        innovations, predicted, noise, gate_probability=gate, most_nodes=_MOST_NODES
-    )

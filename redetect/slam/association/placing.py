@@ -52,7 +52,6 @@ class Place(NamedTuple):
 
     pose: FloatArray  # (3,) m, m, rad
     pairs: IntArray  # (k, 2): discs of the map and of the constellation that agree
-    log10_false_alarms: float  # how many places fit as well by chance, as a logarithm
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,6 @@ class Waking:
     frames: int  # of the run that it took
     discs: int  # of these,
     agreeing: int  # and how many of them are in the map
-    log10_false_alarms: float  # how many places fit as well by chance, as a logarithm
 
 
 def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
@@ -85,10 +83,10 @@ def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
         if len(discs) != before:
             found = placed(discs, disc_xy)
             if found is not None:
-                pose, pairs, alarms = found
+                pose, pairs = found
                 covariance = _covariance(pose, discs[pairs[:, 1]], disc_xy[pairs[:, 0]])
                 covariance += _drift(recording.step_covariance[:frames], pose, discs)
-                return Waking(pose, covariance, frames, len(discs), len(pairs), alarms)
+                return Waking(pose, covariance, frames, len(discs), len(pairs))
         if frames == most:
             return None
         frames, before = min(math.ceil(_MORE * frames), most), len(discs)
@@ -136,7 +134,7 @@ def placed(
         rival = motion_onto(discs, others, ANYWHERE)
         if rival.agreeing > _RIVAL_SHARE * len(pairs):
             return None
-    return Place(pose, pairs, alarms)
+    return Place(pose, pairs)
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:

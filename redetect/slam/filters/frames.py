@@ -21,9 +21,8 @@ from redetect.plane import apply, rotation
 from redetect.slam.association.compatibility import (
     DEFAULT_GATE_PROBABILITY,
     chi_squared_gates,
+    compatible,
     individual_distances,
-    joint_compatible,
-    nearest_compatible,
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_in_robot
@@ -240,7 +239,10 @@ class Associator:
             seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
             spread = jacobian @ estimate.block(index) @ jacobian.T
             innovation = rows.disc_xy[:, None] - seen.reshape(-1, 2)
-            landmark = self._paired(innovation, spread, rows.disc_covariance)
+            pairing = compatible(
+                self.method, innovation, spread, rows.disc_covariance, self.gate_probability
+            )
+            landmark = pairing.landmark
             found[landmark >= 0] = names[landmark[landmark >= 0]]
             distances = individual_distances(innovation, spread, rows.disc_covariance)
             closest = np.min(distances, axis=1)
@@ -262,12 +264,10 @@ class Associator:
         innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
         spread = jacobian @ estimate.block(index) @ jacobian.T
         noise = rows.sigma_rad[:, None, None] ** 2
-        landmark = self._paired(innovation[:, :, None], spread, noise)
-        return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
-
-    def _paired(self, innovation: FloatArray, spread: FloatArray, noise: FloatArray) -> IntArray:
-        pair = joint_compatible if self.method == "joint" else nearest_compatible
-        return pair(innovation, spread, noise, gate_probability=self.gate_probability).landmark
+        pairing = compatible(
+            self.method, innovation[:, :, None], spread, noise, self.gate_probability
+        )
+        return tuple((int(names[j]),) if j >= 0 else () for j in pairing.landmark)
 
 
 def run_filter(
