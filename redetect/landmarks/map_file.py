@@ -18,7 +18,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.records import LandmarkFileError
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.bounded import read_bounded, read_plain_array
 
 FilePath = str | os.PathLike[str]
@@ -188,8 +188,7 @@ def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite:
     """
     content = io.BytesIO()
     np.save(content, np.ascontiguousarray(covariance, dtype=np.float64), allow_pickle=False)
-    with write_whole(covariance_file(map_file), overwrite=overwrite) as stream:
-        stream.write(content.getvalue())
+    write_bytes(covariance_file(map_file), content.getvalue(), overwrite=overwrite)
 
 
 def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArray | None:
@@ -297,8 +296,8 @@ def write_table(
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(text.getvalue().encode("utf-8", "surrogateescape"))
+    content = text.getvalue().encode("utf-8", "surrogateescape")
+    write_bytes(path, content, overwrite=overwrite)
 
 
 def _read(

@@ -28,7 +28,7 @@ from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_a
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import PICTURES
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,8 +73,7 @@ def picture(
             stream = io.BytesIO()
             # Without the name and version of the program that made it: the same bytes everywhere.
             figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
-            with write_whole(png, overwrite=overwrite) as file:
-                file.write(stream.getvalue())
+            write_bytes(png, stream.getvalue(), overwrite=overwrite)
             if interactive:
                 pyplot.show()
         finally:

@@ -18,7 +18,7 @@ from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, landmark_files, read_recording
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, write_bytes
 
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
@@ -113,5 +113,4 @@ def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
 
 def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
     """Write a summary."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode(), overwrite=overwrite)

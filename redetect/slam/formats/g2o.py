@@ -106,7 +106,7 @@ def write_g2o(
     overwrite: bool = False,
 ) -> None:
     """Write a graph; numbers in full precision."""
-    write_text(path, list(_rows(graph, axes, comments)), overwrite=overwrite)
+    write_text(path, _rows(graph, axes, comments), overwrite=overwrite)
 
 
 def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]:

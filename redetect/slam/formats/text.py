@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.bounded import read_bounded
 
 Axes = Literal["robotics", "dataset"]
@@ -86,9 +86,8 @@ _WHOLE = re.compile(r"[0-9]{1,10}", re.ASCII)
 
 def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
     """Write rows of text, whole or not at all."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        for row in rows:
-            stream.write(f"{row}\n".encode("utf-8", "surrogateescape"))
+    content = "".join(f"{row}\n" for row in rows).encode("utf-8", "surrogateescape")
+    write_bytes(path, content, overwrite=overwrite)
 
 
 def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
