@@ -157,6 +157,8 @@ class FilterFlags(RunFlags):
     ----------
     gate_probability : float
         Share of right rows that pass the gate; with known association nothing is gated.
+    start : three floats
+        Pose at the start in the map (m, m, rad).
     reference : Path
         A path.csv to measure the distance from.
     interactive : bool
@@ -165,6 +167,7 @@ class FilterFlags(RunFlags):
 
     association: Literal["known", "nearest", "joint"] = "known"
     gate_probability: float = 0.999
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reference: MaybePath = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False
@@ -187,10 +190,8 @@ class Localize(FilterFlags):
         `considered`: the map's covariances are errors that stay the same each time a landmark is
         seen; `white`: errors that are new each time; `ignored`: the map is exact. By default
         (`auto`) considered with known association, else ignored.
-    start : three floats
-        Pose at the start in the map (m, m, rad).
     start_sigma : three floats
-        Its standard deviations.
+        Standard deviations of the pose at the start.
     lost : bool
         Nothing is known of the pose at the start: it is found by the discs of the first frames,
         whatever their identifiers. Without these, with `--association joint`.
@@ -201,7 +202,6 @@ class Localize(FilterFlags):
 
     map: Path
     map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lost: bool = False
 
@@ -222,8 +222,6 @@ class Ekf(FilterFlags):
         filter gains no spurious information about its heading from landmarks that it has placed
         itself; or at the `latest`, as the textbook filter does, which is inconsistent at large
         heading errors.
-    start : three floats
-        Pose at the start in the map (m, m, rad).
     reference_map : Path
         A map.csv to measure the distance of the landmarks from.
     output : Path
@@ -232,7 +230,6 @@ class Ekf(FilterFlags):
     """
 
     jacobians: Literal["first", "latest"] = "first"
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reference_map: MaybePath = None
 
 

@@ -299,21 +299,16 @@ def recording_of_frames(
     )
 
 
-def frames_of_discs(
-    prefixes: Sequence[str],
-    steps: FloatArray,
-    step_covariance: FloatArray,
-    circles: CircleRows,
-    quality: FloatArray,
-) -> list[Frame]:
-    """Steps and rows of discs as frames: what `recording_of_frames` gathers.
+def frames_of_discs(recording: Recording, quality: FloatArray) -> list[Frame]:
+    """Steps and rows of discs as frames, of which `recording_of_frames` gathers them again.
 
-    Takes `prefixes` of N, `steps` (N, 3), `step_covariance` (N, 3, 3), `quality` (n,) of the rows.
+    Takes `quality` (n,) of the rows.
     """
-    starts = np.searchsorted(circles.frame, np.arange(len(steps) + 1))
-    numbers = np.column_stack([steps, step_covariance.reshape(-1, 9)[:, [0, 1, 4, 2, 5, 8]]])
+    circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
+    starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
+    numbers = np.column_stack([recording.steps, spread[:, [0, 1, 4, 2, 5, 8]]])
     frames = []
-    for k, (prefix, row) in enumerate(zip(prefixes, numbers.tolist())):
+    for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers.tolist())):
         some = slice(starts[k], starts[k + 1])
         seen = circle_landmarks(
             circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]

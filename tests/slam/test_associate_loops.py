@@ -159,7 +159,8 @@ def test_merging_never_joins_what_was_seen_together_and_never_splits(
     assert len(set(zip(frames.tolist(), merged.tolist()))) == len(rows)  # still apart in a frame
     for label in range(count):
         assert len(set(merged[labels == label].tolist())) == 1
-    together = seen_together(frames, labels)
+    apart = seen_together(frames, labels)
+    together = [(a, b) for a, others in enumerate(apart) for b in others]
     groups = {label: int(merged[labels == label][0]) for label in range(count)}
     assert all(groups[a] != groups[b] for a, b in together)
     if usable and (min(usable[0]), max(usable[0])) not in together:

@@ -85,11 +85,11 @@ def test_the_estimates_of_a_solution(tmp_path: Path, solution: Path, capsys: Cap
     graph = tmp_path / "e.g2o"
     assert main(["export", str(DEMO), "-o", str(graph), "--solution", str(solution)]) == 0
     read = read_g2o(graph)
-    np.testing.assert_array_equal(read.poses, read_path(solution / "path.csv").poses)
+    np.testing.assert_array_equal(read.path.poses, read_path(solution / "path.csv").poses)
     np.testing.assert_array_equal(read.discs, read_map(solution / "map.csv").discs.xy)
     assert main(["import", str(graph), "-o", str(tmp_path / "p.csv")]) == 0
     path = read_path(tmp_path / "p.csv")
-    np.testing.assert_array_equal(path.poses, read.poses)
+    np.testing.assert_array_equal(path.poses, read.path.poses)
     assert path.prefixes[:2] == ("start", "e.0000")
     capsys.readouterr()
 

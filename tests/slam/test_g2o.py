@@ -54,14 +54,14 @@ def text(frames: list[Frame]) -> bytes:
 
 def chi2(graph: RunGraph) -> float:
     """The error of a graph by this project's models, in the data set's axes."""
-    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.path.poses[:-1], graph.path.poses[1:]) - graph.recording.steps
     error[:, 2] = wrap_angle(error[:, 2])
     place = dict(zip(graph.disc_ids.tolist(), graph.discs))
-    rows = graph.circles
+    rows = graph.recording.circles
     discs = np.array([place[number] for number in rows.ids.tolist()])
-    missed = disc_in_robot(graph.poses[rows.frame + 1], discs) - rows.xy
+    missed = disc_in_robot(graph.path.poses[rows.frame + 1], discs) - rows.xy
     return float(
-        np.einsum("ni,nij,nj", error, np.linalg.inv(graph.step_covariance), error)
+        np.einsum("ni,nij,nj", error, np.linalg.inv(graph.recording.step_covariance), error)
         + np.einsum("ni,nij,nj", missed, np.linalg.inv(rows.covariance), missed)
     )
 
@@ -98,10 +98,10 @@ def test_the_demo_runs_rows_come_back_byte_by_byte(tmp_path: Path, axes: Axes) -
     write_g2o(tmp_path / "e.g2o", graph, axes=axes)
     again = read_g2o(tmp_path / "e.g2o", axes=axes)
     assert text(frames_of_graph(again)) == text(identified(frames))
-    np.testing.assert_array_equal(again.poses, graph.poses)
+    np.testing.assert_array_equal(again.path.poses, graph.path.poses)
     np.testing.assert_array_equal(again.discs, graph.discs)
     np.testing.assert_array_equal(again.disc_ids, graph.disc_ids)
-    assert again.prefixes == graph.prefixes
+    assert again.path.prefixes == graph.path.prefixes
 
 
 @pytest.mark.long
@@ -123,23 +123,28 @@ def test_the_graphs_error_is_that_of_the_models(tmp_path: Path, axes: Axes) -> N
     assert expected > 1000.0
     assert chi2_by_the_formats_rules(tmp_path / "e.g2o") == pytest.approx(expected, rel=1e-9)
     # What the known mistakes would give is far off.
-    swapped = graph.step_covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
-    wrong = RunGraph(**{**vars(graph), "step_covariance": swapped})
+    swapped = graph.recording.step_covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
+    wrong = replace(graph, recording=replace(graph.recording, step_covariance=swapped))
     assert abs(chi2(wrong) / expected - 1.0) > 1e-3
-    unturned = start_covariance(graph.steps, graph.step_covariance)
-    wrong = RunGraph(**{**vars(graph), "step_covariance": unturned})
+    unturned = start_covariance(graph.recording.steps, graph.recording.step_covariance)
+    wrong = replace(graph, recording=replace(graph.recording, step_covariance=unturned))
     assert abs(chi2(wrong) / expected - 1.0) > 1e-4
 
 
 def noisy(graph: RunGraph) -> RunGraph:
     """Estimates off the measurements, so that there is an error; sharper turns than real ones."""
     rng = np.random.default_rng(7)
-    poses = graph.poses + rng.normal(0.0, 0.02, graph.poses.shape)
+    poses = graph.path.poses + rng.normal(0.0, 0.02, graph.path.poses.shape)
     discs = graph.discs + rng.normal(0.0, 0.05, graph.discs.shape)
-    steps = graph.steps + rng.normal(0.0, [0.0, 0.0, 0.5], graph.steps.shape)
-    turns = np.concatenate([[0.0], np.cumsum(steps[:, 2] - graph.steps[:, 2])])
+    steps = graph.recording.steps + rng.normal(0.0, [0.0, 0.0, 0.5], graph.recording.steps.shape)
+    turns = np.concatenate([[0.0], np.cumsum(steps[:, 2] - graph.recording.steps[:, 2])])
     poses[:, 2] += turns
-    return RunGraph(**{**vars(graph), "poses": poses, "discs": discs, "steps": steps})
+    return replace(
+        graph,
+        recording=replace(graph.recording, steps=steps),
+        path=replace(graph.path, poses=poses),
+        discs=discs,
+    )
 
 
 def test_covariances_at_the_steps_end_are_those_of_samples() -> None:
@@ -229,13 +234,13 @@ def test_a_file_of_another_tool_is_read(tmp_path: Path) -> None:
         "VERTEX_SE2 7 1 0 0.1\r\nVERTEX_XY 8 2 1\n# a comment\nVERTEX_SE2 3 0 0 0\nFIX 3\n"
     )
     graph = read_g2o(file)
-    assert graph.prefixes == ("start", "vertex.7")
+    assert graph.path.prefixes == ("start", "vertex.7")
     np.testing.assert_array_equal(graph.disc_ids, [8])
-    np.testing.assert_array_equal(graph.circles.ids, [8])
+    np.testing.assert_array_equal(graph.recording.circles.ids, [8])
     assert np.isnan(graph.quality).all()
     # X forward 1, Y left 0.5: the data set's X left 0.5, Y backward -1.
-    np.testing.assert_array_equal(graph.circles.xy, [[0.5, -1.0]])
-    np.testing.assert_allclose(graph.circles.covariance, [[[0.04, 0.0], [0.0, 0.01]]])
+    np.testing.assert_array_equal(graph.recording.circles.xy, [[0.5, -1.0]])
+    np.testing.assert_allclose(graph.recording.circles.covariance, [[[0.04, 0.0], [0.0, 0.01]]])
     assert text(frames_of_graph(graph)).splitlines()[1] == (b"LANDMARK_C 0.5 -1 1 0.04 0 0.01 8")
 
 
@@ -284,9 +289,9 @@ def test_damaged_files_are_read_or_refused(
     file.write_bytes(whole[:place] + junk + whole[place + length :])
     with contextlib.suppress(SlamError):
         graph = read_g2o(file)
-        assert np.isfinite(graph.poses).all()
-        assert np.isfinite(graph.step_covariance).all()
-        assert np.isfinite(graph.circles.covariance).all()
+        assert np.isfinite(graph.path.poses).all()
+        assert np.isfinite(graph.recording.step_covariance).all()
+        assert np.isfinite(graph.recording.circles.covariance).all()
 
 
 def test_identifiers_that_have_no_vertex_are_refused(tmp_path: Path) -> None:
@@ -295,7 +300,8 @@ def test_identifiers_that_have_no_vertex_are_refused(tmp_path: Path) -> None:
         disc = CircleLandmark(1.0, -2.0, 0.5, 0.003, 0.0, 0.007, (7,))
         graph = graph_of_frames([Frame(frames[0].step, (disc,))], "a")
         ids = np.array([number])
-        graph = replace(graph, disc_ids=ids, circles=replace(graph.circles, ids=ids))
+        circles = replace(graph.recording.circles, ids=ids)
+        graph = replace(graph, disc_ids=ids, recording=replace(graph.recording, circles=circles))
         with pytest.raises(SlamError, match=f"disc {number}: expected an identifier of 0 to"):
             write_g2o(tmp_path / "a.g2o", graph)
     assert not (tmp_path / "a.g2o").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,21 +29,24 @@ def estimates_with_error(file: Path) -> RunGraph:
     """A run with estimates that are off by more than the measurements."""
     graph = graph_of_frames(list(read_frames(file)), "run")
     rng = np.random.default_rng(11)
-    poses = graph.poses + rng.normal(0.0, [0.01, 0.01, 0.02], graph.poses.shape)
+    poses = graph.path.poses + rng.normal(0.0, [0.01, 0.01, 0.02], graph.path.poses.shape)
     discs = graph.discs + rng.normal(0.0, 0.05, graph.discs.shape)
-    return RunGraph(**{**vars(graph), "poses": poses, "discs": discs})
+    return replace(graph, path=replace(graph.path, poses=poses), discs=discs)
 
 
 def step_errors(graph: RunGraph) -> FloatArray:
-    error = between(graph.poses[:-1], graph.poses[1:]) - graph.steps
+    error = between(graph.path.poses[:-1], graph.path.poses[1:]) - graph.recording.steps
     error[:, 2] = wrap_angle(error[:, 2])
     return error
 
 
 def disc_errors(graph: RunGraph) -> FloatArray:
     place = dict(zip(graph.disc_ids.tolist(), graph.discs))
-    discs = np.array([place[number] for number in graph.circles.ids.tolist()])
-    return np.asarray(disc_in_robot(graph.poses[graph.circles.frame + 1], discs) - graph.circles.xy)
+    discs = np.array([place[number] for number in graph.recording.circles.ids.tolist()])
+    return np.asarray(
+        disc_in_robot(graph.path.poses[graph.recording.circles.frame + 1], discs)
+        - graph.recording.circles.xy
+    )
 
 
 def squared(error: FloatArray, covariance: FloatArray) -> float:
@@ -51,10 +55,10 @@ def squared(error: FloatArray, covariance: FloatArray) -> float:
 
 def check(graph: RunGraph, file: Path) -> None:
     factors, values = gtsam.readG2o(str(file), False)
-    count = len(graph.steps)
+    count = len(graph.recording.steps)
     assert factors.size() == count  # its reader leaves EDGE_SE2_XY out
     assert values.size() == count + 1 + len(graph.disc_ids)
-    for number, pose in enumerate(from_dataset(graph.poses, "robotics")):
+    for number, pose in enumerate(from_dataset(graph.path.poses, "robotics")):
         read = values.atPose2(number)
         np.testing.assert_array_equal([read.x(), read.y()], pose[:2])
         assert wrap_angle(read.theta() - pose[2]) == pytest.approx(0.0, abs=1e-12)
@@ -67,7 +71,9 @@ def check(graph: RunGraph, file: Path) -> None:
         off = factor.measured().between(first.between(second))
         whitened = factor.noiseModel().R() @ [off.x(), off.y(), off.theta()]
         total += float(whitened @ whitened)
-    assert total == pytest.approx(squared(step_errors(graph), graph.step_covariance), rel=1e-8)
+    assert total == pytest.approx(
+        squared(step_errors(graph), graph.recording.step_covariance), rel=1e-8
+    )
 
     # GTSAM measures the error by the logarithm, equal to first order in the turn.
     assert 2.0 * factors.error(values) == pytest.approx(total, rel=0.02)
@@ -84,7 +90,7 @@ def check(graph: RunGraph, file: Path) -> None:
             missed += 2.0 * model.loss(
                 model.squaredMahalanobisDistance(pose.transformTo(disc) - [x, y])
             )
-    expected = squared(disc_errors(graph), graph.circles.covariance)
+    expected = squared(disc_errors(graph), graph.recording.circles.covariance)
     assert missed == pytest.approx(expected, rel=1e-8)
 
 
@@ -110,11 +116,11 @@ def test_the_published_error_of_the_real_run(tmp_path: Path, shared_data: Path) 
     table = np.loadtxt(folder / "least_squares_map.csv", delimiter=",")
     assert np.array_equal(table[:, 0].astype(int), graph.disc_ids)
     poses = np.loadtxt(folder / "least_squares_path.csv", delimiter=",")
-    solved = RunGraph(**{**vars(graph), "poses": poses, "discs": table[:, 1:]})
+    solved = replace(graph, path=replace(graph.path, poses=poses), discs=table[:, 1:])
     write_g2o(tmp_path / "e.g2o", solved)
     check(solved, tmp_path / "e.g2o")
-    total = squared(step_errors(solved), solved.step_covariance)
-    total += squared(disc_errors(solved), solved.circles.covariance)
+    total = squared(step_errors(solved), solved.recording.step_covariance)
+    total += squared(disc_errors(solved), solved.recording.circles.covariance)
     assert total == pytest.approx(56_871.45, abs=0.1)
 
 

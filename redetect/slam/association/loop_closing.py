@@ -119,17 +119,17 @@ NO_STEPS = np.zeros(0, dtype=np.int64)
 _FARTHEST_M = 0.35
 
 
-def seen_together(frames: IntArray, labels: IntArray) -> set[tuple[int, int]]:
-    """Pairs of labels that rows of one frame have: surely two landmarks, and never to be merged.
+def seen_together(frames: IntArray, labels: IntArray) -> list[set[int]]:
+    """Of each label those that rows of one frame have: surely others, and never to be merged.
 
     Takes `frames, labels` (n,).
     """
-    pairs: set[tuple[int, int]] = set()
-    ends = np.flatnonzero(np.diff(frames)) + 1
-    for group in np.split(labels, ends):
-        here = np.unique(group).tolist()
-        pairs.update((a, b) for n, a in enumerate(here) for b in here[n + 1 :])
-    return pairs
+    together: list[set[int]] = [set() for _ in range(int(labels.max(initial=-1)) + 1)]
+    for group in np.split(labels, np.flatnonzero(np.diff(frames)) + 1):
+        here = set(group.tolist())
+        for label in here:
+            together[label] |= here - {label}
+    return together
 
 
 def merge_labels(
@@ -139,11 +139,8 @@ def merge_labels(
 
     Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
-    count = int(labels.max(initial=-1)) + 1
-    apart: list[set[int]] = [set() for _ in range(count)]
-    for a, b in seen_together(frames, labels):
-        apart[a].add(b)
-        apart[b].add(a)
+    apart = seen_together(frames, labels)
+    count = len(apart)
     root = list(range(count))
 
     def find(label: int) -> int:

@@ -63,7 +63,8 @@ def _export_g2o(command: Export) -> int:
     (file,) = landmark_files(command.run, stem=command.stem)
     frames = list(read_frames(file))
     graph = graph_of_frames(frames, str(file), command.solution, command.odometry_noise)
-    print_assumed(graph.unstated_steps, len(graph.steps), command.odometry_noise)
+    run = graph.recording
+    print_assumed(run.unstated_steps, len(run), command.odometry_noise)
     total = sum(isinstance(row, CircleLandmark) for frame in frames for row in frame.landmarks)
     write_g2o(
         command.output,
@@ -73,9 +74,9 @@ def _export_g2o(command: Export) -> int:
         overwrite=command.force,
     )
     print(
-        f"{command.output}: {len(graph.poses)} poses, {len(graph.disc_ids)} discs, "
-        f"{len(graph.steps)} steps, {len(graph.circles)} measurements of discs"
-        f"{_left_out(total - len(graph.circles))}"
+        f"{command.output}: {len(graph.path.poses)} poses, {len(graph.disc_ids)} discs, "
+        f"{len(run)} steps, {len(run.circles)} measurements of discs"
+        f"{_left_out(total - len(run.circles))}"
     )
     return 0
 
@@ -160,16 +161,15 @@ def _import(command: Import) -> int:
         return _write_path(command, read_tum(command.file, axes=command.axes))
     graph = read_g2o(command.file, axes=command.axes)
     if command.output.suffix == ".csv":
-        return _write_path(command, Path2D(graph.prefixes, graph.poses))
+        return _write_path(command, graph.path)
     frames = frames_of_graph(graph)
     demand_readable(frames, str(command.file))
     unknown = int(np.sum(~np.isfinite(graph.quality)))
     head = _made_by(command.file)
     note = f"; {unknown} of them without quality: 1 is written" if unknown else ""
     write_frames(command.output, frames, head=head, overwrite=command.force)
-    print(
-        f"{command.output}: {len(frames)} steps, {len(graph.circles)} measurements of discs{note}"
-    )
+    seen = len(graph.recording.circles)
+    print(f"{command.output}: {len(frames)} steps, {seen} measurements of discs{note}")
     return 0
 
 

@@ -30,7 +30,7 @@ from redetect.plane import between
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.text import finite, text_rows, to_dataset
 from redetect.slam.models import chain_steps
-from redetect.slam.recording import CircleRows, frames_of_discs
+from redetect.slam.recording import CircleRows, LineRows, Recording, frames_of_discs
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -72,7 +72,8 @@ def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame
     xy, covariance = discs_of_ranges(run.range_m, run.bearing_rad, sigma_m, sigma_rad)
     unstated = np.zeros((len(run.steps), 3, 3))
     rows = CircleRows(run.frame, xy, covariance, run.ids)
-    return frames_of_discs(run.prefixes, run.steps, unstated, rows, np.ones(len(xy)))
+    recording = Recording(run.prefixes, run.steps, unstated, rows, LineRows.of())
+    return frames_of_discs(recording, np.ones(len(xy)))
 
 
 def discs_of_ranges(

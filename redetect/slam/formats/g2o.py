@@ -55,6 +55,7 @@ from redetect.slam.models import OdometryNoise, chain_steps
 from redetect.slam.recording import (
     ASSUMED,
     CircleRows,
+    LineRows,
     Recording,
     frames_of_discs,
     recording_of_frames,
@@ -66,17 +67,13 @@ FRAME_COMMENT = "# FRAME"
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """A run with estimates of its poses and discs, in the data set's axes."""
+    """A run of discs that all have an identifier, with estimates; in the data set's axes."""
 
-    prefixes: tuple[str, ...]  # name of each pose; of the start ``start``
-    poses: FloatArray  # (N + 1, 3): Estimates: x, y (m), theta (rad)
+    recording: Recording
+    quality: FloatArray  # (n,): of its rows of discs; NaN where it is unknown
+    path: Path2D  # estimates of the poses
     disc_ids: IntArray  # (M,): identifiers, ascending
     discs: FloatArray  # (M, 2): estimates (m)
-    steps: FloatArray  # (N, 3): dx, dy (m), dphi (rad) in the robot frame before each step
-    step_covariance: FloatArray  # (N, 3, 3): of `steps`
-    circles: CircleRows  # measurements of discs, all with an identifier
-    quality: FloatArray  # (n,): of those rows; NaN where it is unknown
-    unstated_steps: int = 0  # steps whose covariance is an assumed one
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:
@@ -110,9 +107,10 @@ def write_g2o(
 
 
 def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]:
-    for number, pose in enumerate(from_dataset(graph.poses, axes) + 0.0):  # no -0.0
+    run = graph.recording
+    for number, pose in enumerate(from_dataset(graph.path.poses, axes) + 0.0):  # no -0.0
         yield f"VERTEX_SE2 {number} {_numbers(pose)}"
-    base = first_disc_vertex(len(graph.poses) - 1)
+    base = first_disc_vertex(len(graph.path.poses) - 1)
     for disc in graph.disc_ids.tolist():
         if not 0 <= disc <= LARGEST_NUMBER - base:
             raise SlamError(
@@ -122,11 +120,11 @@ def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]
     for disc, xy in zip(graph.disc_ids.tolist(), from_dataset(graph.discs, axes)):
         yield f"VERTEX_XY {base + disc} {_numbers(xy)}"
 
-    steps = from_dataset(graph.steps, axes)
+    steps = from_dataset(run.steps, axes)
     of_steps = inverse_of_3x3(
-        end_covariance(steps, covariance_from_dataset(graph.step_covariance, axes))
+        end_covariance(steps, covariance_from_dataset(run.step_covariance, axes))
     )[:, *np.triu_indices(3)]
-    rows = graph.circles
+    rows = run.circles
     seen = from_dataset(rows.xy, axes)
     of_rows = inverse_of_2x2(covariance_from_dataset(rows.covariance, axes))[:, *np.triu_indices(2)]
     for what, information in (("step", of_steps), ("measurement of a disc", of_rows)):
@@ -148,7 +146,7 @@ def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]
         qualities = graph.quality[of_frame[k] : of_frame[k + 1]]
         # Qualities are identified by their order: if one is unknown, none of the frame is written.
         known = qualities if np.all(np.isfinite(qualities)) else qualities[:0]
-        yield f"{FRAME_COMMENT} {k + 1} {graph.prefixes[k + 1]} {_numbers(known)}".rstrip()
+        yield f"{FRAME_COMMENT} {k + 1} {graph.path.prefixes[k + 1]} {_numbers(known)}".rstrip()
 
 
 def inverse_of_2x2(matrices: FloatArray) -> FloatArray:
@@ -280,21 +278,21 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
     base = first_disc_vertex(order[-1])
     if any(vertex < base for vertex in discs):
         base = 0
+    circles = CircleRows(
+        frame=np.array([rank[row.vertices[0]] - 1 for row in sights], dtype=np.int64),
+        xy=to_dataset(_table([row.numbers[:2] for row in sights], 2), axes),
+        covariance=covariance,
+        ids=np.array([row.vertices[1] - base for row in sights], dtype=np.int64),
+    )
     prefixes, quality = _named(path, frames, order, sights)
+    numbers = _table([poses[vertex].numbers for vertex in order], 3)
+    places = _table([discs[vertex].numbers for vertex in sorted(discs)], 2)
     return RunGraph(
-        prefixes=prefixes,
-        poses=to_dataset(_table([poses[vertex].numbers for vertex in order], 3), axes),
+        Recording(prefixes[1:], to_dataset(steps, axes), step_covariance, circles, LineRows.of()),
+        quality,
+        Path2D(prefixes, to_dataset(numbers, axes)),
         disc_ids=np.array([vertex - base for vertex in sorted(discs)], dtype=np.int64),
-        discs=to_dataset(_table([discs[vertex].numbers for vertex in sorted(discs)], 2), axes),
-        steps=to_dataset(steps, axes),
-        step_covariance=step_covariance,
-        circles=CircleRows(
-            frame=np.array([rank[row.vertices[0]] - 1 for row in sights], dtype=np.int64),
-            xy=to_dataset(_table([row.numbers[:2] for row in sights], 2), axes),
-            covariance=covariance,
-            ids=np.array([row.vertices[1] - base for row in sights], dtype=np.int64),
-        ),
-        quality=quality,
+        discs=to_dataset(places, axes),
     )
 
 
@@ -434,27 +432,19 @@ def graph_of_frames(
         discs = apply(poses.poses[rows.frame[first] + 1], rows.xy[first])
     else:
         discs = _places(solution / "map.csv", disc_ids)
-    return RunGraph(
-        prefixes=poses.prefixes,
-        poses=poses.poses,
-        disc_ids=disc_ids,
-        discs=discs,
-        steps=recording.steps,
-        step_covariance=recording.step_covariance,
-        circles=rows,
-        quality=quality,
-        unstated_steps=recording.unstated_steps,
-    )
+    return RunGraph(replace(recording, circles=rows), quality, poses, disc_ids, discs)
 
 
 def frames_of_graph(graph: RunGraph) -> list[Frame]:
     """The rows of a graph's steps and measurements; a quality that is unknown becomes 1."""
-    spread = graph.step_covariance.copy()
-    spread[np.abs(spread) < _LEAST_STEP_COVARIANCE] = 0.0
+    run = graph.recording
+    spread = np.where(
+        np.abs(run.step_covariance) < _LEAST_STEP_COVARIANCE, 0.0, run.step_covariance
+    )
     quality = np.where(np.isfinite(graph.quality), graph.quality, 1.0)
     # Of a zero, information matrices do not keep the sign.
-    rows = replace(graph.circles, covariance=graph.circles.covariance + 0.0)
-    return frames_of_discs(graph.prefixes[1:], graph.steps, spread, rows, quality)
+    rows = replace(run.circles, covariance=run.circles.covariance + 0.0)
+    return frames_of_discs(replace(run, step_covariance=spread, circles=rows), quality)
 
 
 def demand_readable(frames: Sequence[Frame], name: str) -> None:

@@ -6,6 +6,7 @@ One map can represent a run only if all its parts are connected, which is checke
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -152,23 +153,19 @@ def check_connected(recording: Recording, name: str) -> None:
         seen[part].update(("line", i) for i in ids)
     # Parts grow together as long as any two share enough.
     joined = [({k}, landmarks) for k, landmarks in enumerate(seen)]
-    grown = True
-    while grown:
-        grown = False
-        for a in range(len(joined)):
-            for b in range(len(joined) - 1, a, -1):
-                if len(joined[a][1] & joined[b][1]) >= FEWEST_SHARED:
-                    parts, landmarks = joined.pop(b)
-                    joined[a] = (joined[a][0] | parts, joined[a][1] | landmarks)
-                    grown = True
+    while pair := next(
+        (p for p in combinations(joined, 2) if len(p[0][1] & p[1][1]) >= FEWEST_SHARED), None
+    ):
+        (one, own), (other, others) = pair
+        joined = [some for some in joined if some not in pair] + [(one | other, own | others)]
     if len(joined) == 1:
         return
     # Name the first step with parts on both sides that nothing joins.
-    group = {part: k for k, (parts, _) in enumerate(joined) for part in parts}
-    broken = next(k for k in range(len(lost)) if group[k] != group[k + 1])
+    around = {part: landmarks for parts, landmarks in joined for part in parts}
+    broken = next(k for k in range(len(lost)) if around[k] is not around[k + 1])
     step = int(lost[broken])
     covariance = recording.step_covariance[step]
-    shared = len(joined[group[broken]][1] & joined[group[broken + 1]][1])
+    shared = len(around[broken] & around[broken + 1])
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     raise SlamError(
         f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its odometry is "
