@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
@@ -214,95 +215,101 @@ def associate_locally(
             (False, circle_starts, circle_labels),
             (True, line_starts, line_labels),
         ):
-            first, last = starts[frame], starts[frame + 1]
-            if first == last:
-                continue
-            seen, noise = _measured(circles, lines, slice(first, last), is_line, setting)
-            local, found, complete = _observed(local, frame, seen, noise, is_line, counts, setting)
-            incomplete += not complete
-            labels[first:last] = found
+            some = slice(starts[frame], starts[frame + 1])
+            if some.start < some.stop:
+                seen = _seen(circles, lines, some, is_line, setting)
+                local, labels[some], complete = _observed(local, frame, seen, counts, setting)
+                incomplete += not complete
         if progress:
             progress(frame + 1)
     return LocalAssociation(circle_labels, line_labels, incomplete)
 
 
-def _measured(
+class _Seen(NamedTuple):
+    """A frame's rows of one kind: n measurements of d numbers, of discs 2 and of lines 1."""
+
+    is_line: bool
+    measured: FloatArray  # (n, d)
+    noise: FloatArray  # (n, d, d): covariances
+    sway: FloatArray  # (n, d, 2): how the robot's tilt about two axes moves them, in deviations
+
+
+def _seen(
     circles: CircleRows, lines: LineRows, rows: slice, is_line: bool, setting: AssociateSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Measurements of a frame's rows (n, d), and their covariances (n, d, d)."""
+) -> _Seen:
     if is_line:
-        variance = lines.sigma_rad[rows] ** 2
-        return lines.bearing_rad[rows][:, None], variance[:, None, None]
-    return circles.xy[rows], setting.sigma_scale**2 * circles.covariance[rows]
+        variance = lines.sigma_rad[rows, None, None] ** 2
+        bearing = lines.bearing_rad[rows, None]
+        return _Seen(True, bearing, variance, np.zeros((len(bearing), 1, 2)))
+    xy = circles.xy[rows]
+    noise = setting.sigma_scale**2 * circles.covariance[rows]
+    return _Seen(False, xy, noise, setting.tilt_sigma_rad * tilt_jacobian(xy))
 
 
 def _observed(
-    local: LocalMap,
-    frame: int,
-    seen: FloatArray,
-    noise: FloatArray,
-    is_line: bool,
-    counts: list[int],
-    setting: AssociateSettings,
+    local: LocalMap, frame: int, seen: _Seen, counts: list[int], setting: AssociateSettings
 ) -> tuple[LocalMap, IntArray, bool]:
     """The map after rows of one kind, and their labels; new landmarks raise `counts`."""
-    width = seen.shape[1]
-    candidates = np.flatnonzero(local.is_line == is_line)
-    index = (2 * candidates[:, None] + np.arange(width)).reshape(-1)
-    innovations = seen[:, None] - local.mean[candidates, :width][None]
-    if is_line:
-        innovations = wrap_angle(innovations)
+    width = seen.measured.shape[1]
+    candidates = np.flatnonzero(local.is_line == seen.is_line)
+    index = 2 * candidates[:, None] + np.arange(width)
+    innovations = seen.measured[:, None] - local.mean[candidates, :width]
     # A tilt is the same for all rows of the frame: it correlates their measurements.
-    sway = np.zeros((len(index), 2))
-    sway_of_rows = np.zeros((len(seen), width, 2))
-    if not is_line:
-        sway = setting.tilt_sigma_rad * tilt_jacobian(local.mean[candidates]).reshape(-1, 2)
-        sway_of_rows = setting.tilt_sigma_rad * tilt_jacobian(seen)
-    predicted = local.covariance[np.ix_(index, index)] + sway @ sway.T
-    pairing = compatible(setting.method, innovations, predicted, noise, setting.gate_probability)
-    rows = np.flatnonzero(pairing.landmark >= 0)
-    paired = pairing.landmark[rows]
-    mean, covariance = local.mean, local.covariance
-    last_frame = local.last_frame.copy()
-    if len(rows):
-        chosen = (2 * candidates[paired][:, None] + np.arange(width)).reshape(-1)
-        moving = sway.reshape(-1, width, 2)[paired].reshape(-1, 2)
-        innovation_covariance = covariance[np.ix_(chosen, chosen)] + moving @ moving.T
-        for k, row in enumerate(rows):
-            block = slice(k * width, (k + 1) * width)
-            innovation_covariance[block, block] += noise[row]
-        gain = np.linalg.solve(innovation_covariance, covariance[chosen]).T
-        change = gain @ innovations[rows, paired].reshape(-1)
-        mean = mean + change.reshape(-1, 2)
-        covariance = covariance - gain @ covariance[chosen]
-        covariance = 0.5 * (covariance + covariance.T)
-        last_frame[candidates[paired]] = frame
-
-    fresh = np.flatnonzero(pairing.landmark < 0)
-    kind = int(is_line)
-    labels = np.empty(len(seen), dtype=np.int64)
-    labels[rows] = local.number[candidates[paired]]
-    labels[fresh] = counts[kind] + np.arange(len(fresh))
-    counts[kind] += len(fresh)
-    m, k = len(mean), len(fresh)
-    grown = np.zeros((2 * (m + k), 2 * (m + k)))
-    grown[: 2 * m, : 2 * m] = covariance
-    added = np.empty((k, 2))
-    added[:, :width] = seen[fresh]
-    if is_line:
-        added[:, 1] = _INVERSE_DISTANCE_PRIOR[0]
-    for number, row in enumerate(fresh):
-        at = 2 * (m + number)
-        grown[at : at + width, at : at + width] = (
-            noise[row] + sway_of_rows[row] @ sway_of_rows[row].T
-        )
-        if is_line:
-            grown[at + 1, at + 1] = _INVERSE_DISTANCE_PRIOR[1] ** 2
-    local = LocalMap(
-        np.concatenate([mean, added]),
-        grown,
-        np.concatenate([local.is_line, np.full(k, is_line)]),
-        np.concatenate([local.number, labels[fresh]]),
-        np.concatenate([last_frame, np.full(k, frame)]),
+    sway = np.zeros((len(candidates), width, 2))
+    if seen.is_line:
+        innovations = wrap_angle(innovations)
+    else:
+        sway = setting.tilt_sigma_rad * tilt_jacobian(local.mean[candidates])
+    all_sway = sway.reshape(-1, 2)
+    predicted = local.covariance[np.ix_(index.ravel(), index.ravel())] + all_sway @ all_sway.T
+    pairing = compatible(
+        setting.method, innovations, predicted, seen.noise, setting.gate_probability
     )
-    return local, labels, pairing.complete
+    rows, fresh = np.flatnonzero(pairing.landmark >= 0), np.flatnonzero(pairing.landmark < 0)
+    paired = pairing.landmark[rows]
+    labels = np.empty(len(seen.measured), dtype=np.int64)
+    labels[rows] = local.number[candidates[paired]]
+    labels[fresh] = counts[seen.is_line] + np.arange(len(fresh))
+    counts[seen.is_line] += len(fresh)
+    if len(rows):
+        local = _updated(
+            local, index[paired], innovations[rows, paired], seen.noise[rows], sway[paired]
+        )
+        local.last_frame[candidates[paired]] = frame
+    return _with_new(local, frame, seen, fresh, labels[fresh]), labels, pairing.complete
+
+
+def _updated(
+    local: LocalMap, index: IntArray, innovation: FloatArray, noise: FloatArray, sway: FloatArray
+) -> LocalMap:
+    """The map after k measurements (k, d) of the numbers `index` (k, d) of its state."""
+    chosen, moving, width = index.ravel(), sway.reshape(-1, 2), index.shape[1]
+    covariance = local.covariance
+    innovation_covariance = covariance[np.ix_(chosen, chosen)] + moving @ moving.T
+    for k, own in enumerate(noise):
+        block = slice(k * width, (k + 1) * width)
+        innovation_covariance[block, block] += own
+    gain = np.linalg.solve(innovation_covariance, covariance[chosen]).T
+    mean = local.mean + (gain @ innovation.ravel()).reshape(-1, 2)
+    covariance = covariance - gain @ covariance[chosen]
+    covariance = 0.5 * (covariance + covariance.T)
+    return replace(local, mean=mean, covariance=covariance, last_frame=local.last_frame.copy())
+
+
+def _with_new(
+    local: LocalMap, frame: int, seen: _Seen, rows: IntArray, numbers: IntArray
+) -> LocalMap:
+    """The map with landmarks that some of the rows show, of these numbers."""
+    k, width = len(rows), seen.measured.shape[1]
+    mean = np.full((k, 2), _INVERSE_DISTANCE_PRIOR[0])
+    mean[:, :width] = seen.measured[rows]
+    spread = np.tile(_INVERSE_DISTANCE_PRIOR[1] ** 2 * np.eye(2), (k, 1, 1))
+    sway = seen.sway[rows]
+    spread[:, :width, :width] = seen.noise[rows] + sway @ sway.swapaxes(1, 2)
+    return LocalMap(
+        np.concatenate([local.mean, mean]),
+        block_diag(local.covariance, *spread),
+        np.concatenate([local.is_line, np.full(k, seen.is_line)]),
+        np.concatenate([local.number, numbers]),
+        np.concatenate([local.last_frame, np.full(k, frame)]),
+    )
