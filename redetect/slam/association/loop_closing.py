@@ -247,11 +247,13 @@ def consistent_matches(
         return np.asarray(squared_mahalanobis(gap, spread) - steps - _MOST_SQUARED)
 
     # By itself a match makes a loop with none: that of its earlier frame with itself.
-    alone = [excess(k, frames[[k]][:, [0, 0]], np.zeros((1, 3)))[0] for k in range(len(both))]
+    alone = {
+        k: excess(k, frames[[k]][:, [0, 0]], np.zeros((1, 3)))[0]
+        for k in range(len(closed), len(both))
+    }
     taken = np.arange(len(both)) < len(closed)
-    for k in np.argsort(alone, kind="stable"):
-        if k >= len(closed) and alone[k] <= 0.0:
-            taken[k] = np.all(excess(k, frames[taken], motion[taken]) <= 0.0)
+    for k in sorted(alone, key=alone.__getitem__):
+        taken[k] = alone[k] <= 0.0 and np.all(excess(k, frames[taken], motion[taken]) <= 0.0)
     return [match for match, right in zip(matches, taken[len(closed) :]) if right]
 
 

@@ -119,13 +119,19 @@ class Localizer:
 
         A row of several lines measures the mean of their bearings.
         """
-        discs = [k for k, number in enumerate(rows.disc_ids) if number in self.disc_slots]
-        lines = [
-            k
-            for k, numbers in enumerate(rows.line_ids)
-            if numbers and all(number in self.line_slots for number in numbers)
-        ]
-        self._count(rows, discs, lines)
+        discs, lines, left_out = [], [], self.count.left_out
+        for k, number in enumerate(rows.disc_ids):
+            if number in self.disc_slots:
+                discs.append(k)
+            else:
+                left_out["disc without ID" if number == UNKNOWN_ID else "disc not in the map"] += 1
+        for k, numbers in enumerate(rows.line_ids):
+            if numbers and all(number in self.line_slots for number in numbers):
+                lines.append(k)
+            else:
+                left_out["line not in the map" if numbers else "line without ID"] += 1
+        self.count.discs += len(discs)
+        self.count.lines += len(lines)
         if not discs and not lines:
             return
         error, jacobian, index, noise = innovation_of(rows.only(discs, lines), self, self.state)
@@ -145,16 +151,3 @@ class Localizer:
         self.pose_covariance = self.pose_covariance - factor @ factor.T
         self.count.innovation_squared += float(whitened @ whitened)
         self.count.innovation_numbers += len(error)
-
-    def _count(self, rows: FrameRows, discs: list[int], lines: list[int]) -> None:
-        used_discs, used_lines = set(discs), set(lines)
-        for k, number in enumerate(rows.disc_ids):
-            if k not in used_discs:
-                reason = "disc without ID" if number == UNKNOWN_ID else "disc not in the map"
-                self.count.left_out[reason] += 1
-        for k, numbers in enumerate(rows.line_ids):
-            if k not in used_lines:
-                reason = "line not in the map" if numbers else "line without ID"
-                self.count.left_out[reason] += 1
-        self.count.discs += len(discs)
-        self.count.lines += len(lines)
