@@ -110,8 +110,10 @@ def solve_path(
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
-# Largest squared error of a loop whose odometry errs at random.
+# Largest squared error of a loop whose odometry errs at random; and of how many standard deviations
+# the systematic error of each step may be.
 _MOST_SQUARED = float(chi2.isf(1e-6, 3))
+_SYSTEMATIC_SIGMAS = 2.0
 # Weight of a step that says nothing: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
 NO_STEPS = np.zeros(0, dtype=np.int64)
@@ -218,7 +220,7 @@ def consistent_matches(
     maximization for robust multi-robot map merging", ICRA 2018), and so has each loop by itself.
     Those that odometry agrees with best are taken first, each if all that were taken agree.
 
-    Odometry may err systematically: each step by a standard deviation, all in one direction.
+    Odometry may err systematically: each step by two standard deviations, all in one direction.
 
     Takes matches that are new and those that the path has `closed` already, `path` (N + 1, 3),
     `step_covariance` (N, 3, 3).
@@ -243,8 +245,8 @@ def consistent_matches(
         there = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
         spread = there @ (until[high] - until[low]).sum(axis=1) @ there.T + 2.0 * across
         gap = log_motion(compose(invert(other_motion), motion[k])) @ there.T
-        steps = (high - low).sum(axis=1)
-        return np.asarray(squared_mahalanobis(gap, spread) - steps - _MOST_SQUARED)
+        systematic = _SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
+        return np.asarray(squared_mahalanobis(gap, spread) - systematic - _MOST_SQUARED)
 
     # By itself a match makes a loop with none: that of its earlier frame with itself.
     alone = {
