@@ -170,21 +170,9 @@ def covariance_file(map_file: Path) -> Path:
 
 
 def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite: bool) -> None:
-    """Write a map's joint covariance beside it.
+    """Write a map's joint covariance beside it; errors and `overwrite` as of `write_map`.
 
-    Parameters
-    ----------
-    map_file : Path
-        The map.
-    covariance : (2 M, 2 M) float64
-        x and y of each landmark in the order of the map's rows (m^2).
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
+    Takes `covariance` (2 M, 2 M): x and y of each landmark in the order of the map's rows (m^2).
     """
     content = io.BytesIO()
     np.save(content, np.ascontiguousarray(covariance, dtype=np.float64), allow_pickle=False)
@@ -192,51 +180,36 @@ def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite:
 
 
 def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArray | None:
-    """Read the joint covariance of a map, if there is one beside it.
-
-    Parameters
-    ----------
-    map_file : Path
-        The map.
-    landmark_map : LandmarkMap
-        Its content.
-
-    Returns
-    -------
-    (2 M, 2 M) float64, or None
-        None if there is no such file.
+    """Read the joint covariance (2 M, 2 M) of a map, None if there is no file of it beside.
 
     Raises
     ------
     LandmarkFileError
-        If it is malformed, or not of this map.
+        If it is malformed, or not of this map, whose content is `landmark_map`.
     """
     path = covariance_file(map_file)
     if not path.is_file():
         return None
     own = np.concatenate([landmark_map.discs.covariance, landmark_map.lines.covariance])
+    shape = (2 * len(own), 2 * len(own))
+    most_bytes = max(32 * len(own) ** 2, _SMALL_BYTES)
     try:
         with path.open("rb") as stream:
-            found = read_plain_array(
-                stream, np.dtype(np.float64), 2, max(32 * len(own) ** 2, _SMALL_BYTES)
-            )
-    except OSError as error:
-        raise LandmarkFileError(path, None, f"cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise LandmarkFileError(path, None, f"cannot be read: {error}") from None
-    if found.shape != (2 * len(own), 2 * len(own)) or found.dtype != np.float64:
+            found = read_plain_array(stream, np.dtype(np.float64), 2, most_bytes)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise LandmarkFileError(path, None, f"cannot be read: {reason}") from None
+    if found.shape != shape or found.dtype != np.float64:
         raise LandmarkFileError(
             path,
             None,
-            f"{found.dtype} of shape {found.shape}: expected float64 of "
-            f"{(2 * len(own), 2 * len(own))}, x and y of each landmark of {map_file}",
+            f"{found.dtype} of shape {found.shape}: expected float64 of {shape}, x and y of each "
+            f"landmark of {map_file}",
         )
     k = np.arange(len(own))
     blocks = found.reshape(len(own), 2, len(own), 2)[k, :, k, :]
-    scale = float(np.max(np.abs(own), initial=0.0))
-    if not np.all(np.isfinite(found)) or not np.allclose(
-        blocks, own, rtol=_SAME, atol=_SAME * scale
-    ):
+    nearly = _SAME * float(np.max(np.abs(own), initial=0.0))
+    if not (np.isfinite(found).all() and np.allclose(blocks, own, rtol=_SAME, atol=nearly)):
         raise LandmarkFileError(
             path, None, f"not the covariance of {map_file}: expected that of each landmark"
         )

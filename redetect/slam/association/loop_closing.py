@@ -238,7 +238,7 @@ def consistent_matches(
     motion[: len(closed)] = 0.0
 
     def excess(k: int, other_frames: IntArray, other_motion: FloatArray) -> FloatArray:
-        """By how much the squared errors of loops made of match k and others exceed the bound."""
+        """By how much the squared errors of the loops of match k with others exceed the bound."""
         low, high = np.minimum(frames[k], other_frames), np.maximum(frames[k], other_frames)
         # The loop begins and ends with the later frame.
         x, y = path[frames[k, 1] + 1, :2]

@@ -14,6 +14,7 @@ once.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import count
 from typing import Literal
 
@@ -310,6 +311,6 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
             f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
             "only; expected known association, or a run without lines"
         )
-    filtered = run_filter(recording, ekf, pairing, count(1).__next__)
+    filtered = run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
     ekf.finish()
     return filtered

@@ -215,23 +215,21 @@ class Associator:
 
     method: Association = "known"  # `known`, `nearest` or `joint`
     gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of right rows that pass
+    # The identifier of the next new disc; None: there are none.
+    new_id: Callable[[], int] | None = None
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)
 
-    def identified(
-        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None = None
-    ) -> FrameRows:
+    def identified(self, rows: FrameRows, estimate: Filter) -> FrameRows:
         """Rows with the identifiers of the landmarks they are found to show."""
         if self.method == "known":
             return rows
-        discs = self._discs(rows, estimate, new_id) if rows.disc_ids else ()
+        discs = self._discs(rows, estimate) if rows.disc_ids else ()
         lines = self._lines(rows, estimate) if rows.line_ids else ()
         return replace(rows, disc_ids=discs, line_ids=lines)
 
-    def _discs(
-        self, rows: FrameRows, estimate: Filter, new_id: Callable[[], int] | None
-    ) -> tuple[int, ...]:
+    def _discs(self, rows: FrameRows, estimate: Filter) -> tuple[int, ...]:
         names, slots = _near_discs(rows.disc_xy, estimate)
         found = np.full(len(rows.disc_xy), UNKNOWN_ID, dtype=np.int64)
         closest = np.full(len(found), np.inf)
@@ -246,10 +244,10 @@ class Associator:
             found[landmark >= 0] = names[landmark[landmark >= 0]]
             distances = individual_distances(innovation, spread, rows.disc_covariance)
             closest = np.min(distances, axis=1)
-        if new_id is not None:
+        if self.new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
-                found[k] = new_id()
+                found[k] = self.new_id()
         return tuple(int(number) for number in found)
 
     def _lines(self, rows: FrameRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
@@ -274,13 +272,11 @@ def run_filter(
     recording: Recording,
     estimate: Filter,
     associator: Associator | None = None,
-    new_id: Callable[[], int] | None = None,
 ) -> FilterRun:
     """Take a filter, which is at the start, through a run.
 
-    Rows are paired with landmarks by their identifiers, unless an associator says otherwise;
-    `new_id` gives the next one for a row that is found to show a new disc. Raises `SlamError`,
-    which names the step, if an update is not possible.
+    Rows are paired with landmarks by their identifiers, unless an associator says otherwise. Raises
+    `SlamError`, which names the step, if an update is not possible.
     """
     pairing = associator or Associator()
     disc_ids: list[int] = []
@@ -291,7 +287,7 @@ def run_filter(
     for k, rows in enumerate(frames_of(recording)):
         try:
             estimate.predict(recording.steps[k], recording.step_covariance[k])
-            identified = pairing.identified(rows, estimate, new_id)
+            identified = pairing.identified(rows, estimate)
             estimate.measure(identified)
         except SlamError as error:
             raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
