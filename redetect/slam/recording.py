@@ -198,20 +198,21 @@ def landmark_files(
     if not run.is_dir():
         _demand_landmarks(run)
         return [run]
-    if not circles and not lines:
+    kinds = ["circles"] * circles + ["lines"] * lines
+    if not kinds:
         raise SlamError(f"{run}: neither circles nor lines: expected at least one to be used")
-    found = []
-    for kind, wanted in (("circles", circles), ("lines", lines)):
+    files = []
+    for kind in kinds:
         candidates = [run / f"{name}.{kind}" for name in ([stem] if stem else ["map", "detected"])]
-        present = [path for path in candidates if path.is_file()]
-        if wanted and not present:
+        found = next((path for path in candidates if path.is_file()), None)
+        if found is None:
             expected = " or ".join(path.name for path in candidates)
             raise SlamError(
                 f"{run}: no landmarks: expected {expected} in it: `detect {kind}` writes "
                 f"detected.{kind}, --stem says how another file is called"
             )
-        found += present[:1] if wanted else []
-    return found
+        files.append(found)
+    return files
 
 
 def _demand_landmarks(path: Path) -> None:
