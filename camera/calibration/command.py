@@ -226,7 +226,11 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         f"image), {spread.max():.3f} px at most"
     )
     for name, rms in calibration.outliers:
-        lines.append(f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)")
+        lines.append(
+            f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)"
+            if np.isfinite(rms)
+            else f"left out: {name}, where no pose of the board is seen as it was found"
+        )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
 
@@ -268,7 +272,10 @@ def report_text(
                 adjusted.estimate.translations,
             )
         ],
-        "left_out": [{"name": name, "rms_px": rms} for name, rms in calibration.outliers],
+        "left_out": [
+            {"name": name, "rms_px": rms if np.isfinite(rms) else None}
+            for name, rms in calibration.outliers
+        ],
         "points_per_cell": coverage(calibration.points).tolist(),
         "normals_spread_deg": calibration.spread_deg,
         "projection_sigma_px": projection_sigma(camera, adjusted.covariance).round(6).tolist(),

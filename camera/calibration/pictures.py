@@ -77,17 +77,19 @@ def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
 
 
 def _draw_views(calibration: Calibration, figure: Figure) -> None:
-    rms = calibration.view_rms_px
-    shown = len(rms) + len(calibration.outliers)
-    axes = figure.add_subplot()
+    used, outliers = len(calibration.names), len(calibration.outliers)
     names = [*calibration.names, *(name for name, _ in calibration.outliers)]
-    values = [*rms, *(value for _, value in calibration.outliers)]
-    colours = ["tab:blue"] * len(rms) + ["tab:red"] * len(calibration.outliers)
-    axes.bar(np.arange(shown), values, color=colours)
+    values = np.array([*calibration.view_rms_px, *(value for _, value in calibration.outliers)])
+    # Of those without a residual, the whole height.
+    top = 1.1 * float(values[np.isfinite(values)].max())
+    colours = ["tab:blue"] * used + ["tab:red"] * outliers
+    axes = figure.add_subplot()
+    axes.bar(np.arange(len(names)), np.minimum(values, top), color=colours)
     axes.axhline(calibration.adjusted.rms_px, color="0.3", lw=0.8)
-    axes.set_xticks(np.arange(shown), names, rotation=90, fontsize=6)
+    axes.set_ylim(0.0, top)
+    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=6)
     axes.set_ylabel("RMS residual (px)")
-    axes.set_title("Each picture; red: left out" if calibration.outliers else "Each picture")
+    axes.set_title("Each picture; red: left out" if outliers else "Each picture")
 
 
 def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:

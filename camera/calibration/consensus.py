@@ -1,0 +1,157 @@
+"""Which pictures one camera explains, and which contradict them.
+
+A board that was found a square off, or another board, must neither end a calibration nor bend it:
+such pictures are left out of the fit, and taken in again where they agree with the others after
+all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, project_estimate
+from camera.calibration.model import CalibrationSettings, FreeLens
+from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
+from camera.errors import CalibrationError
+from redetect.array_types import BoolArray, FloatArray
+
+# A view contradicts the others by so many times their median residual: with one coefficient of the
+# lens, which leaves residuals of its own in the image's corners, and with all of them.
+_FAR_AT_FIRST, _FAR = 10.0, 3.0
+# Of a view's points the farthest off don't count for that: single ones are left out by themselves.
+_COUNTED_SHARE = 0.95
+_ROUNDS = 3
+# Below this the focal length hangs on the perspective of single views alone.
+_SMALLEST_SPREAD_DEG = 3.0
+_LARGEST_SCALE_SIGMA = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """A camera that was fitted to some views, and how well it explains each.
+
+    Attributes
+    ----------
+    fit : Adjusted
+        To those views.
+    estimate : Estimate
+        With the poses of all views.
+    rms_px : (V,) float64
+        RMS residual of each view; infinite where the camera sees its board in no pose.
+    agree : (V,) bool
+        Whether the residuals of a view, all but those of single points, are not far above those of
+        the views that it was fitted to.
+    """
+
+    fit: Adjusted
+    estimate: Estimate
+    rms_px: FloatArray
+    agree: BoolArray
+
+
+def find_consensus(points: Points, settings: CalibrationSettings, radius_m: float) -> Consensus:
+    """The camera that most views agree on, with all coefficients free that may be.
+
+    Takes the radius of circles (m), 0 for points.
+
+    Raises
+    ------
+    StartError
+        If no camera sees most of the views where they are.
+    CalibrationError
+        If views are too much alike.
+    """
+
+    def fitted(estimate: Estimate, used: BoolArray, lens: FreeLens) -> Consensus:
+        return _fitted(estimate, used, points, settings, lens, radius_m)
+
+    estimate = first_estimate(points, settings.aspect)
+    errors = view_errors(estimate, points)
+    used = errors <= _FAR_AT_FIRST * np.median(errors)
+    few = min(2, settings.most)
+    for count in (1, few):
+        fit = fitted(estimate, used, settings.lens(count))
+        estimate = best_poses(fit.estimate, points)
+    for count in range(few, settings.most + 1):
+        found = fitted(estimate, used, settings.lens(count))
+        estimate = found.estimate
+    # Checked before terms are fitted that such views do not determine.
+    demand_different_views(found.fit)
+    lens = settings.lens(settings.most, tangential=settings.tangential is not False)
+    if lens.tangential:
+        found = fitted(estimate, used, lens)
+    for _ in range(_ROUNDS):
+        if np.all(found.agree[used]):
+            break
+        used = used & found.agree
+        found = fitted(found.estimate, used, lens)
+    # What only few views show, as the lens in a corner, is not known before one of them joins.
+    for view in np.argsort(found.rms_px):
+        more = used | (np.arange(len(used)) == view)
+        if used[view] or not np.isfinite(found.rms_px[view]):
+            continue
+        other = fitted(found.estimate, more, lens)
+        if not np.all(other.agree[more]):
+            break
+        found, used = other, more
+    return found
+
+
+def _fitted(
+    estimate: Estimate,
+    used: BoolArray,
+    points: Points,
+    settings: CalibrationSettings,
+    lens: FreeLens,
+    radius_m: float,
+) -> Consensus:
+    """Fit to the views that are used; of the others the poses alone."""
+    views, others = np.flatnonzero(used), np.flatnonzero(~used)
+    fit, _ = fit_points(estimate.of(views), points.of(views), settings, lens, radius_m)
+    rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
+    rotations[views], translations[views] = fit.estimate.rotations, fit.estimate.translations
+    residuals = np.empty_like(points.pixels)
+    residuals[used[points.views]] = fit.residuals
+    if len(others):
+        rest = points.of(others)
+        start = replace(estimate.of(others), intrinsics=fit.estimate.intrinsics)
+        posed = best_poses(start, rest)
+        rotations[others], translations[others] = posed.rotations, posed.translations
+        residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
+    typical = view_rms(residuals, points, _COUNTED_SHARE)
+    rms = view_rms(residuals, points)
+    return Consensus(
+        fit=fit,
+        estimate=Estimate(fit.estimate.intrinsics, rotations, translations),
+        rms_px=rms,
+        agree=(typical <= _FAR * np.median(typical[used])) & np.isfinite(rms),
+    )
+
+
+def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:
+    """(V,) root of the mean squared distance of each view's points, the nearest share of them.
+
+    Infinite where one of these is NaN.
+    """
+    squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
+    ordered = squares[np.lexsort((squares, points.views))]
+    of_views = np.split(ordered, np.cumsum(points.counts)[:-1])
+    return np.sqrt([np.mean(some[: int(np.ceil(share * len(some)))]) for some in of_views])
+
+
+def demand_different_views(fit: Adjusted) -> None:
+    """Refuse views that do not separate focal length and distance."""
+    spread_deg = normals_spread_deg(fit.estimate.rotations)
+    variance = float(fit.covariance[0, 0])
+    # In a singular problem rounding can make the variance zero or negative.
+    sigma = np.sqrt(variance) if variance > 0.0 else np.inf
+    relative = float(sigma / fit.estimate.intrinsics[0])
+    if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
+        raise CalibrationError(
+            f"the boards have almost the same orientation: their normals differ by at most "
+            f"{spread_deg:.1f} deg and leave the focal length {100.0 * relative:.2g} % uncertain, "
+            "because it is not separable from the distance; tilt the board by 20 to 45 deg in "
+            "different directions between pictures"
+        )
