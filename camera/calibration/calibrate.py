@@ -17,7 +17,12 @@ from camera.calibration.adjustment import (
     project_estimate,
 )
 from camera.calibration.choice import choose_lens
-from camera.calibration.consensus import demand_different_views, find_consensus, view_rms
+from camera.calibration.consensus import (
+    demand_different_views,
+    find_consensus,
+    scale_warnings,
+    view_rms,
+)
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
 from camera.errors import CalibrationError
@@ -217,7 +222,7 @@ def calibrate(
     adjusted, points = tried[lens].adjusted, tried[lens].points
     spread = normals_spread_deg(adjusted.estimate.rotations)
     demand_different_views(adjusted)
-    warnings = warnings_of(adjusted, points, spread)
+    warnings = warnings_of(adjusted, points, spread) + scale_warnings(adjusted, points, names)
     if wrong:
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}

@@ -7,6 +7,7 @@ all.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray
+from redetect.least_squares.solver import scaled_inverse
 
 # A view contradicts the others by so many times their median residual: with one coefficient of the
 # lens, which leaves residuals of its own in the image's corners, and with all of them.
@@ -23,6 +25,9 @@ _FAR_AT_FIRST, _FAR = 10.0, 3.0
 # Of a view's points the farthest off don't count for that: single ones are left out by themselves.
 _COUNTED_SHARE = 0.95
 _ROUNDS = 3
+# Views differ in scale if that is so much, relatively, and its variance so many times that of
+# noise: boards that are not flat, and a lens that is not quite the model's, ask for some, too.
+_SCALE_CHANGE, _SCALE_VARIANCES = 0.01, 20.0
 # Below this the focal length hangs on the perspective of single views alone.
 _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
@@ -155,3 +160,43 @@ def demand_different_views(fit: Adjusted) -> None:
             "because it is not separable from the distance; tilt the board by 20 to 45 deg in "
             "different directions between pictures"
         )
+
+
+def scale_warnings(fit: Adjusted, points: Points, names: Sequence[str]) -> list[str]:
+    """Whether views contradict each other in scale, which a pose takes up all but a little of."""
+    change, variance = scale_changes(fit, points)
+    weight = 1.0 / variance
+    change = change - np.average(change, weights=weight)
+    ratio = float(np.sum(weight * change**2)) / (len(change) - 1)
+    # The variance between views beyond that of noise (DerSimonian and Laird, Controlled Clinical
+    # Trials 7, 1986).
+    total = weight.sum()
+    spread = np.sqrt(
+        max(ratio - 1.0, 0.0) * (len(change) - 1) / (total - (weight @ weight) / total)
+    )
+    if ratio < _SCALE_VARIANCES or spread < _SCALE_CHANGE:
+        return []
+    near, far = (
+        ", ".join(name for name, chosen in zip(names, some) if chosen)
+        for some in (change > 0.0, change <= 0.0)
+    )
+    return [
+        f"the pictures contradict each other in scale by {100.0 * spread:.1f} %: did zoom or "
+        f"autofocus change? It is larger in {near} than in {far}"
+    ]
+
+
+def scale_changes(fit: Adjusted, points: Points) -> tuple[FloatArray, FloatArray]:
+    """(V,) relative changes of both scales that each view asks for by itself, and variances."""
+    _, by_intrinsics, by_pose = project_estimate(fit.estimate, points)
+    by_scale = by_intrinsics[:, :, :2] @ fit.estimate.intrinsics[:2]
+    root = np.sqrt(fit.weights)
+    by = root[..., None] * np.concatenate([by_scale[..., None], by_pose], axis=-1)
+    changes, variances = [], []
+    for view in range(len(points.counts)):
+        rows = points.views == view
+        jacobian, residuals = by[rows].reshape(-1, 7), (root * fit.residuals)[rows].ravel()
+        inverse = scaled_inverse(jacobian.T @ jacobian)
+        changes.append((inverse @ jacobian.T @ residuals)[0])
+        variances.append(fit.sigma_px**2 * inverse[0, 0])
+    return np.array(changes), np.array(variances)
