@@ -30,9 +30,16 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
-# Points are found to some tenths of a pixel; in large images, which are softer, less well.
 _LARGEST_RMS_PX = 1.0
 _LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+
+
+def largest_rms_px(width: int) -> float:
+    """RMS residual up to which points are explained: they are found to some tenths of a pixel.
+
+    In large images, which are softer, less well.
+    """
+    return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
 def demand_enough(count: int, without: str = "") -> None:
@@ -47,7 +54,7 @@ def demand_enough(count: int, without: str = "") -> None:
 def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
     """Warnings about weaknesses of a calibration."""
     warnings = []
-    if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
+    if fit.rms_px > largest_rms_px(points.width):
         warnings.append(
             f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is "
             "the board flat, are --board, --columns and --rows right, and does the lens see less "
