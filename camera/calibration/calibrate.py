@@ -18,6 +18,7 @@ from camera.calibration.adjustment import (
 )
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
+    ContradictionError,
     demand_different_views,
     find_consensus,
     scale_warnings,
@@ -211,11 +212,6 @@ def calibrate(
         consensus = find_consensus(measured, settings, radius)
         kept = np.isfinite(consensus.rms_px) if settings.keep_outliers else consensus.agree
         outliers = tuple((names[v], float(consensus.rms_px[v])) for v in np.flatnonzero(~kept))
-        if 2 * len(outliers) >= len(names):
-            raise CalibrationError(
-                f"no camera explains most of the pictures: one explains {_listed(names, kept)}, and"
-                f" {_listed(names, ~kept)} contradict it; {_ALL_THE_SAME}"
-            )
         demand_enough(len(names) - len(outliers), f" without {_listed(names, ~kept)}")
         used = np.flatnonzero(kept)
         start, measured = consensus.estimate.of(used), measured.of(used)
@@ -223,8 +219,14 @@ def calibrate(
             start, measured, consensus.fit.sigma_px, settings, radius
         )
         lens, tried = choose_lens(start, measured, settings, radius)
+    except ContradictionError as error:
+        which = ""
+        if error.agree.any():
+            one, others = _listed(names, error.agree), _listed(names, ~error.agree)
+            which = f" of most pictures: one that explains {one} is contradicted by {others}"
+        raise CalibrationError(f"no camera explains the points{which}; {_ALL_THE_SAME}") from None
     except (StartError, np.linalg.LinAlgError):
-        raise CalibrationError(f"no camera explains the points found: {_ALL_THE_SAME}") from None
+        raise CalibrationError(f"no camera explains the points; {_ALL_THE_SAME}") from None
     names = tuple(names[v] for v in used)
     adjusted, points = tried[lens].adjusted, tried[lens].points
     spread = normals_spread_deg(adjusted.estimate.rotations)

@@ -33,6 +33,14 @@ _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
 
 
+class ContradictionError(ValueError):
+    """No camera explains most of the views; `agree` (V,) says which ones the best explains."""
+
+    def __init__(self, agree: BoolArray) -> None:
+        super().__init__("no camera explains most of the views")
+        self.agree = agree
+
+
 @dataclass(frozen=True, eq=False)
 class Consensus:
     """A camera that was fitted to some views, and how well it explains each.
@@ -63,8 +71,10 @@ def find_consensus(points: Points, settings: CalibrationSettings, radius_m: floa
 
     Raises
     ------
+    ContradictionError
+        If no camera explains most of the views.
     StartError
-        If no camera sees most of the views where they are.
+        If none explains any.
     CalibrationError
         If views are too much alike.
     """
@@ -74,7 +84,10 @@ def find_consensus(points: Points, settings: CalibrationSettings, radius_m: floa
 
     estimate = first_estimate(points, settings.aspect)
     errors = view_errors(estimate, points)
-    used = errors <= _FAR_AT_FIRST * np.median(errors)
+    used = np.isfinite(errors)
+    if used.any():
+        used &= errors <= _FAR_AT_FIRST * np.median(errors[used])
+    _demand_most(used)
     few = min(2, settings.most)
     for count in (1, few):
         fit = fitted(estimate, used, settings.lens(count))
@@ -101,7 +114,15 @@ def find_consensus(points: Points, settings: CalibrationSettings, radius_m: floa
         if not np.all(other.agree[more]):
             break
         found, used = other, more
+    if not settings.keep_outliers:
+        _demand_most(found.agree)
     return found
+
+
+def _demand_most(agree: BoolArray) -> None:
+    """Refuse what at most half of the views agree on."""
+    if 2 * agree.sum() <= len(agree):
+        raise ContradictionError(agree)
 
 
 def _fitted(

@@ -29,7 +29,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
     chosen = np.unique(np.linspace(0, len(points.counts) - 1, _FEW_VIEWS).round().astype(np.int64))
     few = points.of(chosen)
     ratio = 1.0 if aspect is None else aspect
-    best, lowest = None, np.inf
+    best, lowest = None, (np.inf, 0)
     for widths in _FOCAL_WIDTHS:
         focal = widths * points.width
         intrinsics = np.array(
@@ -37,7 +37,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
         )
         start = board_poses(intrinsics, few)[0]
         seen = np.flatnonzero(np.isfinite(view_errors(start, few)))
-        if 2 * len(seen) <= len(chosen):
+        if not len(seen):
             continue
         try:
             fit = adjust(start.of(seen), few.of(seen), free_span(1, ratio), tolerance=_LOOSE)
@@ -46,8 +46,9 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
         # Of all points, so that a focal length gains nothing by views that it doesn't see.
         errors = np.full(few.pixels.size, np.inf)
         errors[: fit.residuals.size] = np.abs(fit.residuals).ravel()
-        if np.median(errors) < lowest:
-            best, lowest = fit.estimate.intrinsics, float(np.median(errors))
+        error = float(np.median(errors)), -len(seen)
+        if error < lowest:
+            best, lowest = fit.estimate.intrinsics, error
     if best is None:
         raise StartError("no focal length explains the points")
     return best_poses(board_poses(best, points)[0], points)
