@@ -18,16 +18,17 @@ from camera.calibration.adjustment import (
 )
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
-    ContradictionError,
+    ALL_THE_SAME,
     demand_different_views,
     find_consensus,
+    listed,
     scale_warnings,
     view_rms,
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
 from camera.errors import CalibrationError
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
@@ -109,10 +110,6 @@ _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
 # Pictures that leave the ratio of the scales more uncertain than this leave it open.
 _ASPECT_SIGMA = 0.003
-_ALL_THE_SAME = (
-    "are --columns, --rows and the kind of --board right, and do all pictures show the same board "
-    "by the same camera at the same zoom?"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,24 +206,18 @@ def calibrate(
     radius = 0.5 * board.circle_m
     try:
         # With the fullest model: residuals of a simpler one are partly its own.
-        consensus = find_consensus(measured, settings, radius)
+        consensus = find_consensus(measured, names, settings, radius)
         kept = np.isfinite(consensus.rms_px) if settings.keep_outliers else consensus.agree
         outliers = tuple((names[v], float(consensus.rms_px[v])) for v in np.flatnonzero(~kept))
-        demand_enough(len(names) - len(outliers), f" without {_listed(names, ~kept)}")
+        demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)
         start, measured = consensus.estimate.of(used), measured.of(used)
         measured, wrong = _without_wrong_points(
             start, measured, consensus.fit.sigma_px, settings, radius
         )
         lens, tried = choose_lens(start, measured, settings, radius)
-    except ContradictionError as error:
-        which = ""
-        if error.agree.any():
-            one, others = _listed(names, error.agree), _listed(names, ~error.agree)
-            which = f" of most pictures: one that explains {one} is contradicted by {others}"
-        raise CalibrationError(f"no camera explains the points{which}; {_ALL_THE_SAME}") from None
     except (StartError, np.linalg.LinAlgError):
-        raise CalibrationError(f"no camera explains the points; {_ALL_THE_SAME}") from None
+        raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
     names = tuple(names[v] for v in used)
     adjusted, points = tried[lens].adjusted, tried[lens].points
     spread = normals_spread_deg(adjusted.estimate.rotations)
@@ -287,10 +278,6 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
         width=size[0],
         height=size[1],
     )
-
-
-def _listed(names: Sequence[str], chosen: BoolArray) -> str:
-    return ", ".join(name for name, is_chosen in zip(names, chosen) if is_chosen)
 
 
 def _without_wrong_points(

@@ -25,20 +25,16 @@ _FAR_AT_FIRST, _FAR = 10.0, 3.0
 # Of a view's points the farthest off don't count for that: single ones are left out by themselves.
 _COUNTED_SHARE = 0.95
 _ROUNDS = 3
+ALL_THE_SAME = (
+    "are --columns, --rows and the kind of --board right, and do all pictures show the same board "
+    "by the same camera at the same zoom?"
+)
 # Views differ in scale if that is so much, relatively, and its variance so many times that of
 # noise: boards that are not flat, and a lens that is not quite the model's, ask for some, too.
 _SCALE_CHANGE, _SCALE_VARIANCES = 0.01, 20.0
 # Below this the focal length hangs on the perspective of single views alone.
 _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
-
-
-class ContradictionError(ValueError):
-    """No camera explains most of the views; `agree` (V,) says which ones the best explains."""
-
-    def __init__(self, agree: BoolArray) -> None:
-        super().__init__("no camera explains most of the views")
-        self.agree = agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +60,19 @@ class Consensus:
     agree: BoolArray
 
 
-def find_consensus(points: Points, settings: CalibrationSettings, radius_m: float) -> Consensus:
+def find_consensus(
+    points: Points, names: Sequence[str], settings: CalibrationSettings, radius_m: float
+) -> Consensus:
     """The camera that most views agree on, with all coefficients free that may be.
 
-    Takes the radius of circles (m), 0 for points.
+    Takes the views' names, and the radius of circles (m), 0 for points.
 
     Raises
     ------
-    ContradictionError
-        If no camera explains most of the views.
+    CalibrationError
+        If no camera explains most of the views, or they are too much alike.
     StartError
         If none explains any.
-    CalibrationError
-        If views are too much alike.
     """
 
     def fitted(estimate: Estimate, used: BoolArray, lens: FreeLens) -> Consensus:
@@ -87,7 +83,7 @@ def find_consensus(points: Points, settings: CalibrationSettings, radius_m: floa
     used = np.isfinite(errors)
     if used.any():
         used &= errors <= _FAR_AT_FIRST * np.median(errors[used])
-    _demand_most(used)
+    _demand_most(used, names)
     few = min(2, settings.most)
     for count in (1, few):
         fit = fitted(estimate, used, settings.lens(count))
@@ -115,14 +111,22 @@ def find_consensus(points: Points, settings: CalibrationSettings, radius_m: floa
             break
         found, used = other, more
     if not settings.keep_outliers:
-        _demand_most(found.agree)
+        _demand_most(found.agree, names)
     return found
 
 
-def _demand_most(agree: BoolArray) -> None:
+def _demand_most(agree: BoolArray, names: Sequence[str]) -> None:
     """Refuse what at most half of the views agree on."""
     if 2 * agree.sum() <= len(agree):
-        raise ContradictionError(agree)
+        raise CalibrationError(
+            f"no camera explains most of the pictures: {listed(names, ~agree)} contradict "
+            f"{listed(names, agree) or 'each other'}; {ALL_THE_SAME}"
+        )
+
+
+def listed(names: Sequence[str], chosen: BoolArray) -> str:
+    """Names of some views."""
+    return ", ".join(name for name, is_chosen in zip(names, chosen) if is_chosen)
 
 
 def _fitted(
@@ -197,13 +201,10 @@ def scale_warnings(fit: Adjusted, points: Points, names: Sequence[str]) -> list[
     )
     if ratio < _SCALE_VARIANCES or spread < _SCALE_CHANGE:
         return []
-    near, far = (
-        ", ".join(name for name, chosen in zip(names, some) if chosen)
-        for some in (change > 0.0, change <= 0.0)
-    )
     return [
         f"the pictures contradict each other in scale by {100.0 * spread:.1f} %: did zoom or "
-        f"autofocus change? It is larger in {near} than in {far}"
+        f"autofocus change? It is larger in {listed(names, change > 0.0)} than in "
+        f"{listed(names, change <= 0.0)}"
     ]
 
 

@@ -126,7 +126,7 @@ def test_pictures_that_contradict_each_other_are_named() -> None:
     views = seen_views(4)
     for view in (1, 2):
         nowhere(views[view])
-    with pytest.raises(CalibrationError, match=r"explains 00.png, 03.png is .* by 01.png, 02.png"):
+    with pytest.raises(CalibrationError, match=r"01.png, 02.png contradict 00.png, 03.png"):
         calibrate(views, BOARD, (640, 480), SETTINGS)
     views = seen_views(3)
     a_square_off(views[1])
