@@ -97,19 +97,10 @@ def find_consensus(
     if lens.tangential:
         found = fitted(estimate, used, lens)
     for _ in range(_ROUNDS):
-        if np.all(found.agree[used]):
+        if np.array_equal(found.agree, used):
             break
-        used = used & found.agree
+        used = found.agree
         found = fitted(found.estimate, used, lens)
-    # What only few views show, as the lens in a corner, is not known before one of them joins.
-    for view in np.argsort(found.rms_px):
-        more = used | (np.arange(len(used)) == view)
-        if used[view] or not np.isfinite(found.rms_px[view]):
-            continue
-        other = fitted(found.estimate, more, lens)
-        if not np.all(other.agree[more]):
-            break
-        found, used = other, more
     if not settings.keep_outliers:
         _demand_most(found.agree, names)
     return found

@@ -70,9 +70,7 @@ def assert_true(found: Calibration) -> None:
     assert not any("in scale" in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize(
-    "wrong", [(7,), (0, 7), pytest.param((3, 4, 8, 11, 12), marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("wrong", [(0, 7), pytest.param((3, 4, 8, 11, 12), marks=pytest.mark.long)])
 def test_boards_found_a_square_off_are_left_out(wrong: tuple[int, ...]) -> None:
     views = seen_views()
     for view in wrong:
@@ -82,13 +80,7 @@ def test_boards_found_a_square_off_are_left_out(wrong: tuple[int, ...]) -> None:
     assert_true(found)
 
 
-def test_another_board_is_left_out() -> None:
-    found = calibrate(seen_views(stretched=[5]), BOARD, (640, 480), SETTINGS)
-    assert [name for name, _ in found.outliers] == ["05.png"]
-    assert_true(found)
-
-
-def test_one_of_few_is_left_out() -> None:
+def test_another_board_is_left_out_even_of_few() -> None:
     views = seen_views(5, stretched=[2])
     found = calibrate(views, BOARD, (640, 480), SETTINGS)
     assert [name for name, _ in found.outliers] == ["02.png"]
