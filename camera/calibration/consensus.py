@@ -35,6 +35,8 @@ _SCALE_CHANGE, _SCALE_VARIANCES = 0.01, 20.0
 # Below this the focal length hangs on the perspective of single views alone.
 _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
+# Such boards do not have almost the same orientation.
+_WIDE_SPREAD_DEG = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +171,22 @@ def demand_different_views(fit: Adjusted) -> None:
     # In a singular problem rounding can make the variance zero or negative.
     sigma = np.sqrt(variance) if variance > 0.0 else np.inf
     relative = float(sigma / fit.estimate.intrinsics[0])
-    if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
+    if spread_deg >= _SMALLEST_SPREAD_DEG and relative < _LARGEST_SCALE_SIGMA:
+        return
+    uncertain = f"the focal length {100.0 * relative:.2g} % uncertain"
+    tilt = "tilt the board by 20 to 45 deg in different directions between pictures"
+    if spread_deg < _WIDE_SPREAD_DEG:
         raise CalibrationError(
             f"the boards have almost the same orientation: their normals differ by at most "
-            f"{spread_deg:.1f} deg and leave the focal length {100.0 * relative:.2g} % uncertain, "
-            "because it is not separable from the distance; tilt the board by 20 to 45 deg in "
-            "different directions between pictures"
+            f"{spread_deg:.1f} deg and leave {uncertain}, because it is not separable from the "
+            f"distance; {tilt}"
         )
+    u, v = fit.estimate.intrinsics[2:4].tolist()
+    raise CalibrationError(
+        f"the pictures do not determine the lens: they leave {uncertain}, with the principal point "
+        f"at {u:.0f}, {v:.0f}; {tilt}, hold it nearer, and measure it: it may be longer than "
+        "--square-m one way only"
+    )
 
 
 def scale_warnings(fit: Adjusted, points: Points, names: Sequence[str]) -> list[str]:

@@ -14,8 +14,10 @@ import pytest
 from scipy.stats import chi2
 
 from camera import Camera, read_camera
-from camera.calibration.calibrate import BoardView, Calibration, calibrate
+from camera.calibration.adjustment import Estimate, fit_points
+from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.command import camera_of, report_text
+from camera.calibration.consensus import demand_different_views
 from camera.calibration.model import CalibrationSettings, rotation_of
 from camera.calibration.pictures import pictures
 from camera.cli import main
@@ -124,6 +126,17 @@ def test_pictures_that_contradict_each_other_are_named() -> None:
     a_square_off(views[1])
     with pytest.raises(CalibrationError, match=r"2 pictures of the board without 01.png"):
         calibrate(views, BOARD, (640, 480), SETTINGS)
+
+
+def test_what_different_orientations_do_not_determine_is_not_put_on_them() -> None:
+    poses = board_poses(TRUTH, BOARD, 6, SEED, distances_m=(0.3, 0.6))
+    truth = Estimate(intrinsics_of(TRUTH), *map(np.stack, zip(*poses)))
+    points = points_of(seen_views(6), BOARD, (640, 480))
+    fit, _ = fit_points(truth, points, SETTINGS, SETTINGS.lens(2), 0.0)
+    demand_different_views(fit)
+    unsure = replace(fit, covariance=1e4 * fit.covariance)
+    with pytest.raises(CalibrationError, match=r"not determine the lens.*% uncertain.* 32\d, 23\d"):
+        demand_different_views(unsure)
 
 
 @pytest.mark.long
