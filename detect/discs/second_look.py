@@ -46,7 +46,7 @@ GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.24
 #: Least log-odds of a glance: where so many edges vote for the place as the last says, less.
-_LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.0, -2.5, 2.6
+_LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.3, -0.7, 3.0
 #: Least share of the rim that is on a circle.
 _LEAST_RIM = 0.3
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
