@@ -36,7 +36,7 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def run(block: Block) -> None:
-    """Do what a block says; programs of the project run in this process, which saves their start."""
+    """Do what a block says; the project's own programs in this process, which saves their start."""
     if block.language == "python":
         exec(compile("\n".join(block.lines), block.name, "exec"), {"__name__": "__main__"})
         return

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, event, given, settings
+from hypothesis import assume, event, given
 from hypothesis import strategies as st
 
 from camera import Camera
@@ -204,7 +204,6 @@ def shapes(draw: st.DrawFn) -> DiscShape:
     )
 
 
-@settings(deadline=None)
 @given(cameras(largest_side=60))
 def test_any_camera_s_floor_is_that_of_its_pixels(camera: Camera) -> None:
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
@@ -255,7 +254,6 @@ def test_images_of_any_size_have_tables(width: int, height: int) -> None:
         assert_table_is(table, plain_outlines(camera, shape))
 
 
-@settings(deadline=None)
 @given(cameras(largest_side=40, down_deg=(-10.0, 90.0)), shapes())
 def test_any_camera_s_table_is_what_a_plain_computation_says(
     camera: Camera, shape: DiscShape

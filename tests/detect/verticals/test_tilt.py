@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
@@ -48,7 +48,6 @@ def seen_normals(
     roll=st.floats(-4.9, 4.9),
     seed=st.integers(0, 2**31),
 )
-@settings(max_examples=40, deadline=None)
 def test_exact_verticals_give_the_tilt_back(pitch: float, roll: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = np.radians(pitch), np.radians(roll)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -110,7 +110,6 @@ def onboard(
 
 
 @given(st.floats(0.5, 9.5), st.floats(0.5, 6.5), st.floats(-math.pi, math.pi))
-@settings(max_examples=40, deadline=None)
 def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -> None:
     survey = survey_of()
     found = solved(measured((x, y, theta), survey), survey)
