@@ -21,7 +21,7 @@ from tools.simulator.driving import tilted_camera
 from tools.simulator.observation import published_covariance
 from tools.simulator.runs import DEMO, RunPlan, RunSettings, plan_run, render_frame, write_rows
 
-SETTINGS = RunSettings(name="sim", frames=40, seed=3, discs=25, lookalikes=10)
+SETTINGS = RunSettings(name="sim", frames=25, seed=3, discs=25, lookalikes=10)
 
 
 @pytest.fixture(scope="module")
