@@ -99,7 +99,7 @@ def _compile_modules(environment: Path) -> None:
     `detect`, and for each of its workers. The packages' own tests, a quarter of it, are left out.
     """
     command = [str(environment / "bin" / "python"), "-m", "compileall", "-qq", "-j", "0"]
-    command += ["-x", r"/tests?/"]
+    command += ["-x", r"site-packages/.*/tests?/"]
     # Some files are templates, or for other versions of Python, and no modules here.
     subprocess.run([*command, str(environment)], check=False)
 

@@ -207,7 +207,7 @@ def test_blurred_edges_among_texture_do_not_overstate_the_tilt(narrow: bool) -> 
     table = build_vertical_table(camera)
     rng = np.random.default_rng(9)
     squared = []
-    for _ in range(24):
+    for _ in range(16):
         true = np.radians(rng.uniform(-1.5, 1.5, 2))
         bearings = np.linspace(-0.55, 0.55, 7) + rng.uniform(-0.05, 0.05, 7)
         edges = [Edge(b, 60.0 * (-1.0) ** i) for i, b in enumerate(bearings)]
