@@ -214,14 +214,14 @@ def normalised_errors(
 def test_the_normalised_error_is_that_of_its_distribution(
     calibration_sigma: float, floor: bool, cameras: int
 ) -> None:
-    draws = 100
+    draws = 50
     squares, plane, costs = normalised_errors(
         draws, seed=7, calibration_sigma=calibration_sigma, floor=floor, cameras=cameras
     )
     for values, dof in ((squares, 6), (plane, 3)):
         low, high = chi2.ppf([0.005, 0.995], dof * draws) / draws
         assert low < np.mean(values) < high
-    assert np.mean(costs) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(costs) == pytest.approx(1.0, abs=0.15)
 
 
 def test_without_the_calibrations_uncertainty_the_error_is_underestimated() -> None:
