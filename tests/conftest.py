@@ -15,9 +15,9 @@ from hypothesis import settings
 from camera import Camera, parse_camera
 from tools.published_camera import PUBLISHED_CAM
 
-# Compiling takes longer than any deadline, and a test that fails must fail again. Half as many
-# examples as by default: the same ones each time, more of them tell little.
-settings.register_profile("project", deadline=None, derandomize=True, max_examples=50)
+# Compiling takes longer than any deadline, and a test that fails must fail again. A third of the
+# examples of the default: the same ones each time, more of them tell little.
+settings.register_profile("project", deadline=None, derandomize=True, max_examples=30)
 settings.load_profile("project")
 
 ROOT = Path(__file__).resolve().parent.parent

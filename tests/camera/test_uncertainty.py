@@ -70,7 +70,7 @@ def test_poses_of_the_floor_err_as_stated(published_camera: Camera) -> None:
     places = np.stack(np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-3, -1, 5)), -1).reshape(-1, 2)
     pixels, seen = truth.project_floor(places), truth.project_floor(FLOOR)
     squared = []
-    for _ in range(60):
+    for _ in range(40):
         wrong = with_intrinsics(
             truth, intrinsics_of(truth) + rng.multivariate_normal(np.zeros(COUNT), lens)
         )

@@ -159,7 +159,7 @@ def test_disc_at_the_side_border(published_camera: Camera, side: int) -> None:
     assert_found_once(detect(image, published_camera), place[None], within_m=0.01)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     x=st.floats(-0.8, 0.8),
     y=st.floats(-3.0, -0.95),
@@ -392,7 +392,7 @@ def mirrored_rows(found: CircleDetections, width: int) -> CircleDetections:
     )
 
 
-@settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=10, phases=[Phase.explicit, Phase.generate])
 @given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-0.2, 0.2))
 def test_mirrored_image_and_camera_give_mirrored_rows(
     published_camera: Camera, seed: int, shift: float
@@ -464,7 +464,7 @@ def test_tilt_jacobian_is_how_positions_move(published_camera: Camera) -> None:
 
 @pytest.mark.long
 def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera: Camera) -> None:
-    result = measure_accuracy(published_camera, DEFAULT, Scene(), discs=400, seed=4)
+    result = measure_accuracy(published_camera, DEFAULT, Scene(), discs=200, seed=4)
     assert result.failed == 0
     assert result.rms_px <= 0.02
     assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5

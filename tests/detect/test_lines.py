@@ -142,7 +142,7 @@ def test_published_presets_keep_their_margins(preset: LineSettings, margin: floa
 
 
 @given(gain=st.floats(0.8, 2.0), offset=st.floats(0.0, 10.0))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_affine_brightness_does_not_matter(gain: float, offset: float) -> None:
     """Up to quantisation and what the regulariser adds."""
     plain = [Edge(edge.bearing_rad, 0.6 * edge.contrast) for edge in EDGES]
@@ -174,7 +174,7 @@ def test_mirrored_image_and_camera_give_mirrored_rows(seed: int) -> None:
     roll=st.floats(-25.0, 25.0),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_no_row_outside_the_view(pitch: float, roll: float, seed: int) -> None:
     camera = pinhole(120, 90, 90.0, pitch_deg=pitch, roll_deg=roll, coef=BARREL)
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -72,7 +72,6 @@ def reference(image: NDArray[np.uint8]) -> float:
     return float(np.median(values) / 0.6745 / 6.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     height=st.integers(3, 40),
     width=st.integers(3, 60),

@@ -29,12 +29,6 @@ def as_bag(folder: Path, images: Images) -> Path:
     return ros.write(folder / "s", said)
 
 
-def as_pattern(folder: Path, images: Images) -> Path:
-    for k, image in enumerate(images):
-        cv2.imwrite(str(folder / f"s.{k:04d}.pgm"), image)
-    return folder / "s.*.pgm"
-
-
 @pytest.fixture(scope="module")
 def rows(small_run_template: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Flags that name what was found in the small run, and a reference that differs from it."""
@@ -70,7 +64,7 @@ def expected(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("record", [as_video, as_bag, as_pattern], ids=["video", "bag", "pattern"])
+@pytest.mark.parametrize("record", [as_video, as_bag], ids=["video", "bag"])
 def test_the_same_pictures_page_and_table(
     small_run: Path,
     rows: list[str],

@@ -202,5 +202,3 @@ def test_the_demo(tmp_path: Path, capsys: Captured) -> None:
     assert "The floor from above" in page
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 1
     assert "exists already" in capsys.readouterr().err
-    assert main(["-q", "demo", "-o", str(tmp_path / "demo"), "--force"]) == 0
-    assert capsys.readouterr().out == ""

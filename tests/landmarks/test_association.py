@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.array_types import BoolArray, FloatArray
@@ -55,7 +55,6 @@ def total(found: Association, costs: FloatArray) -> float:
     return float(costs[found.first, found.second].sum())
 
 
-@settings(deadline=None)
 @given(problems())
 def test_pairs_are_allowed_one_to_one_and_nothing_is_lost(
     problem: tuple[FloatArray, BoolArray],
@@ -68,7 +67,6 @@ def test_pairs_are_allowed_one_to_one_and_nothing_is_lost(
     assert (np.diff(found.first) > 0).all()
 
 
-@settings(deadline=None, max_examples=50)
 @given(problems())
 def test_no_association_has_more_pairs_or_less_cost(
     problem: tuple[FloatArray, BoolArray],
@@ -81,7 +79,6 @@ def test_no_association_has_more_pairs_or_less_cost(
     assert total(found, costs) == pytest.approx(least, rel=1e-9, abs=1e-12 * costs.max(initial=0))
 
 
-@settings(deadline=None)
 @given(problems(), st.integers(0, 2**32 - 1))
 def test_the_order_of_the_rows_does_not_matter(
     problem: tuple[FloatArray, BoolArray], seed: int

@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.landmarks import (
@@ -189,7 +189,6 @@ def test_files_that_cannot_be_opened_are_named(tmp_path: Path) -> None:
 ROW_LIKE = st.sampled_from([STEP, CIRCLE, "LANDMARK_L", "#", "\\", "\r", " ", "1e9", "XDETECTOR"])
 
 
-@settings(deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=30), ROW_LIKE.map(str.encode)), max_size=20))
 def test_any_bytes_give_rows_or_one_clear_error(pieces: list[bytes]) -> None:
     content = b"\n".join(pieces)

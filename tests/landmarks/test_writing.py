@@ -8,7 +8,7 @@ from dataclasses import astuple, replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.landmarks import (
@@ -159,7 +159,6 @@ def landmark_file(draw: st.DrawFn) -> bytes:
     return content + draw(st.sampled_from([b"", b"\n", b"\r\n"]))
 
 
-@settings(deadline=None)
 @given(landmark_file())
 def test_any_file_comes_back_byte_by_byte(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -168,7 +167,6 @@ def test_any_file_comes_back_byte_by_byte(content: bytes) -> None:
         assert path.read_bytes() == content
 
 
-@settings(deadline=None)
 @given(data_row())
 def test_written_rows_are_read_with_the_digits_written(row: bytes) -> None:
     first_step = PUBLISHED.splitlines()[0].encode()

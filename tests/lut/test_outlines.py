@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, event, given, settings
+from hypothesis import assume, event, given
 from hypothesis import strategies as st
 
 from camera import Camera
@@ -111,18 +111,17 @@ def published_table(published_camera: Camera) -> DiscTable:
     return build_disc_table(published_camera, DiscShape())
 
 
-def test_the_published_table_is_what_a_plain_computation_says(
-    published_camera: Camera, published_table: DiscTable
-) -> None:
-    assert_table_is(published_table, plain_outlines(published_camera, DiscShape()))
-
-
 def quarter_of(camera: Camera) -> Camera:
     """The published camera at a quarter of the image size: a sixteenth of the work."""
     return dataclasses.replace(
         camera, width=192, height=72, scale_x=464.762 / 4, scale_y=232.381 / 4,
         offset_x=96.0, offset_y=36.0,
     )  # fmt: skip
+
+
+def test_the_published_table_is_what_a_plain_computation_says(published_camera: Camera) -> None:
+    camera = quarter_of(published_camera)
+    assert_table_is(build_disc_table(camera, DiscShape()), plain_outlines(camera, DiscShape()))
 
 
 @pytest.mark.parametrize(
@@ -204,7 +203,6 @@ def shapes(draw: st.DrawFn) -> DiscShape:
     )
 
 
-@settings(deadline=None)
 @given(cameras(largest_side=60))
 def test_any_camera_s_floor_is_that_of_its_pixels(camera: Camera) -> None:
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
@@ -255,7 +253,6 @@ def test_images_of_any_size_have_tables(width: int, height: int) -> None:
         assert_table_is(table, plain_outlines(camera, shape))
 
 
-@settings(deadline=None)
 @given(cameras(largest_side=40, down_deg=(-10.0, 90.0)), shapes())
 def test_any_camera_s_table_is_what_a_plain_computation_says(
     camera: Camera, shape: DiscShape

@@ -95,7 +95,7 @@ def test_vertical_passes_through_its_column_on_the_horizon(
     coef=st.sampled_from([(0.0,) * 5, BARREL]),
     tangential=st.sampled_from([(0.0, 0.0), (5e-3, -3e-3)]),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_any_pose_gives_verticals_inside_the_image(
     pitch: float,
     roll: float,

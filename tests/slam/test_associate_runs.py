@@ -210,12 +210,11 @@ def test_lines_do_not_change_what_becomes_of_the_discs() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("bias_rad", [0.0, 0.004])
-def test_a_second_lap_is_recognised_though_odometry_drifts(bias_rad: float) -> None:
+def test_a_second_lap_is_recognised_though_odometry_drifts() -> None:
     """By a bias of 0.004 rad a step the second lap is turned by 0.8 rad and metres away."""
     discs = scattered(9, 150, 0.3)
     path = circuit(2.0)
-    recording = drive(path, discs, NO_LINES, seed=10, bias_rad=bias_rad)
+    recording = drive(path, discs, NO_LINES, seed=10, bias_rad=0.004)
     found = associate_run(recording)
     before = score_association(found.local_circle_labels, ids_of(recording))
     after = score_association(found.circle_labels, ids_of(recording))

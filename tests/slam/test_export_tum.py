@@ -21,7 +21,6 @@ numbers = st.floats(-1e6, 1e6)
 angles = st.floats(-20.0, 20.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(numbers, numbers, angles), min_size=1, max_size=8), st.booleans())
 def test_a_path_comes_back(
     tmp_path_factory: pytest.TempPathFactory,
@@ -78,7 +77,7 @@ def test_what_is_no_path_on_the_floor_is_refused(tmp_path: Path, text: str, mess
         read_tum(tmp_path / "p.tum")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=40), st.integers(0, 80), st.integers(0, 20))
 def test_damaged_files_are_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int, length: int

@@ -200,7 +200,6 @@ def runs(draw: st.DrawFn) -> list[Frame]:
     return frames
 
 
-@settings(max_examples=60, deadline=None)
 @given(runs(), st.booleans())
 def test_any_runs_rows_come_back_as_they_are_written(
     tmp_path_factory: pytest.TempPathFactory, frames: list[Frame], robotics: bool
@@ -279,7 +278,7 @@ def test_what_is_no_run_is_refused_by_its_line(tmp_path: Path, content: str, mes
         read_g2o(tmp_path / "a.g2o")
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.binary(max_size=60), st.integers(0, 200), st.integers(0, 30))
 def test_damaged_files_are_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int, length: int

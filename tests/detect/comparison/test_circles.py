@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.comparison.compare import compare_frames
@@ -385,7 +385,6 @@ DISCS = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(DISCS, DISCS, st.booleans(), st.sampled_from([None, 4.0]))
 def test_rows_are_accounted_for_whatever_they_are(
     reference: list[CircleLandmark],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -69,7 +69,6 @@ def compare(camera: Camera, raw: list[Frame], level: list[Frame]) -> DiscCompari
     return compare_frames(raw, level, CompareOptions(), sight=Sight(camera))
 
 
-@settings(deadline=None, max_examples=60)
 @given(
     st.lists(st.tuples(st.floats(60, 700), st.floats(110, 280)), min_size=1, max_size=5),
     st.floats(-0.08, 0.08),

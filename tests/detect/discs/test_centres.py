@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -109,7 +109,6 @@ def test_centres_are_those_of_a_plain_computation(samples: int, kind: str) -> No
             assert_centres(image, table, outlines, threshold, sign)
 
 
-@settings(deadline=None)
 @given(
     cameras(largest_side=90, down_deg=(10.0, 90.0)),
     st.integers(3, 24),

@@ -34,7 +34,7 @@ def nearest(camera: Camera, place: tuple[float, float]) -> NDArray[np.int64]:
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("offset", [(0, 0), (3, -1), (-2, 1)])
+@pytest.mark.parametrize("offset", [(0, 0), (3, -1)])
 @pytest.mark.parametrize("blur", [0.5, 1.0, 3.0])
 def test_parameters_come_back(
     published_camera: Camera,
@@ -165,8 +165,8 @@ def test_the_middle_of_a_discs_best_centres(table: DiscTable) -> None:
     np.testing.assert_array_equal(alone, pixels[keep])
 
 
-@pytest.mark.parametrize("forward_m", [1.2, 1.8, 2.5, 3.2])
-@pytest.mark.parametrize("hole_m", [0.05, 0.06, 0.07])
+@pytest.mark.parametrize("forward_m", [1.2, 3.2])
+@pytest.mark.parametrize("hole_m", [0.05, 0.07])
 def test_a_ring_is_no_disc(
     published_camera: Camera, table: DiscTable, forward_m: float, hole_m: float
 ) -> None:
@@ -182,8 +182,13 @@ def test_a_ring_is_no_disc(
         assert (disc_evidence(fit, 0.10)[0] > 1.1) == is_disc
 
 
-@pytest.mark.parametrize("place", [(-0.6, -2.1), (0.4, -2.5), (-0.3, -3.6), (0.8, -5.2)])
-@pytest.mark.parametrize("image_of", ["noise", "saturated", "shaded"])
+@pytest.mark.parametrize(
+    ("place", "image_of"),
+    [
+        ((-0.6, -2.1), "noise"), ((0.4, -2.5), "saturated"), ((0.4, -2.5), "shaded"),
+        ((0.8, -5.2), "noise"), ((-0.3, -3.6), "saturated"), ((-0.3, -3.6), "shaded"),
+    ],
+)  # fmt: skip
 def test_fits_are_the_least_squares_of_the_reference(
     published_camera: Camera, table: DiscTable, place: tuple[float, float], image_of: str
 ) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.discs.identity import MappedDisc, ids_of_map, ids_of_rows, matched
@@ -21,7 +21,6 @@ def row(x: float, y: float, *ids: int) -> CircleLandmark:
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 12), dropped=st.integers(0, 4))
-@settings(max_examples=50, deadline=None)
 def test_shuffled_discs_keep_their_ids(seed: int, count: int, dropped: int) -> None:
     rng = np.random.default_rng(seed)
     grid = np.stack(np.divmod(rng.permutation(36)[:count], 6), axis=-1) * 0.25
@@ -34,7 +33,6 @@ def test_shuffled_discs_keep_their_ids(seed: int, count: int, dropped: int) -> N
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=50, deadline=None)
 def test_one_disc_gives_its_id_to_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
     xy, known = rng.uniform(0.0, 0.3, (8, 2)), rng.uniform(0.0, 0.3, (6, 2))

@@ -53,7 +53,7 @@ MAPS = hnp.arrays(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(MAPS, st.sampled_from([0.0, 0.25, 0.5, 0.75]))
 def test_every_plateau_is_found_once_at_its_middle_in_scan_order(
     levels: NDArray[np.int8], threshold: float
@@ -113,7 +113,7 @@ def test_an_image_that_is_one_plateau_has_one_maximum_in_its_middle() -> None:
     assert rows[0] in (143, 144)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(MAPS, st.sampled_from([0.0, 0.25, 0.5, 0.75]))
 def test_of_pixels_equally_near_to_the_middle_the_same_is_taken_every_time(
     levels: NDArray[np.int8], threshold: float

@@ -128,7 +128,6 @@ def test_a_disc_has_quality_one_at_its_centre_and_the_sign_of_its_contrast(
         assert contrast[centre[1], centre[0]] == inside - outside
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(KINDS))
 def test_quality_is_between_0_and_1_and_0_where_no_centre_is_usable(seed: int, kind: str) -> None:
     quality, contrast = quality_of_centres(random_image(seed, kind), TABLE)
@@ -139,7 +138,6 @@ def test_quality_is_between_0_and_1_and_0_where_no_centre_is_usable(seed: int, k
     assert np.array_equal(quality > 0.0, contrast != 0.0)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.data())
 def test_quality_does_not_change_with_affine_brightness(
     seed: int, levels: int, data: st.DataObject
@@ -239,7 +237,7 @@ POSITIONS = hnp.arrays(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(POSITIONS, st.integers(1, 40), st.integers(0, 2**32 - 1))
 def test_the_best_stay_and_no_two_are_too_close(
     lattice: NDArray[np.int8], eighths: int, seed: int

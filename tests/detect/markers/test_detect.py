@@ -106,18 +106,18 @@ def test_corners_are_where_they_were_drawn(
 
 @pytest.mark.parametrize("joint", [True, False])
 def test_covariances_are_right(joint: bool) -> None:
-    # 60 independent images: the mean of 8 * 60 normalised squared errors, which hang together
-    # within an image, is within 0.35 of 1.
+    # 40 independent images: the mean of 8 * 40 normalised squared errors, which hang together
+    # within an image, is within 0.43 of 1.
     settings = MarkerSettings(dictionary="6x6_250", joint=joint, systematic_px=0.0)
     errors = []
-    for seed in range(60):
+    for seed in range(40):
         rng = np.random.default_rng(1000 + seed)
         view = View(50.0 + 20.0 * rng.random(), 45.0 * rng.random(), *(360.0 * rng.random(2)))
         image, corners = picture(view=view, noise=4.0, seed=seed, background=200.0)
         found = detect_markers(image, settings)
         assert found.ids.tolist() == [7]
         errors.append(normalised_error(found, corners))
-    assert 0.65 < np.mean(errors) < (1.35 if joint else 1.6)
+    assert 0.57 < np.mean(errors) < (1.43 if joint else 1.7)
 
 
 @pytest.mark.parametrize("width", [15.0, 16.0, 17.0, 18.0])

@@ -155,7 +155,7 @@ def test_killed_at_any_moment(
     moments = random.Random(5)
     outcomes = {"previous": 0, "new": 0, "between": 0}
     whole_s = processor_s_of(command(run_folder, output))
-    for trial in range(12):
+    for trial in range(8):
         jobs = "2" if trial % 5 == 4 else "1"
         before = lay_previous(output)
         arguments = command(run_folder, output, "--jobs", jobs)
@@ -177,7 +177,7 @@ def test_killed_at_any_moment(
         resumed(run_folder, output, capsys, "--jobs", "2" if trial == 4 else "1")
         assert results(output) == undisturbed
         assert hidden(output) == set()
-    assert outcomes["previous"] > 4
+    assert outcomes["previous"] > 3
     # They take them by four calls in a row: hardly any kill falls between those.
     assert outcomes["between"] <= 1
 

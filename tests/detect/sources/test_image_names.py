@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.errors import FrameError
@@ -22,7 +22,6 @@ def by_value(name: str) -> tuple[list[tuple[int, str]], str]:
 FILE_NAMES = st.from_regex(r"[ab0-9][ab0-9]{0,5}\.(jpg|PNG)", fullmatch=True)
 
 
-@settings(max_examples=40)
 @given(names=st.sets(FILE_NAMES, min_size=1, max_size=12))
 def test_images_are_in_natural_order(names: set[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -74,7 +74,7 @@ def test_no_bias_of_faint_edges_under_noise(slant_deg: float) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("contrast", "noise", "slant_deg"),
-    [(10.0, 1.0, 0.0), (30.0, 3.0, 7.0), (60.0, 3.0, 0.0), (60.0, 3.0, -20.0), (200.0, 4.0, 20.0)],
+    [(10.0, 1.0, 0.0), (30.0, 3.0, 7.0), (60.0, 3.0, -20.0), (200.0, 4.0, 20.0)],
 )
 def test_scatter_under_noise_is_the_predicted_one(
     contrast: float, noise: float, slant_deg: float
@@ -83,7 +83,7 @@ def test_scatter_under_noise_is_the_predicted_one(
     camera = pinhole(120, 90, roll_deg=slant_deg)
     table = build_vertical_table(camera)
     errors, predicted, leans = [], [], []
-    for offset in rng.uniform(0.0, 1.0, 200):
+    for offset in rng.uniform(0.0, 1.0, 120):
         bearing = bearing_at(camera, table, offset)
         grey = 128.0 - 0.5 * contrast
         image = render(camera, [Edge(bearing, contrast)], grey=grey, noise=noise, rng=rng)
@@ -92,10 +92,10 @@ def test_scatter_under_noise_is_the_predicted_one(
         predicted.append(sigma)
         track = found.members[0][0]
         leans.append(found.fits.line[track, 1] / np.sqrt(found.fits.covariance[track, 1, 1]))
-    # 200 draws know a standard deviation to 5 %.
-    assert np.std(errors) == pytest.approx(np.sqrt(np.mean(np.square(predicted))), rel=0.15)
+    # 120 draws know a standard deviation to 6.5 %.
+    assert np.std(errors) == pytest.approx(np.sqrt(np.mean(np.square(predicted))), rel=0.2)
     assert abs(np.mean(errors)) < 0.02
-    assert np.std(leans) == pytest.approx(1.0, rel=0.2)
+    assert np.std(leans) == pytest.approx(1.0, rel=0.25)
 
 
 def test_uncertainty_of_a_row_has_a_floor_of_sigma_px() -> None:

@@ -35,7 +35,7 @@ def step_image(left: int, right: int, column: int = 48) -> np.ndarray:
 
 
 @given(hnp.arrays(np.uint8, (64, 96)))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_response_is_a_squared_correlation(image: np.ndarray) -> None:
     for preset in (DEFAULT, PUBLISHED):
         response = line_response(image, TABLE, replace(preset, regulariser=1e-3))
@@ -69,7 +69,7 @@ def test_ideal_step_reaches_two_over_pi() -> None:
 
 
 @given(gain=st.sampled_from([1, 2, 3]), offset=st.integers(0, 60))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_affine_brightness_changes_only_what_the_regulariser_adds(gain: int, offset: int) -> None:
     image = np.random.default_rng(1).integers(0, 60, (64, 96)).astype(np.uint8)
     bright = (gain * image.astype(int) + offset).astype(np.uint8)

@@ -43,9 +43,7 @@ SEGMENT = ClockSegment(
 )
 
 
-@pytest.mark.parametrize(
-    ("offset", "drift"), [(-0.97, -0.0095), (-0.2, 1e-4), (0.0, 0.0), (0.61, 0.004), (0.98, 0.0097)]
-)
+@pytest.mark.parametrize(("offset", "drift"), [(-0.97, -0.0095), (0.0, 0.0), (0.98, 0.0097)])
 def test_the_clock_comes_back_from_anywhere_within_the_bounds(offset: float, drift: float) -> None:
     clocks = Clocks(offset_s=offset, drift=drift)
     odometry, truth = simulate(clocks, seed=3)
@@ -66,8 +64,8 @@ def test_slow_ground_truth_is_met_by_samples_not_by_windows() -> None:
 @pytest.mark.long
 def test_deviations_are_right() -> None:
     normalised = []
-    for seed in range(12):
-        clocks = Clocks(offset_s=-0.4 + 0.03 * seed, drift=-2e-4 + 1.5e-5 * seed, walk=0.01)
+    for seed in range(8):
+        clocks = Clocks(offset_s=-0.4 + 0.05 * seed, drift=-2e-4 + 2.5e-5 * seed, walk=0.01)
         (found,) = synchronise(*simulate(clocks, seed))
         normalised.append(
             (
@@ -77,9 +75,9 @@ def test_deviations_are_right() -> None:
             )
         )
     squared = np.mean(np.square(normalised), axis=0)
-    # The 99 % band of chi-squared with 12 degrees of freedom over 12.
-    assert np.all(squared > 0.26)
-    assert np.all(squared < 2.36)
+    # The 99 % band of chi-squared with 8 degrees of freedom over 8.
+    assert np.all(squared > 0.17)
+    assert np.all(squared < 2.74)
 
 
 def test_a_segment_without_turns_cannot_be_synchronised() -> None:
@@ -138,7 +136,7 @@ def test_a_clock_set_within_a_segment_is_marked_and_bounded(jump_s: float) -> No
 
 @pytest.mark.long
 def test_nothing_is_found_where_nothing_jumped() -> None:
-    for seed in range(6):
+    for seed in range(3):
         (found,) = synchronise(*simulate(Clocks(), seed=20 + seed))
         assert found.status == "ok"
 

@@ -149,10 +149,9 @@ def test_a_robot_carried_far_away_is_found_again() -> None:
     assert np.max(off[fusion.poses.times_s > fusion.restarts_s[0] + 1.0]) < 0.15
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_odometry_that_errs_smoothly_bridges_long_gaps_and_holes_beside_them(seed: int) -> None:
+def test_odometry_that_errs_smoothly_bridges_long_gaps_and_holes_beside_them() -> None:
     """A localisation as odometry: never far off, and wrong for seconds, not from row to row."""
-    rng = np.random.default_rng(30 + seed)
+    rng = np.random.default_rng(31)
     times = np.arange(0.0, 1700.0, 0.1)
     # It turns left more than right: what is learnt of turns counts at the long gaps' ends.
     turning = 0.01 + 0.4 * np.sin(0.3 * times)
@@ -189,14 +188,13 @@ def test_odometry_that_errs_smoothly_bridges_long_gaps_and_holes_beside_them(see
     assert np.mean(squared) < 2.0
 
 
-@pytest.mark.parametrize("bend", [-0.02, 0.02])
-def test_beside_a_long_gap_the_path_is_told_by_its_own_side(bend: float) -> None:
+def test_beside_a_long_gap_the_path_is_told_by_its_own_side() -> None:
     """Twenty minutes without a pose: for seconds from either end, odometry leads on from there."""
     rng = np.random.default_rng(40)
     exact = FuseSettings(distance_sigma=0.01, lateral_sigma=0.0, turn_per_metre_sigma=0.02)
     truth, own = drive(rng, 1240.0, exact, rate_hz=10.0)
     steps = between(own.poses[:-1], own.poses[1:])
-    steps[:, 2] += bend * np.hypot(steps[:, 0], steps[:, 1])
+    steps[:, 2] -= 0.02 * np.hypot(steps[:, 0], steps[:, 1])
     odometry = PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), np.zeros(3)))
     seen = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(1220.0, 1239.8, 0.1)])
     found = fuse(odometry, {"laser": measure(rng, truth, seen, LASER_COVARIANCE / 10)}).poses
@@ -209,8 +207,7 @@ def test_beside_a_long_gap_the_path_is_told_by_its_own_side(bend: float) -> None
     assert np.mean(normalised_error(found, truth)) < 3.0 * 2.0
 
 
-@pytest.mark.parametrize("turned_rad", [0.0, 2.0])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "turned_rad"), [(0, 2.0), (1, 0.0)])
 def test_a_robot_carried_away_in_a_gap_keeps_the_covariance_honest(
     seed: int, turned_rad: float
 ) -> None:

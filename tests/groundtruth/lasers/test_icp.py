@@ -68,7 +68,7 @@ def test_nearest_on_segments_by_dense_sampling() -> None:
 
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.03, 0.03), st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_exact_points_give_the_exact_pose(dx: float, dy: float, dt: float, seed: int) -> None:
     true = np.array([2.0, -1.0, 0.6])
     points = apply(invert(true), on_walls(ROOM, 300, np.random.default_rng(seed)))

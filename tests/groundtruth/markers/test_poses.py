@@ -37,8 +37,8 @@ def error_of(pose: FloatArray, truth: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("cameras", [1, 2, 3, 4])
-@pytest.mark.parametrize("markers", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("cameras", [1, 2, 4])
+@pytest.mark.parametrize("markers", [1, 3, 6])
 def test_every_solver_ends_at_the_exact_pose(solver: Solver, cameras: int, markers: int) -> None:
     generator = np.random.default_rng(21)
     tried = 0
@@ -106,7 +106,7 @@ def test_a_misread_marker_is_found_and_does_not_move_the_pose() -> None:
     generator = np.random.default_rng(24)
     settings = PoseSettings()
     found = 0
-    while found < 15:
+    while found < 8:
         truth = robot_pose(generator)
         problem = pose_problem(truth, cameras=4, noise=generator)
         if problem.views < 4:

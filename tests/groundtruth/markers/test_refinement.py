@@ -117,14 +117,14 @@ def test_covariances_of_composed_and_inverse_poses() -> None:
     "solver",
     [pytest.param(s, marks=pytest.mark.lowest) if s == "pycolmap" else s for s in SOLVERS],
 )
-@pytest.mark.parametrize("cameras", [1, 2, 3, 4])
-@pytest.mark.parametrize("markers", [1, 2, 3, 6])
+@pytest.mark.parametrize("cameras", [1, 2, 4])
+@pytest.mark.parametrize("markers", [1, 3, 6])
 def test_every_solver_recovers_the_pose_exactly(solver: Solver, cameras: int, markers: int) -> None:
     if solver == "epnp" and markers < 6:
         pytest.skip("EPnP may take the mirror image of points in one plane")
     generator = np.random.default_rng(5)
     tried = 0
-    while tried < 4:
+    while tried < 2:
         truth = robot_pose(generator)
         problem = pose_problem(truth, cameras=cameras, markers=markers)
         if not problem.views or (solver == "epnp" and max(np.bincount(problem.seen.camera)) < 8):
@@ -214,14 +214,14 @@ def normalised_errors(
 def test_the_normalised_error_is_that_of_its_distribution(
     calibration_sigma: float, floor: bool, cameras: int
 ) -> None:
-    draws = 100
+    draws = 50
     squares, plane, costs = normalised_errors(
         draws, seed=7, calibration_sigma=calibration_sigma, floor=floor, cameras=cameras
     )
     for values, dof in ((squares, 6), (plane, 3)):
         low, high = chi2.ppf([0.005, 0.995], dof * draws) / draws
         assert low < np.mean(values) < high
-    assert np.mean(costs) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(costs) == pytest.approx(1.0, abs=0.15)
 
 
 def test_without_the_calibrations_uncertainty_the_error_is_underestimated() -> None:

@@ -116,7 +116,7 @@ def test_both_covariances_are_in_the_normalised_error() -> None:
     rng = np.random.default_rng(3)
     covariance = np.diag([0.003, 0.004, 0.006]) ** 2
     total, count = 0.0, 0
-    for _ in range(25):
+    for _ in range(10):
         noisy = STANDS + rng.normal(size=STANDS.shape) * np.sqrt(np.diag(covariance))
         solved = poses_from_distances(SURVEY, distances_at(STANDS, rng))
         references, _ = reference_poses(solved)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -110,7 +110,6 @@ def onboard(
 
 
 @given(st.floats(0.5, 9.5), st.floats(0.5, 6.5), st.floats(-math.pi, math.pi))
-@settings(max_examples=40, deadline=None)
 def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -> None:
     survey = survey_of()
     found = solved(measured((x, y, theta), survey), survey)
@@ -127,15 +126,15 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     survey = survey_of()
     truth = np.array([3.0, 2.0, 3.1])
     squared, costs = [], []
-    for _ in range(150):
+    for _ in range(50):
         found = solved(measured(truth, survey, rng), survey)
         error = found.candidates[0] - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
         squared.append(error @ np.linalg.solve(found.covariances[0], error))
         costs.append(found.chi2)
-    low, high = chi2.ppf([0.001, 0.999], 450)
+    low, high = chi2.ppf([0.001, 0.999], 150)
     assert low < sum(squared) < high
-    low, high = chi2.ppf([0.001, 0.999], 1350)
+    low, high = chi2.ppf([0.001, 0.999], 450)
     assert low < sum(costs) < high
 
 
@@ -221,7 +220,7 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
     rng = np.random.default_rng(4)
     survey = survey_of(sigma_m=0.02)
     total = 0.0
-    for _ in range(40):
+    for _ in range(20):
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
         prior = solved(measured(truth, survey, rng), survey)
         refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
@@ -232,7 +231,7 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
         total += float(error @ np.linalg.solve(refined.covariance, error))
         assert math.hypot(error[0], error[1]) < 0.003
         assert np.all(np.linalg.eigvalsh(prior.covariances[0] - refined.covariance) > 0)
-    low, high = chi2.ppf([0.001, 0.999], 120)
+    low, high = chi2.ppf([0.001, 0.999], 60)
     assert low < total < high
 
 

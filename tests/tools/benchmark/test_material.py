@@ -109,7 +109,7 @@ def test_a_long_run_takes_no_more_room_on_the_disk_than_a_processor_notices(
     assert images[180].read_bytes() == sources[0].read_bytes()
 
 
-@pytest.mark.parametrize("count", [0, 5, 20, 50])
+@pytest.mark.parametrize("count", [0, 50])
 def test_as_many_discs_are_painted_as_were_asked_for(published_camera: Camera, count: int) -> None:
     settings = CircleSettings()
     table = build_disc_table(published_camera, disc_shape(settings))
@@ -133,7 +133,7 @@ def test_more_discs_than_have_room_are_an_error(published_camera: Camera) -> Non
         disc_places(published_camera, 500, seed=0)
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 20])
+@pytest.mark.parametrize("count", [0, 1, 20])
 def test_as_many_edges_are_painted_as_were_asked_for(published_camera: Camera, count: int) -> None:
     image = wall_with_edges(published_camera, count, seed=0)
     found = detect_lines(image, build_vertical_table(published_camera))

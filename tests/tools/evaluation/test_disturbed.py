@@ -36,7 +36,7 @@ def bare_disc() -> Surroundings:
 @pytest.mark.parametrize("share", [0.1, 0.4])
 def test_a_share_of_the_rim_is_disturbed(kind: str, share: float) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
-    for seed in range(8):
+    for seed in range(4):
         distance = DISTURBANCES[kind].shape(np.random.default_rng(seed))
         covered = distance(np.cos(angle), np.sin(angle), _size_for(distance, share)) > 0.0
         assert np.mean(covered) == pytest.approx(share, abs=0.02)

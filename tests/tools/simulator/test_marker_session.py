@@ -182,7 +182,7 @@ def test_published_like_session(full_plan: SessionPlan) -> None:
 @pytest.mark.long
 def test_markers_are_seen_by_several_cameras(full_plan: SessionPlan) -> None:
     widths, cameras_per_pose = [], []
-    for frame in (0, 7, 100):
+    for frame in (0, 100):
         seen = 0
         for camera in range(4):
             markers = seen_markers(full_plan, camera, full_plan.poses[frame])

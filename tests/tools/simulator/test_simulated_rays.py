@@ -66,7 +66,7 @@ def test_rays_come_back_to_their_pixels(published_camera: Camera) -> None:
 
 @pytest.mark.parametrize(
     ("pose", "tilt"),
-    [((0.0, 0.0, 0.0), (0.0, 0.0)), ((1.3, -0.4, 2.1), (0.01, -0.015)), ((-2, 1, -1.0), (0.04, 0))],
+    [((0.0, 0.0, 0.0), (0.0, 0.0)), ((1.3, -0.4, 2.1), (0.04, -0.015))],
 )
 def test_disc_is_rendered_where_the_camera_projects_it(
     published_camera: Camera, pose: tuple[float, ...], tilt: tuple[float, float]
