@@ -45,8 +45,8 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.24
-#: Least log-odds of a glance.
-_LEAST_GLANCE = -2.0
+#: Least log-odds of a glance: where so many edges vote for the place as the last says, less.
+_LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.0, -2.5, 2.6
 #: Least share of the rim that is on a circle.
 _LEAST_RIM = 0.3
 #: Nearer to a disc already found than this share of the separation nothing is looked for.
@@ -153,7 +153,8 @@ def _look_at_all(
             continue
         inputs, scales = network_inputs(grey, scale, sought.sign)
         score = candidates.score[i : i + 1]
-        if network_log_odds(inputs, scales, score, networks.glance) < _LEAST_GLANCE:
+        least = _LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE
+        if network_log_odds(inputs, scales, score, networks.glance) < least:
             continue
         first = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
         if first.agreeing < _LEAST_RIM:
