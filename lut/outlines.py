@@ -134,7 +134,8 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """
     if not camera.centre[2] > 0.0:
         raise TableError(
-            f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0"
+            f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0; "
+            "`camera floor` says where it is"
         )
     floor_xy = floor_positions(camera)
     down = _size_down(camera, floor_xy, shape)

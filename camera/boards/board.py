@@ -72,8 +72,11 @@ class Board:
                 f"a {self.kind} board of {self.columns} x {self.rows}: expected at least 3 x 3 "
                 f"({_WHAT_IS_COUNTED[self.kind]} are counted)"
             )
-        if not (np.isfinite(self.square_m) and self.square_m > 0.0):
-            raise CalibrationError(f"square_m is {self.square_m:g}: expected metres above 0")
+        if not 0.0 < self.square_m <= _LARGEST_SQUARE_M:
+            raise CalibrationError(
+                f"square_m is {self.square_m:g}: expected metres above 0, at most "
+                f"{_LARGEST_SQUARE_M:g} (25 mm are 0.025)"
+            )
         if self.kind == "charuco" and not 0.0 < self.marker_m < self.square_m:
             raise CalibrationError(
                 f"marker_m is {self.marker_m:g}: a ChArUco board needs the side of its markers, "
@@ -116,6 +119,9 @@ class Board:
         counted = _WHAT_IS_COUNTED[self.kind]
         return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
 
+
+# What is larger is taken for millimetres.
+_LARGEST_SQUARE_M = 10.0
 
 # How far apart neighbouring circles are, in `square_m`; those of an asymmetric grid across.
 _NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}

@@ -124,7 +124,12 @@ class Adjusted:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance (u and v together) between seen and projected."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+        return rms_px(self.residuals)
+
+
+def rms_px(residuals: FloatArray) -> float:
+    """Root of the mean squared length of (N, 2) residuals."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)

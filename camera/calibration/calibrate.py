@@ -14,23 +14,34 @@ from camera.calibration.adjustment import (
     Estimate,
     Points,
     circle_shifts,
-    fit_points,
     project_estimate,
 )
 from camera.calibration.choice import choose_lens
+from camera.calibration.consensus import (
+    ALL_THE_SAME,
+    demand_different_views,
+    find_consensus,
+    listed,
+    scale_warnings,
+    view_rms,
+)
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
-from camera.calibration.start import best_poses, first_estimate, normals_spread_deg
+from camera.calibration.start import normals_spread_deg
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
-# Below this the focal length hangs on the perspective of single views alone.
-_SMALLEST_SPREAD_DEG = 3.0
-_LARGEST_SCALE_SIGMA = 0.03
-# Points are found to some tenths of a pixel; in large images, which are softer, less well.
 _LARGEST_RMS_PX = 1.0
 _LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+
+
+def largest_rms_px(width: int) -> float:
+    """RMS residual up to which points are explained: they are found to some tenths of a pixel.
+
+    In large images, which are softer, less well.
+    """
+    return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
 def demand_enough(count: int, without: str = "") -> None:
@@ -42,25 +53,10 @@ def demand_enough(count: int, without: str = "") -> None:
         )
 
 
-def demand_different_views(fit: Adjusted, spread_deg: float) -> None:
-    """Refuse views that do not separate focal length and distance."""
-    variance = float(fit.covariance[0, 0])
-    # In a singular problem rounding can make the variance zero or negative.
-    sigma = np.sqrt(variance) if variance > 0.0 else np.inf
-    relative = float(sigma / fit.estimate.intrinsics[0])
-    if spread_deg < _SMALLEST_SPREAD_DEG or not relative < _LARGEST_SCALE_SIGMA:
-        raise CalibrationError(
-            f"the boards have almost the same orientation: their normals differ by at most "
-            f"{spread_deg:.1f} deg and leave the focal length {100.0 * relative:.2g} % uncertain, "
-            "because it is not separable from the distance; tilt the board by 20 to 45 deg in "
-            "different directions between pictures"
-        )
-
-
 def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
     """Warnings about weaknesses of a calibration."""
     warnings = []
-    if fit.rms_px > max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * points.width):
+    if fit.rms_px > largest_rms_px(points.width):
         warnings.append(
             f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is "
             "the board flat, are --board, --columns and --rows right, and does the lens see less "
@@ -109,7 +105,6 @@ def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
     return warnings
 
 
-_OUTLIER_FACTOR = 3.0
 # Residual, in standard deviations, beyond which a point is an outlier.
 _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
@@ -176,7 +171,7 @@ class Calibration:
     @property
     def view_rms_px(self) -> FloatArray:
         """(V,) RMS residual of each view."""
-        return _view_rms(self.adjusted, self.points)
+        return view_rms(self.adjusted.residuals, self.points)
 
 
 def calibrate(
@@ -210,41 +205,24 @@ def calibrate(
     names = tuple(view.name for view in views)
     radius = 0.5 * board.circle_m
     try:
-        start = first_estimate(measured, settings.aspect)
-        start = _staged(start, measured, settings, radius)
-    except StartError:
-        raise CalibrationError(
-            "no camera explains the points found: are --columns, --rows and the kind of --board "
-            "right, and do all pictures show the same board by the same camera at the same zoom?"
-        ) from None
-    outliers: tuple[tuple[str, float], ...] = ()
-    # Outliers are detected with the fullest model: residuals of a simpler one are partly its own.
-    most = settings.most
-    for count in range(min(2, most), most + 1):
-        first = fit_points(start, measured, settings, settings.lens(count), radius)
-        start = first[0].estimate
-    # Checked before terms are fitted that such views do not determine.
-    demand_different_views(first[0], normals_spread_deg(start.rotations))
-    if settings.tangential is not False:
-        full = settings.lens(most, tangential=True)
-        first = fit_points(start, measured, settings, full, radius)
-        start = first[0].estimate
-    rms = _view_rms(*first)
-    far = rms > _OUTLIER_FACTOR * np.median(rms)
-    if far.any() and not settings.keep_outliers:
-        kept = np.flatnonzero(~far)
-        outliers = tuple((names[v], float(rms[v])) for v in np.flatnonzero(far))
-        demand_enough(len(kept), f" without {', '.join(name for name, _ in outliers)}")
-        names = tuple(names[v] for v in kept)
-        measured = measured.of(kept)
-        start = start.of(kept)
-    measured, wrong = _without_wrong_points(start, measured, first[0].sigma_px, settings, radius)
-
-    lens, tried = choose_lens(start, measured, settings, radius)
+        # With the fullest model: residuals of a simpler one are partly its own.
+        consensus = find_consensus(measured, names, settings, radius)
+        kept = np.isfinite(consensus.rms_px) if settings.keep_outliers else consensus.agree
+        outliers = tuple((names[v], float(consensus.rms_px[v])) for v in np.flatnonzero(~kept))
+        demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
+        used = np.flatnonzero(kept)
+        start, measured = consensus.estimate.of(used), measured.of(used)
+        measured, wrong = _without_wrong_points(
+            start, measured, consensus.fit.sigma_px, settings, radius
+        )
+        lens, tried = choose_lens(start, measured, settings, radius)
+    except (StartError, np.linalg.LinAlgError):
+        raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
+    names = tuple(names[v] for v in used)
     adjusted, points = tried[lens].adjusted, tried[lens].points
     spread = normals_spread_deg(adjusted.estimate.rotations)
-    demand_different_views(adjusted, spread)
-    warnings = warnings_of(adjusted, points, spread)
+    demand_different_views(adjusted)
+    warnings = warnings_of(adjusted, points, spread) + scale_warnings(adjusted, points, names)
     if wrong:
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
@@ -302,17 +280,6 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
     )
 
 
-def _staged(
-    start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
-) -> Estimate:
-    """One and then two coefficients, with the poses' second solutions tried in between."""
-    for count in (1, min(2, settings.most)):
-        lens = settings.lens(count)
-        estimate = fit_points(start, points, settings, lens, radius_m)[0].estimate
-        start = best_poses(estimate, points)
-    return start
-
-
 def _without_wrong_points(
     estimate: Estimate,
     points: Points,
@@ -332,8 +299,3 @@ def _without_wrong_points(
     # A picture with too few points left is unchanged: the robust loss deals with it.
     right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
     return points.where(right), int(np.sum(~right))
-
-
-def _view_rms(fit: Adjusted, points: Points) -> FloatArray:
-    squares = np.sum(fit.residuals**2, axis=1)
-    return np.asarray(np.sqrt(np.bincount(points.views, squares) / points.counts))

@@ -46,6 +46,11 @@ from redetect.storage import demand_place, write_bytes
 
 #: How many pictures are looked through for the true size of a checkerboard, and how many agree.
 _COUNTED_PICTURES, _VOTES = 8, 2
+#: What is looked at first where a board is in no picture, by its kind.
+_RIGHT = {
+    "checkerboard": "--rows right? A board of 10 x 7 squares has 9 x 6 inner corners",
+    "charuco": "--rows right, and the --dictionary?",
+}
 _WHETHER = {"auto": None, "on": True, "off": False}
 
 
@@ -156,14 +161,13 @@ def _has_board(image: GreyImage, board: Board) -> bool:
 def find_views(
     images: Iterable[tuple[str, GreyImage]], board: Board
 ) -> tuple[list[BoardView], tuple[int, int]]:
-    """Find the board in images; those without it are listed on standard error."""
+    """Find the board in images; those without it are listed on standard error, and why."""
     if board.kind == "charuco":
         dictionary_of(board)
     views: list[BoardView] = []
+    without: dict[str, list[str]] = {}
     size: tuple[int, int] | None = None
-    count = 0
     for name, image in images:
-        count += 1
         found_size = (image.shape[1], image.shape[0])
         if size is not None and found_size != size:
             raise CalibrationError(
@@ -174,14 +178,17 @@ def find_views(
         try:
             indices, pixels = find_board(image, board)
         except CalibrationError as error:
-            print(f"{name}: {error}", file=sys.stderr)
+            without.setdefault(str(error), []).append(name)
             continue
         views.append(BoardView(name, indices, pixels))
+    count = len(views) + sum(map(len, without.values()))
     if size is None or not views:
         raise CalibrationError(
-            f"no {board} in any of {count} pictures: are --board, --columns and --rows right? "
-            "Inner corners of a checkerboard are counted, so a board of 10 x 7 squares has 9 x 6"
+            f"no {board} in any of {count} pictures: are --board, --columns and "
+            f"{_RIGHT.get(board.kind, '--rows right?')}"
         )
+    for reason, names in without.items():
+        print(f"{', '.join(names)}: {reason}", file=sys.stderr)
     print(f"{board}: found in {len(views)} of {count} pictures of {size[0]} x {size[1]}")
     return views, size
 
@@ -226,7 +233,11 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         f"image), {spread.max():.3f} px at most"
     )
     for name, rms in calibration.outliers:
-        lines.append(f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)")
+        lines.append(
+            f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)"
+            if np.isfinite(rms)
+            else f"left out: {name}, where no pose of the board is seen as it was found"
+        )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
 
@@ -268,7 +279,10 @@ def report_text(
                 adjusted.estimate.translations,
             )
         ],
-        "left_out": [{"name": name, "rms_px": rms} for name, rms in calibration.outliers],
+        "left_out": [
+            {"name": name, "rms_px": rms if np.isfinite(rms) else None}
+            for name, rms in calibration.outliers
+        ],
         "points_per_cell": coverage(calibration.points).tolist(),
         "normals_spread_deg": calibration.spread_deg,
         "projection_sigma_px": projection_sigma(camera, adjusted.covariance).round(6).tolist(),

@@ -25,7 +25,9 @@ from camera.calibration.adjustment import (
     adjust,
     fit_to_centres,
     project_estimate,
+    rms_px,
 )
+from camera.calibration.calibrate import largest_rms_px
 from camera.calibration.images import read_grey
 from camera.calibration.model import COUNT, cross_matrices
 from camera.calibration.pictures import drawn_floor, rectified_floor
@@ -82,11 +84,12 @@ class FloorPose:
     residuals: FloatArray  # (N, 2): seen less projected, pixels
     sigma_px: float  # noise of a coordinate that the residuals show
     by_intrinsics: FloatArray  # (6, 14): how the pose follows errors of the intrinsics
+    warnings: tuple[str, ...] = ()
 
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance between seen and projected."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+        return rms_px(self.residuals)
 
 
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
@@ -112,7 +115,7 @@ def place_on_floor(
     Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
-    _check(pixels, floor)
+    _check(pixels, floor, (camera.width, camera.height))
     one_view = np.zeros(len(floor), dtype=np.int64)
     points = Points(floor, pixels, one_view, camera.width, camera.height)
     intrinsics = intrinsics_of(camera)
@@ -148,12 +151,22 @@ def place_on_floor(
     covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T
     if intrinsics_covariance is not None:
         covariance = covariance + follows @ intrinsics_covariance @ follows.T
+    warnings = []
+    if fit.rms_px > largest_rms_px(camera.width):
+        away = np.linalg.norm(fit.residuals, axis=1)
+        u, v = pixels[np.argmax(away)].tolist()
+        warnings.append(
+            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained (the "
+            f"farthest, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all places right, "
+            "is the floor flat, and is it this camera's calibration?"
+        )
     return FloorPose(
         robot_from_camera=np.column_stack([R, t]),
         covariance=covariance,
         residuals=fit.residuals,
         sigma_px=fit.sigma_px,
         by_intrinsics=follows,
+        warnings=tuple(warnings),
     )
 
 
@@ -233,11 +246,18 @@ def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
     return table[:, :2], table[:, 2:]
 
 
-def _check(pixels: FloatArray, floor: FloatArray) -> None:
+def _check(pixels: FloatArray, floor: FloatArray, size: tuple[int, int]) -> None:
     if len(pixels) < _FEWEST_POINTS:
         raise CalibrationError(
             f"{len(pixels)} points on the floor: at least {_FEWEST_POINTS} are needed, better 10 "
             "and more over all of the floor that is seen"
+        )
+    outside = np.any((pixels < -0.5) | (pixels > np.array(size) - 0.5), axis=1)
+    if outside.any():
+        u, v = pixels[outside][0].tolist()
+        raise CalibrationError(
+            f"pixel {u:g}, {v:g} is outside of the calibrated camera's {size[0]} x {size[1]}: are "
+            "the points of pictures of this size?"
         )
     for what, values in (("on the floor", floor[:, :2]), ("in the image", pixels)):
         spread = np.linalg.svd(values - values.mean(axis=0), compute_uv=False)
@@ -277,6 +297,7 @@ def describe_pose(pose: FloorPose) -> str:
             f"Y, Z +- {', '.join(f'{degrees(s):.4f}' for s in sigma[3:])} deg",
             "  covariance (X Y Z in m, rotations about X Y Z in rad):",
             *(f"    {' '.join(f'{value: .3e}' for value in row)}" for row in pose.covariance),
+            *(f"warning: {text}" for text in pose.warnings),
         ]
     )
 

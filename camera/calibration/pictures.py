@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 _ARROW_SHARE = 0.05
+#: Height of the bars' axis, in the largest residual of a picture that is used.
+_VIEWS_TOP = 4.0
 
 
 def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
@@ -77,17 +79,24 @@ def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
 
 
 def _draw_views(calibration: Calibration, figure: Figure) -> None:
-    rms = calibration.view_rms_px
-    shown = len(rms) + len(calibration.outliers)
-    axes = figure.add_subplot()
+    used, outliers = len(calibration.names), len(calibration.outliers)
     names = [*calibration.names, *(name for name, _ in calibration.outliers)]
-    values = [*rms, *(value for _, value in calibration.outliers)]
-    colours = ["tab:blue"] * len(rms) + ["tab:red"] * len(calibration.outliers)
-    axes.bar(np.arange(shown), values, color=colours)
+    values = np.array([*calibration.view_rms_px, *(value for _, value in calibration.outliers)])
+    # Those far above, or without a residual, are cut off and labelled: the others stay readable.
+    highest = 1.05 * float(values[np.isfinite(values)].max())
+    top = min(highest, _VIEWS_TOP * float(values[:used].max()))
+    colours = ["tab:blue"] * used + ["tab:red"] * outliers
+    axes = figure.add_subplot()
+    axes.bar(np.arange(len(names)), np.minimum(values, top), color=colours)
     axes.axhline(calibration.adjusted.rms_px, color="0.3", lw=0.8)
-    axes.set_xticks(np.arange(shown), names, rotation=90, fontsize=6)
+    axes.set_ylim(0.0, top)
+    for place, value in enumerate(values.tolist()):
+        if value > top:
+            label = f"{value:.1f}" if np.isfinite(value) else "none"
+            axes.text(place, top, label, ha="center", va="bottom", fontsize=6)
+    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=6)
     axes.set_ylabel("RMS residual (px)")
-    axes.set_title("Each picture; red: left out" if calibration.outliers else "Each picture")
+    axes.set_title("Each picture; red: left out" if outliers else "Each picture", pad=12)
 
 
 def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:

@@ -7,13 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from camera.calibration.adjustment import (
-    Adjusted,
-    Estimate,
-    Points,
-    adjust,
-    project_estimate,
-)
+from camera.calibration.adjustment import Estimate, Points, adjust, project_estimate
 from camera.calibration.model import COUNT, free_span, lens_of, rotation_of
 from camera.distortion import one_to_one_radius, straightened
 from redetect.array_types import FloatArray
@@ -27,30 +21,37 @@ _LOOSE = 1e-4
 
 
 def first_estimate(points: Points, aspect: float | None) -> Estimate:
-    """The best of some focal lengths, with at most one coefficient; it projects all points.
+    """The best of some focal lengths, with at most one coefficient.
 
-    `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with).
+    `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with). Views that contradict the
+    others may be left with a pose from which their points are not seen.
     """
     chosen = np.unique(np.linspace(0, len(points.counts) - 1, _FEW_VIEWS).round().astype(np.int64))
     few = points.of(chosen)
     ratio = 1.0 if aspect is None else aspect
-    best: Adjusted | None = None
+    best, lowest = None, (np.inf, 0)
     for widths in _FOCAL_WIDTHS:
         focal = widths * points.width
         intrinsics = np.array(
             [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 10]
         )
         start = board_poses(intrinsics, few)[0]
+        seen = np.flatnonzero(np.isfinite(view_errors(start, few)))
+        if not len(seen):
+            continue
         try:
-            fit = adjust(start, few, free_span(1, ratio), robust=True, tolerance=_LOOSE)
+            fit = adjust(start.of(seen), few.of(seen), free_span(1, ratio), tolerance=_LOOSE)
         except (StartError, np.linalg.LinAlgError):
             continue
-        if best is None or fit.sigma_px < best.sigma_px:
-            best = fit
+        # Of all points, so that a focal length gains nothing by views that it doesn't see.
+        errors = np.full(few.pixels.size, np.inf)
+        errors[: fit.residuals.size] = np.abs(fit.residuals).ravel()
+        error = float(np.median(errors)), -len(seen)
+        if error < lowest:
+            best, lowest = fit.estimate.intrinsics, error
     if best is None:
         raise StartError("no focal length explains the points")
-    intrinsics = best.estimate.intrinsics
-    return best_poses(board_poses(intrinsics, points)[0], points)
+    return best_poses(board_poses(best, points)[0], points)
 
 
 def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estimate]:
@@ -82,7 +83,7 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
     """Each pose refined, from its start and from both of `board_poses`."""
     candidates = [estimate, *board_poses(estimate.intrinsics, points)]
     fits = [_poses_alone(candidate, points) for candidate in candidates]
-    errors = np.stack([_errors(fit, points) for fit in fits])
+    errors = np.stack([view_errors(fit, points) for fit in fits])
     use = np.argmin(errors, axis=0)
     every = np.arange(len(points.counts))
     rotations = np.stack([fit.rotations for fit in fits])[use, every]
@@ -91,25 +92,23 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
 
 
 def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
-    """Refine poses, all at once or, where one has no start, one by one; that one stays as it is."""
-    nothing = np.zeros((COUNT, 0))
+    """Refine the poses from which all points are seen; the others stay as they are."""
+    seen = np.flatnonzero(np.isfinite(view_errors(estimate, points)))
+    if not len(seen):
+        return estimate
     try:
-        return adjust(estimate, points, nothing, tolerance=_LOOSE).estimate
+        fit = adjust(
+            estimate.of(seen), points.of(seen), np.zeros((COUNT, 0)), tolerance=_LOOSE
+        ).estimate
     except (StartError, np.linalg.LinAlgError):
-        pass
+        return estimate
     rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
-    for view in range(len(points.counts)):
-        one = np.array([view])
-        try:
-            fit = adjust(estimate.of(one), points.of(one), nothing, tolerance=_LOOSE).estimate
-        except (StartError, np.linalg.LinAlgError):
-            continue
-        rotations[view], translations[view] = fit.rotations[0], fit.translations[0]
+    rotations[seen], translations[seen] = fit.rotations, fit.translations
     return Estimate(estimate.intrinsics, rotations, translations)
 
 
-def _errors(estimate: Estimate, points: Points) -> FloatArray:
-    """(V,) mean absolute residual; infinity where a view is not projected."""
+def view_errors(estimate: Estimate, points: Points) -> FloatArray:
+    """(V,) mean absolute residual (px); infinite where a view is not projected."""
     error = np.abs(points.pixels - project_estimate(estimate, points)[0]).sum(axis=1)
     error = np.where(np.isnan(error), np.inf, error)
     return np.asarray(np.bincount(points.views, error) / points.counts)

@@ -21,7 +21,7 @@ from camera.cli import main
 from camera.errors import CalibrationError
 from camera.uncertainty import covariance_of
 from tests.camera.conftest import BOARD, PICTURES
-from tools.evaluation.boards import Rays, board_poses, projection_difference, render_board
+from tools.evaluation.boards import Rays, projection_difference, render_board
 from tools.evaluation.calibration import BOARDS, calibrate_rendered
 
 FLAGS = ["--columns", "9", "--rows", "6", "--square-m", "0.04"]
@@ -285,13 +285,23 @@ def test_what_a_newcomer_gets_wrong(
     told = error("calibrate", str(tmp_path), *FLAGS, *output)
     assert "in any of 1 pictures" in told
     assert "10 x 7 squares has 9 x 6" in told
-    R, t = board_poses(rays.camera, BOARD, 1, 3, distances_m=(0.4, 0.6), margin_px=5.0)[0]
-    cv2.imwrite(str(tmp_path / "a.png"), render_board(rays, BOARD, R, t))
-    assert "1 pictures" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    assert len(told.splitlines()) == 1
+    facing = np.diag([1.0, -1.0, -1.0])
+    near = render_board(rays, BOARD, facing, np.array([0.0, 0.0, 0.5]))
+    cv2.imwrite(str(tmp_path / "a.png"), near)
+    for name in ("b.png", "c.png"):
+        cv2.imwrite(str(tmp_path / name), empty)
+    told = error("calibrate", str(tmp_path), *FLAGS, *output)
+    assert "error: 1 pictures of the board" in told
+    assert told.startswith("b.png, c.png: no checkerboard")
+    (tmp_path / "c.png").unlink()
     markers = ["--board", "charuco", "--marker-m", "0.03"]
     told = error("calibrate", str(tmp_path), *FLAGS, *markers, "--dictionary", "NONE", *output)
     assert told.count("'NONE' is unknown") == 1
     assert "a.png" not in told
+    told = error("calibrate", str(tmp_path), *FLAGS, *markers, *output)
+    assert "the --dictionary?" in told
+    assert len(told.splitlines()) == 1
     cv2.imwrite(str(tmp_path / "b.png"), empty[:200])
     assert "pictures before" in error("calibrate", str(tmp_path), *FLAGS, *output)
     (tmp_path / "b.png").write_bytes(b"no picture")

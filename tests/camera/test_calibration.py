@@ -380,6 +380,7 @@ def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> No
     [
         (("checkerboard", 2, 6, 0.04), "at least 3 x 3"),
         (("checkerboard", 9, 6, 0.0), "metres above 0"),
+        (("checkerboard", 9, 6, 25.0), "square_m is 25: .*25 mm are 0.025"),
         (("charuco", 9, 6, 0.04), "marker_m is 0"),
         (("circles", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.1), "below the circles' distance"),
         (("circles", 9, 6, 0.04, 0.0, "DICT_5X5_100", 0.05), "below the circles' distance, 0.04"),

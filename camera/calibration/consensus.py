@@ -1,0 +1,226 @@
+"""Which pictures one camera explains, and which contradict them.
+
+A board that was found a square off, or another board, must neither end a calibration nor bend it:
+such pictures are left out of the fit, and taken in again where they agree with the others after
+all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, project_estimate
+from camera.calibration.model import CalibrationSettings, FreeLens
+from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
+from camera.errors import CalibrationError
+from redetect.array_types import BoolArray, FloatArray
+from redetect.least_squares.solver import scaled_inverse
+
+# A view contradicts the others by so many times their median residual: with one coefficient of the
+# lens, which leaves residuals of its own in the image's corners, and with all of them.
+_FAR_AT_FIRST, _FAR = 10.0, 3.0
+# Of a view's points the farthest off don't count for that: single ones are left out by themselves.
+_COUNTED_SHARE = 0.95
+_ROUNDS = 3
+ALL_THE_SAME = (
+    "are --columns, --rows and the kind of --board right, and do all pictures show the same board "
+    "by the same camera at the same zoom?"
+)
+# Views differ in scale if that is so much, relatively, and its variance so many times that of
+# noise: boards that are not flat, and a lens that is not quite the model's, ask for some, too.
+_SCALE_CHANGE, _SCALE_VARIANCES = 0.01, 20.0
+# Below this the focal length hangs on the perspective of single views alone.
+_SMALLEST_SPREAD_DEG = 3.0
+_LARGEST_SCALE_SIGMA = 0.03
+# Such boards do not have almost the same orientation.
+_WIDE_SPREAD_DEG = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """A camera that was fitted to some views, and how well it explains each.
+
+    Attributes
+    ----------
+    fit : Adjusted
+        To those views.
+    estimate : Estimate
+        With the poses of all views.
+    rms_px : (V,) float64
+        RMS residual of each view; infinite where the camera sees its board in no pose.
+    agree : (V,) bool
+        Whether the residuals of a view, all but those of single points, are not far above those of
+        the views that it was fitted to.
+    """
+
+    fit: Adjusted
+    estimate: Estimate
+    rms_px: FloatArray
+    agree: BoolArray
+
+
+def find_consensus(
+    points: Points, names: Sequence[str], settings: CalibrationSettings, radius_m: float
+) -> Consensus:
+    """The camera that most views agree on, with all coefficients free that may be.
+
+    Takes the views' names, and the radius of circles (m), 0 for points.
+
+    Raises
+    ------
+    CalibrationError
+        If no camera explains most of the views, or they are too much alike.
+    StartError
+        If none explains any.
+    """
+
+    def fitted(estimate: Estimate, used: BoolArray, lens: FreeLens) -> Consensus:
+        return _fitted(estimate, used, points, settings, lens, radius_m)
+
+    estimate = first_estimate(points, settings.aspect)
+    errors = view_errors(estimate, points)
+    used = np.isfinite(errors)
+    if used.any():
+        used &= errors <= _FAR_AT_FIRST * np.median(errors[used])
+    _demand_most(used, names)
+    few = min(2, settings.most)
+    for count in (1, few):
+        fit = fitted(estimate, used, settings.lens(count))
+        estimate = best_poses(fit.estimate, points)
+    for count in range(few, settings.most + 1):
+        found = fitted(estimate, used, settings.lens(count))
+        estimate = found.estimate
+    # Checked before terms are fitted that such views do not determine.
+    demand_different_views(found.fit)
+    lens = settings.lens(settings.most, tangential=settings.tangential is not False)
+    if lens.tangential:
+        found = fitted(estimate, used, lens)
+    for _ in range(_ROUNDS):
+        if np.array_equal(found.agree, used):
+            break
+        used = found.agree
+        found = fitted(found.estimate, used, lens)
+    if not settings.keep_outliers:
+        _demand_most(found.agree, names)
+    return found
+
+
+def _demand_most(agree: BoolArray, names: Sequence[str]) -> None:
+    """Refuse what at most half of the views agree on."""
+    if 2 * agree.sum() <= len(agree):
+        raise CalibrationError(
+            f"no camera explains most of the pictures: {listed(names, ~agree)} contradict "
+            f"{listed(names, agree) or 'each other'}; {ALL_THE_SAME}"
+        )
+
+
+def listed(names: Sequence[str], chosen: BoolArray) -> str:
+    """Names of some views."""
+    return ", ".join(name for name, is_chosen in zip(names, chosen) if is_chosen)
+
+
+def _fitted(
+    estimate: Estimate,
+    used: BoolArray,
+    points: Points,
+    settings: CalibrationSettings,
+    lens: FreeLens,
+    radius_m: float,
+) -> Consensus:
+    """Fit to the views that are used; of the others the poses alone."""
+    views, others = np.flatnonzero(used), np.flatnonzero(~used)
+    fit, _ = fit_points(estimate.of(views), points.of(views), settings, lens, radius_m)
+    rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
+    rotations[views], translations[views] = fit.estimate.rotations, fit.estimate.translations
+    residuals = np.empty_like(points.pixels)
+    residuals[used[points.views]] = fit.residuals
+    if len(others):
+        rest = points.of(others)
+        start = replace(estimate.of(others), intrinsics=fit.estimate.intrinsics)
+        posed = best_poses(start, rest)
+        rotations[others], translations[others] = posed.rotations, posed.translations
+        residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
+    typical = view_rms(residuals, points, _COUNTED_SHARE)
+    rms = view_rms(residuals, points)
+    return Consensus(
+        fit=fit,
+        estimate=Estimate(fit.estimate.intrinsics, rotations, translations),
+        rms_px=rms,
+        agree=(typical <= _FAR * np.median(typical[used])) & np.isfinite(rms),
+    )
+
+
+def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:
+    """(V,) root of the mean squared distance of each view's points, the nearest share of them.
+
+    Infinite where one of these is NaN.
+    """
+    squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
+    ordered = squares[np.lexsort((squares, points.views))]
+    of_views = np.split(ordered, np.cumsum(points.counts)[:-1])
+    return np.sqrt([np.mean(some[: int(np.ceil(share * len(some)))]) for some in of_views])
+
+
+def demand_different_views(fit: Adjusted) -> None:
+    """Refuse views that do not separate focal length and distance."""
+    spread_deg = normals_spread_deg(fit.estimate.rotations)
+    variance = float(fit.covariance[0, 0])
+    # In a singular problem rounding can make the variance zero or negative.
+    sigma = np.sqrt(variance) if variance > 0.0 else np.inf
+    relative = float(sigma / fit.estimate.intrinsics[0])
+    if spread_deg >= _SMALLEST_SPREAD_DEG and relative < _LARGEST_SCALE_SIGMA:
+        return
+    uncertain = f"the focal length {100.0 * relative:.2g} % uncertain"
+    tilt = "tilt the board by 20 to 45 deg in different directions between pictures"
+    if spread_deg < _WIDE_SPREAD_DEG:
+        raise CalibrationError(
+            f"the boards have almost the same orientation: their normals differ by at most "
+            f"{spread_deg:.1f} deg and leave {uncertain}, because it is not separable from the "
+            f"distance; {tilt}"
+        )
+    u, v = fit.estimate.intrinsics[2:4].tolist()
+    raise CalibrationError(
+        f"the pictures do not determine the lens: they leave {uncertain}, with the principal point "
+        f"at {u:.0f}, {v:.0f}; {tilt}, hold it nearer, and measure it: it may be longer than "
+        "--square-m one way only"
+    )
+
+
+def scale_warnings(fit: Adjusted, points: Points, names: Sequence[str]) -> list[str]:
+    """Whether views contradict each other in scale, which a pose takes up all but a little of."""
+    change, variance = scale_changes(fit, points)
+    weight = 1.0 / variance
+    change = change - np.average(change, weights=weight)
+    ratio = float(np.sum(weight * change**2)) / (len(change) - 1)
+    # The variance between views beyond that of noise (DerSimonian and Laird, Controlled Clinical
+    # Trials 7, 1986).
+    total = weight.sum()
+    spread = np.sqrt(
+        max(ratio - 1.0, 0.0) * (len(change) - 1) / (total - (weight @ weight) / total)
+    )
+    if ratio < _SCALE_VARIANCES or spread < _SCALE_CHANGE:
+        return []
+    return [
+        f"the pictures contradict each other in scale by {100.0 * spread:.1f} %: did zoom or "
+        f"autofocus change? It is larger in {listed(names, change > 0.0)} than in "
+        f"{listed(names, change <= 0.0)}"
+    ]
+
+
+def scale_changes(fit: Adjusted, points: Points) -> tuple[FloatArray, FloatArray]:
+    """(V,) relative changes of both scales that each view asks for by itself, and variances."""
+    _, by_intrinsics, by_pose = project_estimate(fit.estimate, points)
+    by_scale = by_intrinsics[:, :, :2] @ fit.estimate.intrinsics[:2]
+    root = np.sqrt(fit.weights)
+    by = root[..., None] * np.concatenate([by_scale[..., None], by_pose], axis=-1)
+    changes, variances = [], []
+    for view in range(len(points.counts)):
+        rows = points.views == view
+        jacobian, residuals = by[rows].reshape(-1, 7), (root * fit.residuals)[rows].ravel()
+        inverse = scaled_inverse(jacobian.T @ jacobian)
+        changes.append((inverse @ jacobian.T @ residuals)[0])
+        variances.append(fit.sigma_px**2 * inverse[0, 0])
+    return np.array(changes), np.array(variances)
