@@ -19,10 +19,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 
 #: Length of the state, and of the pose at its beginning.
 STATE = 6
@@ -33,7 +33,7 @@ NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 _SERIES_BELOW = 0.1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     """Effect of errors along an arc of length 1.
 
@@ -61,7 +61,7 @@ def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     return chord, mean_along, variance_along, variance_across, mean_cosine
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def move(
     x: FloatArray,
     p: FloatArray,
@@ -129,12 +129,12 @@ def move(
         p[j, i] += value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
@@ -151,7 +151,7 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     return float(determinant)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _squared_innovation(
     p: FloatArray,
     measured_covariance: FloatArray,
@@ -171,7 +171,7 @@ def _squared_innovation(
     return squared, determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _update(
     x: FloatArray,
     p: FloatArray,
@@ -248,7 +248,7 @@ def empty_history(nodes: int) -> FilterHistory:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def filter_forward(
     odometry: Odometry,
     start: FloatArray,
@@ -343,7 +343,7 @@ def filter_forward(
     return squared_innovations, accepted, restarted, surprise
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     """Smooth what `filter_forward` left, from the last node to the first.
 

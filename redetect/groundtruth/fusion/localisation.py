@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import minimize
 
 from redetect.array_types import FloatArray
+from redetect.compiled import kernel
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
 from redetect.groundtruth.trajectories.streams import (
@@ -165,7 +165,7 @@ class _Filtered(NamedTuple):
     surprise: float
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _filter(
     times_s: FloatArray,
     differences: FloatArray,
@@ -221,7 +221,7 @@ def _filter(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _smooth(
     times_s: FloatArray, errors: FloatArray, filtered: _Filtered
 ) -> tuple[FloatArray, FloatArray]:

@@ -18,12 +18,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.plane import apply, invert
 from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
@@ -258,7 +258,7 @@ def explained(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float
     return float(np.mean(np.exp(-0.5 * np.concatenate([there, back**2]) / sigma_m**2)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def nearest_on_segments(
     points: FloatArray, segments: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -288,7 +288,7 @@ def nearest_on_segments(
     return nearest, index, squared
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatArray:
     """Pose (3,) with the least sum of squared distances between the used pairs of points.
 
@@ -322,7 +322,7 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
     return pose
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points taken by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -333,7 +333,7 @@ def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def fit_outline(
     points: FloatArray,
     faces: FloatArray,

@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 
 
 class Beams(NamedTuple):
@@ -84,7 +84,7 @@ class OutlineFit(NamedTuple):
     steps: int  # At most
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def new_points(
     ranges_mm: NDArray[np.uint16],
     rows: IntArray,
@@ -136,7 +136,7 @@ def new_points(
     return Seen(points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy())
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _face_of(
     x: float,
     y: float,
@@ -177,7 +177,7 @@ def _face_of(
     return face
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _hold_open(
     h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
 ) -> tuple[int, FloatArray]:
@@ -207,7 +207,7 @@ def _hold_open(
     return open_count, vectors[:, 0].copy()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def refine_outline(
     seen: Seen,
     faces: FloatArray,
@@ -309,7 +309,7 @@ def refine_outline(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def explain_set(
     ranges_mm: NDArray[np.uint16],
     rows: IntArray,
