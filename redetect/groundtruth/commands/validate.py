@@ -24,19 +24,17 @@ from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation.onboard import (
     INCIDENCES_DEG,
+    Onboard,
+    ReferencePose,
+    Refused,
     range_errors,
+    reference_poses,
     refine_mounts,
 )
 from redetect.groundtruth.validation.reference_poses import (
     poses_from_distances,
     read_distances,
     read_survey,
-)
-from redetect.groundtruth.validation.reference_poses_scans import (
-    Onboard,
-    ReferencePose,
-    Refused,
-    reference_poses,
 )
 from redetect.groundtruth.validation.scoring import sigma_of
 from redetect.groundtruth.validation.validate import (

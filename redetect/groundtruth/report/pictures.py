@@ -15,7 +15,7 @@ import numpy as np
 from redetect import plane
 from redetect.array_types import FloatArray
 from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog
-from redetect.groundtruth.lasers.alignment import Alignment, StillScan
+from redetect.groundtruth.lasers.alignment import Alignment
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.calibration import Rig, marker_corners
@@ -321,11 +321,11 @@ _COLOURS = ("#2a78b5", "#d9822b", "#3a9150", "#8e5bb0", "#b03a48", "#6b6b6b")
 def draw_alignment(
     measured: tuple[Scanner, ...],
     alignment: Alignment,
-    scans: list[StillScan],
+    clouds: list[FloatArray],
     building: FloatArray,
     icp_rms_m: list[FloatArray],
 ) -> bytes:
-    """Draw the scans on the map by the measured poses and by those found; a PNG's bytes.
+    """Draw scanners' points on the map by the measured poses and by those found; a PNG's bytes.
 
     Beside them `icp_rms_m`, for each scanner the distances from the map (m) step by step of an ICP
     from its measured pose. The same input gives the same bytes.
@@ -333,14 +333,14 @@ def draw_alignment(
     with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]
         before = [scanner.pose for scanner in measured]
-        everything = np.concatenate([plane.apply(p, s.points) for p, s in zip(after, scans)])
+        everything = np.concatenate([plane.apply(p, cloud) for p, cloud in zip(after, clouds)])
         low, high = everything.min(axis=0) - 0.5, everything.max(axis=0) + 0.5
         *maps, steps = figure.subplots(1, 3)
         for axes, poses, title in zip(maps, (before, after), ("measured by hand", "aligned")):
             draw_walls(axes, building)
-            for k, (pose, scan) in enumerate(zip(poses, scans)):
+            for k, (pose, cloud) in enumerate(zip(poses, clouds)):
                 colour = _COLOURS[k % len(_COLOURS)]
-                points = plane.apply(pose, scan.points)
+                points = plane.apply(pose, cloud)
                 axes.scatter(points[:, 0], points[:, 1], s=7, color=colour, lw=0, zorder=2)
                 ahead = plane.apply(pose, np.array([[0.0, 0.0], [0.5, 0.0]]))
                 axes.plot(ahead[:, 0], ahead[:, 1], color=colour, lw=2.0, zorder=3)

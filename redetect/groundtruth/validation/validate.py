@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
-from redetect.groundtruth.validation.reference_poses_scans import ReferencePose, Refused
+from redetect.groundtruth.validation.onboard import ReferencePose, Refused
 from redetect.groundtruth.validation.scoring import LEAST_CORRELATION, sigma_of
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 

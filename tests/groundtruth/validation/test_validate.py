@@ -19,8 +19,8 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.groundtruth.validation.onboard import reference_poses
 from redetect.groundtruth.validation.reference_poses import Distance, Survey, poses_from_distances
-from redetect.groundtruth.validation.reference_poses_scans import reference_poses
 from redetect.groundtruth.validation.validate import figures_of, pose_errors
 from tools.simulator.laser.writers import (
     write_building,
