@@ -22,8 +22,7 @@ from redetect.groundtruth.report.pictures import (
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
 from redetect.groundtruth.validation.dimensions import Dimension, SurveyedFiducials
-from redetect.groundtruth.validation.scoring import PoseScore, score_poses, sigma_of
-from redetect.groundtruth.validation.validate import PUBLISHED
+from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, score_poses, sigma_of
 from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of
 
@@ -270,13 +269,6 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _is_outside(figures: dict[str, Any]) -> bool:
-    """Whether the normalised error is outside its band."""
-    values = [figures.get(name) for name in ("nees_low", "nees", "nees_high")]
-    numbers = [float(value) for value in values if is_number(value)]
-    return len(numbers) == 3 and not numbers[0] <= numbers[1] <= numbers[2]
-
-
 def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
@@ -287,9 +279,9 @@ def _validation(inputs: Inputs) -> list[Part]:
         (
             str(document.get("poses", "ground truth")),
             *(_number(figures.get(k), 1e3) for k in
-              ("linear_mean_m", "linear_sigma_m", "linear_worst_m")),
+              ("position_mean_m", "position_sigma_m", "position_max_m")),
             *(_number(figures.get(k), 180.0 / math.pi, 3) for k in
-              ("angular_mean_rad", "angular_sigma_rad", "angular_worst_rad")),
+              ("angle_mean_rad", "angle_sigma_rad", "angle_max_rad")),
         )
     ]  # fmt: skip
     for p in PUBLISHED:
@@ -300,15 +292,14 @@ def _validation(inputs: Inputs) -> list[Part]:
         )  # fmt: skip
     head = ("ground truth", "mean / mm", "sigma", "worst", "mean / deg", "sigma", "worst")
     content = [table("Linear and angular errors at reference poses", head, rows)]
-    content.append(
-        Part(
-            "problem" if _is_outside(figures) else "text",
-            f"{_number(figures.get('poses'), 1.0, 0)} reference poses. NEES / 3 with both "
-            f"covariances: {_number(figures.get('nees'), 1.0, 3)}; 95 % of right ones lie between "
-            f"{_number(figures.get('nees_low'), 1.0, 3)} and "
-            f"{_number(figures.get('nees_high'), 1.0, 3)}.",
-        )
-    )
+    nees = figures.get("normalised_error")
+    words, outside = f"NEES / 3 with both covariances: {_number(nees, 1.0, 3)}", False
+    band = [v for v in _entry(figures, "normalised_band", list) if is_number(v)]
+    if len(band) == 2 and is_number(nees):
+        words += f"; 95 % of right ones lie between {band[0]:.3f} and {band[1]:.3f}"
+        outside = not band[0] <= nees <= band[1]
+    count = _number(figures.get("poses"), 1.0, 0)
+    content.append(Part("problem" if outside else "text", f"{count} reference poses. {words}."))
     for name, words, size in (
         ("errors", "Linear and angular errors at each reference pose.", _VALIDATION_PX),
         ("scans", "Readings of the scanners on board, by each set of poses.", _SCANS_PX),

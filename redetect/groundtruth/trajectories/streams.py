@@ -181,41 +181,6 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     return times
 
 
-def read_rows_of_numbers(
-    path: str | os.PathLike[str], columns: int, expected: str, *, head: str = ""
-) -> FloatArray:
-    """Read rows of numbers between commas or blanks; blank lines and `#` comments are skipped.
-
-    Parameters
-    ----------
-    columns : int
-        Numbers in every row.
-    expected : str
-        What they are, for messages.
-    head : str
-        Names between commas that may be on the first line.
-
-    Returns
-    -------
-    (N, columns) float64
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read, is empty or a row is malformed; it names file and line.
-    """
-    rows: list[list[float]] = []
-    for line, words in read_rows(path):
-        if not rows and words == head.split(","):
-            continue
-        if len(words) != columns:
-            raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
-        rows.append(parse_numbers(path, line, words))
-    if not rows:
-        raise StreamError(path, None, f"no rows in it: expected {expected}")
-    return np.array(rows)
-
-
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
     """The samples (N,) of each segment between pauses that are longer than a limit."""
     cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1

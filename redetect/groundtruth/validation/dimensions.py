@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import parse_numbers, read_rows
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.files import known_name, read_table
 from redetect.groundtruth.validation.reference_poses import Survey
 from redetect.plane import apply, fitted, rotation
-from redetect.storage.messages import excerpt
 
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
 FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
@@ -54,31 +53,18 @@ class SurveyedFiducials(NamedTuple):
 def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
     """Read a ``dimensions.csv``."""
     found = []
-    for line, words in _rows(path, DIMENSIONS_HEAD):
-        x1, y1, x2, y2, measured = parse_numbers(path, line, words[1:])
-        found.append(Dimension(words[0], math.hypot(x2 - x1, y2 - y1), measured))
+    for _, (name,), (x1, y1, x2, y2, measured) in read_table(path, DIMENSIONS_HEAD, ("name",)):
+        found.append(Dimension(name, math.hypot(x2 - x1, y2 - y1), measured))
     return found
 
 
 def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> list[FiducialDistance]:
     """Read a ``fiducial_distances.csv``, which may name the survey's fiducials only."""
     found = []
-    for line, words in _rows(path, FIDUCIAL_DISTANCES_HEAD):
-        for name in words[:2]:
-            if name not in survey.fiducials:
-                known = ", ".join(survey.fiducials)
-                raise StreamError(path, line, f"{excerpt(name)}: expected one of {known}")
-        (distance,) = parse_numbers(path, line, words[2:])
-        found.append(FiducialDistance(words[0], words[1], distance))
+    for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):
+        a, b = (known_name(path, line, name, survey.fiducials) for name in names)
+        found.append(FiducialDistance(a, b, distance))
     return found
-
-
-def _rows(path: str | os.PathLike[str], head: str) -> list[tuple[int, list[str]]]:
-    rows = [(line, words) for line, words in read_rows(path) if words != head.split(",")]
-    for line, words in rows:
-        if len(words) != head.count(",") + 1:
-            raise StreamError(path, line, f"{len(words)} words: expected {head}")
-    return rows
 
 
 def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> SurveyedFiducials:

@@ -21,13 +21,13 @@ from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import JsonObject, read_rows
+from redetect.groundtruth.files import JsonObject, known_name, read_table
 from redetect.landmarks import wrap_angle
 from redetect.plane import rotation
 from redetect.storage.bounds import ABOVE_0
-from redetect.storage.messages import excerpt
 
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
+_ENDS = ("point", "fiducial")
 _FARTHEST_M = 1e6
 
 
@@ -84,10 +84,13 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     StreamError
         If the file cannot be read, a row is malformed or names a point that is not known.
     """
-    rows: list[Distance] = []
-    for line, words in read_rows(path):
-        if rows or words != DISTANCES_HEAD.split(","):
-            rows.append(_distance(path, line, words, survey))
+    rows = []
+    for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
+        if pose < 0.0 or pose % 1.0 or not 0.0 <= distance_m < _FARTHEST_M:
+            raise StreamError(path, line, "expected a whole pose and a distance of 0 or more")
+        point = known_name(path, line, names[0], survey.robot_points)
+        fiducial = known_name(path, line, names[1], survey.fiducials)
+        rows.append(Distance(int(pose), time_s, point, fiducial, distance_m))
     return rows
 
 
@@ -101,23 +104,6 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
         if not np.all(np.abs(point) < _FARTHEST_M):
             raise entries.wrong(name, f"less than {_FARTHEST_M:g} m")
     return points
-
-
-def _distance(
-    path: str | os.PathLike[str], number: int, words: list[str], survey: Survey
-) -> Distance:
-    if len(words) != 5:
-        raise StreamError(path, number, f"{len(words)} words: expected {DISTANCES_HEAD}")
-    try:
-        pose, time, distance = int(words[0]), float(words[1]), float(words[4])
-    except ValueError:
-        raise StreamError(path, number, f"expected numbers in {DISTANCES_HEAD}") from None
-    if pose < 0 or not np.isfinite(time) or not 0.0 <= distance < _FARTHEST_M:
-        raise StreamError(path, number, "expected a pose and a distance of 0 or more, finite")
-    for name, known in ((words[2], survey.robot_points), (words[3], survey.fiducials)):
-        if name not in known:
-            raise StreamError(path, number, f"{excerpt(name)}: expected one of {', '.join(known)}")
-    return Distance(pose, time, words[2], words[3], distance)
 
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
