@@ -377,9 +377,8 @@ def draw_errors(
         linear, angular = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
         names = [str(reference.index) for reference in errors.references]
         at = np.arange(len(names))
-        linear.bar(
-            at, 1e3 * np.hypot(*errors.error[:, :2].T), color=_BLUE, width=0.6, label="error"
-        )
+        x, y, theta = errors.error.T
+        linear.bar(at, 1e3 * np.hypot(x, y), color=_BLUE, width=0.6, label="error")
         # Of two independent directions: the root mean square, so that it compares with errors.
         expected = 1e3 * errors.sigma[:, 0]
         if np.isfinite(expected).any():
@@ -398,7 +397,7 @@ def draw_errors(
             f"{1e3 * score.position_sigma_m:.2f} mm, worst {1e3 * score.position_max_m:.2f} mm",
             fontsize=10,
         )
-        turns, sigma = np.degrees(errors.error[:, 2]), np.degrees(errors.sigma[:, 1])
+        turns, sigma = np.degrees(theta), np.degrees(errors.sigma[:, 1])
         angular.axhline(0.0, color=_GREY, lw=0.8)
         angular.errorbar(
             at, turns, yerr=np.where(np.isfinite(sigma), sigma, 0.0), fmt="o", color=_BLUE,
@@ -423,11 +422,11 @@ def draw_errors(
         where = figure.add_subplot(grid[:, 1])
         if building is not None:
             draw_walls(where, building)
-        poses, shown = np.array([r.pose for r in errors.references]), errors.error
+        poses = errors.reference_poses.poses
         span = float(np.ptp(poses[:, :2], axis=0).max()) if len(poses) > 1 else 1.0
         factor = _round_factor(0.12 * max(span, 1.0) / max(score.position_max_m, 1e-6))
         where.quiver(
-            poses[:, 0], poses[:, 1], factor * shown[:, 0], factor * shown[:, 1], angles="xy",
+            poses[:, 0], poses[:, 1], factor * x, factor * y, angles="xy",
             scale_units="xy", scale=1.0, color=_BLUE, width=0.004, zorder=3,
         )  # fmt: skip
         ahead = poses[:, :2] + 0.2 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])

@@ -167,7 +167,8 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
     (session / "validation").mkdir()
     hostile = {
         "version": HOSTILE, "settings": {HOSTILE: {HOSTILE: HOSTILE}}, "poses": HOSTILE,
-        "figures": {"position_mean_m": HOSTILE, "normalised_error": [1], "normalised_band": [2, HOSTILE], "poses": True},
+        "figures": {"position_mean_m": HOSTILE, "normalised_error": [1], "poses": True,
+                    "normalised_band": [2, HOSTILE]},
         "refused": [{"index": HOSTILE, "status": HOSTILE, "reason": HOSTILE}, HOSTILE],
         "rejected": [{"stream": HOSTILE, "time_s": 1e999, "squared_innovation": HOSTILE}, 5],
         "used": {HOSTILE: HOSTILE}, "restarts_s": HOSTILE,
