@@ -42,8 +42,8 @@ def perform(options: Laser) -> int:
     calibration = options.scanners or options.session / "aligned.json"
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
-    scanners, robot, tables, sets = load_session(options.session, calibration)
-    track, left_out = track_without_suspects(sets, tables, robot, scanners, options.settings)
+    scanners, robot, fixed, sets = load_session(options.session, calibration)
+    track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)

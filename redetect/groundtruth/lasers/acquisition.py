@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,11 +13,12 @@ from scipy.spatial import cKDTree
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
-from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import (
-    BeamCounts,
+    Body,
+    FixedScanners,
     OutlineFit,
     OutlinePose,
+    ScanSet,
     Seen,
     explain_set,
     new_points,
@@ -117,8 +117,6 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
     )
 
 
-#: A reading within this of where a beam should meet the robot agrees (m).
-AGREES_M = 0.05
 #: Steps of the refinement.
 _STEPS = 8
 
@@ -126,20 +124,10 @@ _EVERYWHERE_M = 1e6
 _LARGEST_CHI2 = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Body:
-    """The robot's data for the kernels."""
-
-    faces: FloatArray  # (k, 4): counter-clockwise
-    middle: FloatArray  # (2,): of its bounding box, in its frame
-    radius_m: float  # Of its farthest corner from there
-    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
-
-
 def refine(
     seen: Seen,
     start: FloatArray,
-    tables: ScannerTables,
+    fixed: FixedScanners,
     body: Body,
     settings: LaserSettings,
     prior_m: float,
@@ -150,17 +138,7 @@ def refine(
         s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
         _STEPS,
     )  # fmt: skip
-    return refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit)
-
-
-def explain(
-    sets: ScanSets, index: int, tables: ScannerTables, body: Body, pose: FloatArray
-) -> BeamCounts:
-    """How a pose explains the beams of a set."""
-    return explain_set(
-        sets.ranges_mm, sets.rows[index], tables.as_beams(), body.faces, body.middle,
-        body.radius_m, pose, AGREES_M,
-    )  # fmt: skip
+    return refine_outline(seen, body.faces, start, fixed.origins, fixed.sigmas_m, fit)
 
 
 def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
@@ -171,7 +149,7 @@ def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_
 
 
 def acquire(
-    sets: ScanSets, index: int, tables: ScannerTables, body: Body, settings: LaserSettings
+    scans: ScanSet, fixed: FixedScanners, body: Body, settings: LaserSettings
 ) -> FloatArray | None:
     """Find the robot in one set of scans: x, y (m), theta (rad), or None.
 
@@ -181,10 +159,7 @@ def acquire(
     outline's symmetries and explain the scans about as well, none is returned; with a symmetric
     outline it is one of the equivalent poses.
     """
-    seen = new_points(
-        sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
-        np.zeros(5), sets.ages_s[index],
-    )  # fmt: skip
+    seen = new_points(scans, fixed, np.zeros(2), _EVERYWHERE_M, np.zeros(5))
     if len(seen.points) < settings.acquire_readings:
         return None
     found: list[tuple[float, FloatArray]] = []
@@ -192,7 +167,7 @@ def acquire(
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
         if int(near.sum()) < settings.acquire_readings:
             continue
-        found += _search(place, seen.where(near), sets, index, tables, body, settings)
+        found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
     found.sort(key=lambda entry: -entry[0])
@@ -230,9 +205,8 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
 def _search(
     place: FloatArray,
     seen: Seen,
-    sets: ScanSets,
-    index: int,
-    tables: ScannerTables,
+    scans: ScanSet,
+    fixed: FixedScanners,
     body: Body,
     settings: LaserSettings,
 ) -> list[tuple[float, FloatArray]]:
@@ -249,12 +223,12 @@ def _search(
         if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
-        refined = refine(seen, pose, tables, body, settings, 0.1)
+        refined = refine(seen, pose, fixed, body, settings, 0.1)
         if refined.used < settings.acquire_readings or refined.open_directions:
             continue
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
-        _, agree, through, hidden, _, beside = explain(sets, index, tables, body, refined.pose)
+        _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
         if agree < settings.least_agreement * (agree + through + hidden + beside):
             continue
         found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))

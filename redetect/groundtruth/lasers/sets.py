@@ -1,4 +1,4 @@
-"""Scans of several scanners as sets, the background that they see, and the kernels' tables."""
+"""Scans of several scanners as sets, and what the scanners see of the empty area."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -21,7 +22,7 @@ from redetect.groundtruth.lasers.scanners import (
     read_scanners,
     read_scans,
 )
-from redetect.groundtruth.lasers.tracking_kernels import Beams
+from redetect.groundtruth.lasers.tracking_kernels import FixedScanners, ScanSet
 
 # A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
 # than the nearest object that the beam saw, which is at this quantile of its readings.
@@ -72,27 +73,6 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
 
 
 @dataclass(frozen=True, eq=False)
-class ScannerTables:
-    """Fixed scanners as arrays, padded to the longest scan."""
-
-    names: tuple[str, ...]
-    poses: FloatArray  # (scanners, 3): in the world
-    covariance: FloatArray  # (3 scanners, 3 scanners): of the poses, jointly
-    near_mm: FloatArray  # (scanners, readings): A reading below this is new; 0 for the padding.
-    beams: FloatArray  # (scanners, readings, 2): the beams' directions in the world
-    sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
-
-    @property
-    def origins(self) -> FloatArray:
-        """(scanners, 2) places of the scanners (m)."""
-        return np.ascontiguousarray(self.poses[:, :2])
-
-    def as_beams(self) -> Beams:
-        """As the kernels take them."""
-        return Beams(self.near_mm, self.beams, self.origins)
-
-
-@dataclass(frozen=True, eq=False)
 class ScanSets:
     """Scans that belong together."""
 
@@ -105,29 +85,30 @@ class ScanSets:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    def __getitem__(self, index: int) -> ScanSet:
+        return ScanSet(self.ranges_mm, self.rows[index], self.ages_s[index])
 
-def scanner_tables(scanners: Sequence[Scanner], backgrounds: Sequence[Background]) -> ScannerTables:
-    """Arrange scanners and their backgrounds for the kernels."""
+
+def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> FixedScanners:
+    """Arrange scanners, and the background in their scans of the empty area, for the kernels."""
     if not scanners:
         raise GroundTruthError("no scanners: expected some")
+    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
-    beams = np.zeros((len(scanners), width, 2))
-    covariance = np.zeros((3 * len(scanners), 3 * len(scanners)))
+    direction = np.zeros((len(scanners), width, 2))
     for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
         reach = np.minimum(background.near_m, scanner.max_range_m)
         near[i, : scanner.readings] = 1e3 * reach
         angle = scanner.pose[2] + scanner.angles_rad
-        beams[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = scanner.covariance
-    return ScannerTables(
-        tuple(scanner.name for scanner in scanners),
-        np.stack([scanner.pose for scanner in scanners]),
-        covariance,
+        direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return FixedScanners(
         near,
-        beams,
+        direction,
+        np.stack([scanner.pose[:2] for scanner in scanners]),
         # Rounding to a quantum is an error more, evenly spread over it.
         np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
+        block_diag(*(scanner.covariance for scanner in scanners)),
     )
 
 
@@ -176,7 +157,7 @@ def _group(
 
 def load_session(
     folder: Path, calibration: Path
-) -> tuple[tuple[Scanner, ...], Robot, ScannerTables, ScanSets]:
+) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
     """Read fixed scanners, robot, scans, and learn the background.
 
     Raises
@@ -190,6 +171,4 @@ def load_session(
         [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
         for place in (folder / "empty", folder)
     )
-    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
-    tables = scanner_tables(scanners, backgrounds)
-    return scanners, robot, tables, sets_of_scans(scans)
+    return scanners, robot, fixed_scanners(scanners, empties), sets_of_scans(scans)

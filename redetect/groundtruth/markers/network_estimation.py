@@ -234,25 +234,21 @@ def _bundle(
         np.concatenate([view.corners for view in views]),
         np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
-    free_part = np.zeros(len(order), dtype=np.bool_)
+    free = np.arange(len(names) + len(order) + 1 + len(bodies)) != len(names) + len(order)
+    free[len(names) : len(names) + len(order)] = False
     priors: tuple[PosePrior, ...] = ()
     if double is not None and any(view.board == double.second for view in views):
-        free = double.offset is None or bool(np.any(double.covariance))
-        free_part[order.index(double.second)] = free
-        if free and double.offset is not None:
+        second = len(names) + order.index(double.second)
+        free[second] = double.offset is None or bool(np.any(double.covariance))
+        if free[second] and double.offset is not None:
             # Exactly known poses beside uncertain ones are held to a micrometre.
-            covariance = double.covariance + 1e-12 * np.eye(6)
-            priors = (PosePrior("part", order.index(double.second), double.offset, covariance),)
-    free_body = np.ones(1 + len(bodies), dtype=np.bool_)
-    free_body[0] = False
+            priors = (PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),)
+    of_bodies = [np.eye(4), *(bodies[number] for number in sorted(bodies))]
     bundle = Bundle(
         tuple(cameras[name] for name in names),
-        np.stack([poses[name] for name in names]),
-        np.stack([np.eye(4), *(bodies[number] for number in sorted(bodies))]),
-        np.stack([parts[name] for name in order]),
-        np.ones(len(names), dtype=np.bool_),
-        free_body,
-        free_part,
+        len(order),
+        np.stack([*(poses[name] for name in names), *(parts[name] for name in order), *of_bodies]),
+        free,
         points,
         np.repeat(np.arange(len(views)), counts),
         priors,

@@ -268,16 +268,13 @@ def _bundle(
         bodies += [len(poses)] * len(own)
         poses.append(pose)
     points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
-    free_part = np.ones(len(rig.ids), dtype=np.bool_)
-    free_part[root] = False
+    free = np.arange(len(cameras) + len(start) + len(poses)) >= len(cameras)
+    free[len(cameras) + root] = False
     bundle = Bundle(
         cameras,
-        world_from_camera,
-        np.stack(poses),
-        start,
-        np.zeros(len(cameras), dtype=np.bool_),
-        np.ones(len(poses), dtype=np.bool_),
-        free_part,
+        len(start),
+        np.concatenate([world_from_camera, start, poses]),
+        free,
         replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
         np.repeat(np.arange(len(views)), 4),
     )
@@ -286,17 +283,18 @@ def _bundle(
 
 def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     """The bundle with its cameras free, each with its own covariance as a prior."""
-    free = np.isin(np.arange(len(bundle.cameras)), bundle.seen.camera)
+    seen = np.unique(bundle.seen.camera)
+    free = bundle.free.copy()
+    free[seen] = True
     priors = tuple(
-        PosePrior(
-            "camera",
-            int(c),
-            bundle.world_from_camera[c],
-            covariance[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] + 1e-12 * np.eye(6),
-        )
-        for c in np.flatnonzero(free)
+        PosePrior(int(c), bundle.poses[c], _block(covariance, c) + _EXACT * np.eye(6)) for c in seen
     )
-    return replace(bundle, free_camera=free, priors=priors)
+    return replace(bundle, free=free, priors=priors)
+
+
+def _block(covariance: FloatArray, index: int) -> FloatArray:
+    """The (6, 6) covariance of one of several poses."""
+    return covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
 
 
 def _best_start(
@@ -351,8 +349,9 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
     priors, starts = [], []
     for marker in common:
         i, j = ids.index(marker), known.ids.index(marker)
-        covariance = known.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] + _EXACT * np.eye(6)
-        priors.append(PosePrior("part", i, known.robot_from_marker[j], covariance))
+        covariance = _block(known.covariance, j) + _EXACT * np.eye(6)
+        cameras = len(estimate.adjusted.bundle.cameras)
+        priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
         starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
     start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings)
@@ -393,7 +392,7 @@ def rig_by_reference_poses(
         x, y, theta = reference.poses[k]
         pose = planar_transform(float(x), float(y), float(theta))
         covariance = _reference_covariance(reference, k, pose)
-        priors.append(PosePrior("body", body, pose, covariance))
+        priors.append(PosePrior(bundle.shared + body, pose, covariance))
         starts.append(inverse(pose) @ bundle.world_from_body[body])
     if not priors:
         raise GroundTruthError(
@@ -421,14 +420,21 @@ def _readjusted(
     settings: RigSettings,
 ) -> RigEstimate:
     bundle = estimate.adjusted.bundle
-    seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body)
+    cameras = len(bundle.cameras)
+    free = bundle.free.copy()
+    free[cameras : bundle.shared] = True
+    free[bundle.shared :] = np.isin(np.arange(len(bundle.world_from_body)), bundle.seen.body)
     moved = replace(
         bundle,
-        world_from_body=bundle.world_from_body @ inverse(robot_from_rig),
-        body_from_part=robot_from_rig @ bundle.body_from_part,
-        free_body=seen,
-        free_part=np.ones(len(bundle.free_part), dtype=np.bool_),
-        priors=(*(p for p in bundle.priors if p.kind == "camera"), *priors),
+        poses=np.concatenate(
+            [
+                bundle.world_from_camera,
+                robot_from_rig @ bundle.body_from_part,
+                bundle.world_from_body @ inverse(robot_from_rig),
+            ]
+        ),
+        free=free,
+        priors=(*(p for p in bundle.priors if p.index < cameras), *priors),
     )
     adjusted, rig = _adjusted(moved, estimate.rig, settings)
     return replace(estimate, rig=rig, adjusted=adjusted)
