@@ -425,7 +425,7 @@ def _refined(
         return movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
 
     def surprise(x: FloatArray) -> float:
-        return problem_at(x).surprise(noise)
+        return problem_at(x).account(noise).surprise
 
     best = np.zeros(2)
     try:

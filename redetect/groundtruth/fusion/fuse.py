@@ -71,7 +71,7 @@ def likeliest_noise(problem: MovementProblem) -> FloatArray:
             def surprise(value: float, axis: int = axis) -> float:
                 tried = logarithms.copy()
                 tried[axis] = value
-                return sum(part.surprise(scaled(tried)) for part in some)
+                return sum(part.account(scaled(tried)).surprise for part in some)
 
             found = minimize_scalar(
                 surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}
@@ -95,7 +95,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
             _LONGEST_GAP_TO_LEARN_FROM_S
         )
     ]
-    numbers = POSE * sum(len(part.nodes) - 1 for part in some)
+    numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
     looser = 1.0
@@ -263,17 +263,12 @@ def fuse(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
         rejected=tuple(
-            Rejected(
-                problem.streams[i],
-                float(problem.times_s[problem.nodes[i]]),
-                float(squared[i]),
-            )
+            Rejected(str(problem.streams[i]), float(problem.measured_s[i]), float(squared[i]))
             for i in np.flatnonzero(~accepted)
         ),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
-            name: int(np.count_nonzero(accepted & (np.array(problem.streams) == name)))
-            for name in streams
+            name: int(np.count_nonzero(accepted & (problem.streams == name))) for name in streams
         },
         odometry=OdometryErrors(
             *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()

@@ -230,19 +230,19 @@ class Gating(NamedTuple):
 
 
 class FilterHistory(NamedTuple):
-    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother."""
+    """States (N, d) and covariances (N, d, d) at all nodes, for the smoother."""
 
     predicted: FloatArray
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
-    # (N, 6, 6): derivatives of each node's prediction with respect to the node before
+    # (N, d, d): derivatives of each node's prediction with respect to the node before
     transitions: FloatArray
 
 
-def empty_history(nodes: int) -> FilterHistory:
+def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
     """A history to be filled; of no nodes where none is wanted."""
-    states, spreads = (nodes, STATE), (nodes, STATE, STATE)
+    states, spreads = (nodes, state), (nodes, state, state)
     return FilterHistory(
         np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
     )
@@ -345,12 +345,12 @@ def filter_forward(
 
 @kernel()
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """Smooth what `filter_forward` left, from the last node to the first.
+    """Smooth what a filter left, from the last node to the first (Rauch, Tung, Striebel).
 
     Where the filter began anew, poses before learn from what came after only what it says of
     odometry's systematic errors.
 
-    Returns `states`, `covariances` (N, 6), (N, 6, 6).
+    Returns `states`, `covariances` (N, d), (N, d, d).
     """
     predicted, predicted_covariance = history.predicted, history.predicted_covariance
     filtered, filtered_covariance = history.filtered, history.filtered_covariance
@@ -362,7 +362,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     for k in range(last - 1, -1, -1):
         p = filtered_covariance[k]
         expected = predicted_covariance[k + 1].copy()
-        for i in range(STATE):
+        for i in range(len(expected)):
             # States without any variance stay as they are.
             if expected[i, i] == 0.0:
                 expected[i, i] = 1.0
