@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from camera import CameraError
-from redetect.groundtruth.clocks.clock import read_clock, read_ptpd
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
+from redetect.groundtruth.fusion.clock import read_clock, read_ptpd
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
 from redetect.groundtruth.markers.boards import read_boards
-from redetect.groundtruth.markers.calibration import read_network, read_rig
+from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
 from redetect.groundtruth.validation.reference_poses import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.scoring import read_relations

@@ -12,8 +12,8 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,

@@ -21,14 +21,21 @@ from redetect.groundtruth.commands.outputs import (
 )
 from redetect.groundtruth.commands.poses import read_all_frames
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Network, read_network, read_rig, write_rig
 from redetect.groundtruth.markers.rig_estimation import (
     RigEstimate,
     estimate_rig,
     rig_by_known_markers,
     rig_by_reference_poses,
 )
-from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, read_marker_frames
+from redetect.groundtruth.markers.session import (
+    MarkerFrame,
+    Network,
+    group_by_time,
+    read_marker_frames,
+    read_network,
+    read_rig,
+    write_rig,
+)
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_whole

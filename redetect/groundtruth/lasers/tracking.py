@@ -14,10 +14,9 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import acquire, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from redetect.groundtruth.lasers.sets import ScanSets
 from redetect.groundtruth.lasers.tracking_kernels import (
     BeamCounts,
     Body,

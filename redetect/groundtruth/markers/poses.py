@@ -48,7 +48,7 @@ def solve_camera(
     ----------
     points : (N, 3) array
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
-        frame, as `redetect.groundtruth.markers.calibration.marker_corners` gives them.
+        frame, as `redetect.groundtruth.markers.session.marker_corners` gives them.
     pixels : (N, 2) array
         In the original image; the lens' distortion is removed here.
     solver : str

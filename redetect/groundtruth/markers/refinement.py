@@ -13,6 +13,7 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     UNDETERMINED,
     ChainPoints,
@@ -28,7 +29,8 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.settings import Loss
+from redetect.groundtruth.markers.session import Network, Rig, View, marker_corners
+from redetect.groundtruth.settings import Loss, PoseSettings
 from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
 from redetect.landmarks import squared_mahalanobis
 
@@ -310,3 +312,48 @@ def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatAr
     jacobian[1, 3:] = (up[2] * by_rotation[1] - up[1] * by_rotation[2]) / across
     jacobian[2, 3:] = -by_rotation[0] / np.sqrt(across)
     return missing / sigmas, jacobian / sigmas[:, None]
+
+
+def chain_points(
+    views: Sequence[View], widths_m: Sequence[float], corner_floor_px: float
+) -> ChainPoints:
+    """Corners of views as points of a chain, with body 0 and the rig's markers as parts."""
+    cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
+    parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
+    points = np.zeros((0, 3))
+    pixels, covariances = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    if views:
+        points = np.concatenate([marker_corners(widths_m[view.rig_index]) for view in views])
+        corners = [corner for view in views for corner in view.marker.corners]
+        pixels = np.array([[c.u, c.v] for c in corners])
+        covariances = np.array([[[c.cuu, c.cuv], [c.cuv, c.cvv]] for c in corners])
+        covariances += corner_floor_px**2 * np.eye(2)
+        determinants = covariances[:, 0, 0] * covariances[:, 1, 1] - covariances[:, 0, 1] ** 2
+        wrong = np.flatnonzero(~((covariances[:, 0, 0] > 0.0) & (determinants > 0.0)))
+        if wrong.size:
+            view = views[int(wrong[0]) // 4]
+            raise GroundTruthError(
+                f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
+                "is not positive definite: expected one, or a corner floor above 0"
+            )
+    return ChainPoints(
+        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
+    )
+
+
+def pose_problem(
+    views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
+) -> PoseProblem:
+    """The problem of the robot's pose at one time."""
+    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
+    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
+    return PoseProblem(
+        network.cameras,
+        network.world_from_camera,
+        rig.robot_from_marker,
+        network.covariance,
+        rig.covariance,
+        chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px),
+        np.repeat(np.arange(len(views)), 4),
+        floor,
+    )

@@ -22,7 +22,6 @@ from redetect.groundtruth.markers.adjustment import (
     adjust_bundle,
     project_chain,
 )
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -32,8 +31,8 @@ from redetect.groundtruth.markers.pairs import (
     spanning_tree,
 )
 from redetect.groundtruth.markers.poses import view_poses
-from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
-from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
+from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
+from redetect.groundtruth.markers.session import MarkerFrame, Rig, View, rig_views
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform

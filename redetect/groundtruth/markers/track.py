@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.calibration import Network, Rig
 from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.refinement import pose_problem
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
+    Network,
+    Rig,
     View,
-    pose_problem,
     rig_views,
 )
 from redetect.groundtruth.settings import PoseSettings

@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_json
+from redetect.groundtruth.fusion.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -25,14 +25,14 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     segments_between_gaps,
 )
-from redetect.groundtruth.validation.dimensions import (
+from redetect.groundtruth.validation.reference_poses import (
     Dimension,
     SurveyedFiducials,
     read_dimensions,
     read_fiducial_distances,
+    read_survey,
     survey_fiducials,
 )
-from redetect.groundtruth.validation.reference_poses import read_survey
 from redetect.storage.bounded import read_bounded
 
 T = TypeVar("T")

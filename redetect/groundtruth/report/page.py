@@ -21,7 +21,7 @@ from redetect.groundtruth.report.pictures import (
     stages_figure,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
-from redetect.groundtruth.validation.dimensions import Dimension, SurveyedFiducials
+from redetect.groundtruth.validation.reference_poses import Dimension, SurveyedFiducials
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, score_poses, sigma_of
 from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of

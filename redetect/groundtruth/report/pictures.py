@@ -14,12 +14,12 @@ import numpy as np
 
 from redetect import plane
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog
+from redetect.groundtruth.fusion.clock import ClockModel, PtpdLog
 from redetect.groundtruth.lasers.alignment import Alignment
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.markers.calibration import Rig, marker_corners
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
+from redetect.groundtruth.markers.session import Rig, marker_corners
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors

@@ -18,8 +18,8 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel
 from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.sets import (
+from redetect.groundtruth.lasers.acquisition import (
     fixed_scanners,
     learn_background,
     sets_of_scans,
 )
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.tracking_kernels import FixedScanners
 from tests.groundtruth.lasers.scene import empty_scans, four_scanners
 

@@ -14,17 +14,15 @@ from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
+    ScanSets,
     acquire,
+    fixed_scanners,
     refine,
     robot_body,
+    sets_of_scans,
 )
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
-from redetect.groundtruth.lasers.sets import (
-    ScanSets,
-    fixed_scanners,
-    sets_of_scans,
-)
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,

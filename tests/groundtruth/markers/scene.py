@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
-from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,

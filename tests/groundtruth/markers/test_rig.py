@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     chained_poses,
@@ -24,7 +23,7 @@ from redetect.groundtruth.markers.rig_estimation import (
     rig_by_known_markers,
     rig_by_reference_poses,
 )
-from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses

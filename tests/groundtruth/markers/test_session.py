@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Network
+from redetect.groundtruth.markers.refinement import chain_points
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
-    chain_points,
+    Network,
     find_runs,
     group_by_time,
     read_marker_frames,

@@ -24,14 +24,16 @@ import numpy as np
 from scipy.optimize import Bounds, direct, minimize
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.clocks.clock import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.clock import (
     ClockModel,
     ClockSegment,
     Status,
     knots_of,
     on_one_line,
 )
-from redetect.groundtruth.clocks.headings import (
+from redetect.groundtruth.fusion.fuse import likeliest_noise
+from redetect.groundtruth.fusion.headings import (
     HeadingPair,
     Wandering,
     continuous_headings,
@@ -40,8 +42,6 @@ from redetect.groundtruth.clocks.headings import (
     pair_headings,
     without_turns,
 )
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import likeliest_noise
 from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
