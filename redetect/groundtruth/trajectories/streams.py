@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import parse_numbers, read_rows
+from redetect.groundtruth.files import parse_numbers, read_rows, read_table
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
@@ -171,13 +171,10 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
         If the file cannot be read, a row is malformed or a prefix is listed twice.
     """
     times: dict[str, float] = {}
-    for line, words in read_rows(path):
-        if len(words) != 2:
-            raise StreamError(path, line, f"{len(words)} words: expected a prefix and seconds")
-        prefix = words[0]
+    for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):
         if prefix in times:
             raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
-        times[prefix] = parse_numbers(path, line, words[1:])[0]
+        times[prefix] = seconds
     return times
 
 

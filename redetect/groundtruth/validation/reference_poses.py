@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
@@ -353,7 +354,6 @@ def _wide_pairs(fiducials: FloatArray) -> list[tuple[int, int]]:
 
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
 FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
-_SURVEY_STEPS = 20
 
 
 class Dimension(NamedTuple):
@@ -414,25 +414,21 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
     drawn = np.stack([survey.fiducials[name] for name in names])
     ends = np.array([(names.index(d.a), names.index(d.b)) for d in distances]).reshape(-1, 2)
     measured = np.array([d.distance_m for d in distances])
-    rows = np.arange(len(measured))
-    places = drawn.copy()
-    for _ in range(_SURVEY_STEPS):
-        apart = places[ends[:, 0]] - places[ends[:, 1]]
-        length = np.maximum(np.hypot(apart[:, 0], apart[:, 1]), 1e-9)
-        jacobian = np.zeros((len(measured), len(names), 2))
-        jacobian[rows, ends[:, 0]] += apart / length[:, None]
-        jacobian[rows, ends[:, 1]] -= apart / length[:, None]
-        flat = jacobian.reshape(len(measured), -1)
-        step, _, rank, _ = np.linalg.lstsq(flat, measured - length, rcond=1e-9)
-        if rank < 2 * len(names) - 3:
-            raise GroundTruthError(
-                f"{len(measured)} distances leave the places of {len(names)} fiducials open"
-            )
-        places = places + step.reshape(-1, 2)
+
+    def residuals(flat: FloatArray) -> FloatArray:
+        apart = flat.reshape(-1, 2)[ends[:, 0]] - flat.reshape(-1, 2)[ends[:, 1]]
+        return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) - measured)
+
+    found = least_squares(residuals, drawn.ravel(), xtol=1e-12, ftol=1e-12)
+    if np.linalg.matrix_rank(found.jac, tol=1e-6) < 2 * len(names) - 3:
+        raise GroundTruthError(
+            f"{len(measured)} distances leave the places of {len(names)} fiducials open"
+        )
+    places = found.x.reshape(-1, 2)
     motion = fitted(places, drawn)
-    variances = survey.sigma_m**2 * np.linalg.pinv(flat.T @ flat, rcond=1e-9)
+    variances = survey.sigma_m**2 * np.linalg.pinv(found.jac.T @ found.jac, rcond=1e-9)
     each = np.arange(len(names))
     blocks = variances.reshape(len(names), 2, len(names), 2)[each, :, each]
     turned = rotation(motion[2]) @ blocks @ rotation(motion[2]).T
     sigma = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
-    return SurveyedFiducials(names, apply(motion, places), drawn, sigma, measured - length)
+    return SurveyedFiducials(names, apply(motion, places), drawn, sigma, -found.fun)
