@@ -114,7 +114,8 @@ def estimate_rig(
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
-    start = chained_poses(pairs, tree, renumbered[root])
+    relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
+    start = chained_poses(relative, tree, renumbered[root])
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionary, kept_ids, widths_m)
     bundle, views, times = _bundle(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -249,20 +249,11 @@ def _cheapest_paths(
         skipped: _step_costs(times_s, estimates, skipped + 1, settings)
         for skipped in range(_MOST_LEFT_OUT + 1)
     }
-    ahead = [np.full(size, _REJECT_COST * i) for i, size in enumerate(sizes)]
-    for i in range(count):
-        for skipped, costs in steps.items():
-            j = i - skipped - 1
-            if j >= 0:
-                came = ahead[j][:, None] + costs[j] + _REJECT_COST * skipped
-                ahead[i] = np.minimum(ahead[i], came.min(axis=0))
-    back = [np.full(size, _REJECT_COST * (count - 1 - i)) for i, size in enumerate(sizes)]
-    for i in reversed(range(count)):
-        for skipped, costs in steps.items():
-            j = i + skipped + 1
-            if j < count:
-                goes = costs[i] + back[j][None, :] + _REJECT_COST * skipped
-                back[i] = np.minimum(back[i], goes.min(axis=1))
+    ahead = _cheapest_before(sizes, steps)
+    backward = {
+        skipped: [costs.T for costs in reversed(of_steps)] for skipped, of_steps in steps.items()
+    }
+    back = _cheapest_before(sizes[::-1], backward)[::-1]
     through = [a + b for a, b in zip(ahead, back)]
     without = np.full(count, _REJECT_COST * count)
     for i in range(count):
@@ -278,6 +269,23 @@ def _cheapest_paths(
                 inside = slice(j + 1, j + skipped + 1)
                 without[inside] = np.minimum(without[inside], cost)
     return through, without
+
+
+def _cheapest_before(
+    sizes: Sequence[int], steps: Mapping[int, Sequence[FloatArray]]
+) -> list[FloatArray]:
+    """Costs of the cheapest sequences that lead to each candidate of each frame.
+
+    `sizes` are the numbers of candidates, `steps` the costs of moving on from each frame, by how
+    many frames are left out.
+    """
+    costs = [np.full(size, _REJECT_COST * i) for i, size in enumerate(sizes)]
+    for i in range(len(sizes)):
+        for skipped, of_steps in steps.items():
+            if (j := i - skipped - 1) >= 0:
+                came = costs[j][:, None] + of_steps[j] + _REJECT_COST * skipped
+                costs[i] = np.minimum(costs[i], came.min(axis=0))
+    return costs
 
 
 def _step_costs(
