@@ -153,19 +153,13 @@ class Rejected:
 class OdometryErrors:
     """Odometry's errors estimated from the measurements."""
 
-    # `turn_scale`, `turn_bias_per_metre`, `distance_scale`: By what share turns are longer than
-    # odometry says, the turn it misses per metre (rad), by what share ways are longer
-    turn_scale: float
-    turn_bias_per_metre: float
-    distance_scale: float
-    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Their standard
-    # deviations
-    turn_scale_sigma: float
+    turn_scale: float  # By what share turns are longer than odometry says
+    turn_bias_per_metre: float  # The turn that it misses per metre (rad)
+    distance_scale: float  # By what share ways are longer
+    turn_scale_sigma: float  # Standard deviations of these three
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
-    # `distance_sigma`, `lateral_sigma`, `turn_sigma`, `turn_per_metre_sigma`: Its random errors, as
-    # in `FuseSettings`
-    distance_sigma: float
+    distance_sigma: float  # Random errors, as in `FuseSettings`
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
@@ -301,16 +295,13 @@ _LARGEST_GAP_S = 2.0
 class LeftOut:
     """A segment of the ground truth, predicted without it."""
 
-    # `from_s`, `to_s`: The segment
-    from_s: float
+    from_s: float  # When the segment begins
     to_s: float
     poses: int  # Of the ground truth in it that have a prediction
-    # `position_rms_m`, `heading_rms_rad`: Root of the mean squared error of the fused path
-    position_rms_m: float
+    position_rms_m: float  # Root of the mean squared error of the fused path
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
-    # `aligned_position_rms_m`, `aligned_heading_rms_rad`: The same of odometry after the rigid
-    # motion that fits it to the other segments best
+    # The same of odometry after the rigid motion that fits it to the other segments best
     aligned_position_rms_m: float
     aligned_heading_rms_rad: float
 

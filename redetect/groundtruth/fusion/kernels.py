@@ -212,9 +212,8 @@ class MeasuredPoses(NamedTuple):
     """M poses measured at some of the nodes, in ascending order."""
 
     nodes: IntArray  # (M,)
-    # `poses`, `covariances`: (M, 3), (M, 3, 3)
-    poses: FloatArray
-    covariances: FloatArray
+    poses: FloatArray  # (M, 3)
+    covariances: FloatArray  # (M, 3, 3)
 
 
 class Gating(NamedTuple):

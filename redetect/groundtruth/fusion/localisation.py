@@ -63,13 +63,9 @@ _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 class LocalisationErrors:
     """How odometry errs that is a localisation."""
 
-    # `position_sigma`, `heading_sigma`: Standard deviations of x and y (m each), and of the heading
-    # (rad)
-    position_sigma: float
-    heading_sigma: float
-    # `position_correlation_s`, `heading_correlation_s`: After which time errors are alike by 1/e
-    # only
-    position_correlation_s: float
+    position_sigma: float  # Standard deviation of x and y, each (m)
+    heading_sigma: float  # Of the heading (rad)
+    position_correlation_s: float  # After which time errors are alike by 1/e only
     heading_correlation_s: float
     # Heading of the ground truth beyond that of the aligned localisation (rad)
     heading_offset: float
@@ -80,10 +76,8 @@ class LocalisationProblem(NamedTuple):
 
     odometry: PlanarPoses  # Aligned rigidly with the measured poses
     times_s: FloatArray  # (M,)
-    # `differences`, `covariances`: (M, 3), (M, 3, 3): measured poses minus odometry's at their
-    # times; covariances of the former.
-    differences: FloatArray
-    covariances: FloatArray
+    differences: FloatArray  # (M, 3): measured poses minus odometry's at their times
+    covariances: FloatArray  # (M, 3, 3): of the measured poses
     offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
     centroid: FloatArray  # (2,)
     gate: float  # Largest squared normalised innovation

@@ -97,9 +97,8 @@ class OutlineFit(NamedTuple):
 
     floor_m: float  # Standard deviation of what the outline and the scanner are not
     least_slope: float  # Beams that graze a face count as if they met it at this sine
-    # `gate_sigma`, `gate_m`: Readings farther off do not count; metres in the first step.
-    gate_sigma: float
-    gate_m: float
+    gate_sigma: float  # Readings farther off do not count
+    gate_m: float  # Instead of this in the first step
     prior_sigma_m: float  # With it, open directions hold on to the start
     weak_sigma_m: float  # Directions along which the standard deviation would be larger are open
     scale_m: float  # A radian counts as this

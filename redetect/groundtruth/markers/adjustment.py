@@ -52,8 +52,7 @@ UNDETERMINED = "the points do not determine all poses"
 class ChainPoints:
     """Points seen in images."""
 
-    # `camera`, `body`, `part`: (N,): which camera, body and part each point belongs to
-    camera: IntArray
+    camera: IntArray  # (N,): which camera, body and part each point belongs to
     body: IntArray
     part: IntArray
     points: FloatArray  # (N, 3): in the part's frame (m)
@@ -74,8 +73,7 @@ class ChainProjection:
 
     # (N, 2): naN where a point is not in front of its camera or past the distortion's fold
     pixels: FloatArray
-    # `by_camera`, `by_body`, `by_part`: (N, 2, 6): d(u, v) / d(translation m, rotation rad)
-    by_camera: FloatArray
+    by_camera: FloatArray  # (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_body: FloatArray
     by_part: FloatArray
 

@@ -245,21 +245,10 @@ _FARTHEST_M = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidate:
-    """A pose that may be the robot's."""
+class PoseCandidate(RefinedPose):
+    """A pose that may be the robot's, refined over the views that it explains."""
 
-    refined: RefinedPose  # Over the views that it explains
     views: BoolArray  # (V,): which of all views those are
-
-    @property
-    def world_from_robot(self) -> FloatArray:
-        """(4, 4) the pose."""
-        return self.refined.world_from_robot
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(6, 6) covariance of its right perturbation."""
-        return self.refined.covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,13 +296,15 @@ def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
         alone = problem.only(views)
         starts = _starts(alone, settings)[:1] + _mirrored(alone)
         minima = _distinct(refined + _refined(alone, starts, settings))
-        candidates += [PoseCandidate(pose, views) for pose in _likely(minima, settings)]
+        candidates += [
+            PoseCandidate(**vars(pose), views=views) for pose in _likely(minima, settings)
+        ]
     if contradiction:
         # Different views were explained: their costs are not comparable.
         return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
-    best = candidates[0].refined
+    best = candidates[0]
     inflation = _inflation(best)
-    log_odds = tuple(0.5 * (c.refined.cost - best.cost) / inflation for c in candidates)
+    log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
     return PoseEstimate(tuple(candidates), log_odds, False)
 
 

@@ -75,9 +75,8 @@ class Track:
     @property
     def reduced_cost(self) -> float:
         """Sum of all costs over their degrees of freedom: 1 if the covariances are right."""
-        refined = [pose.refined for _, pose in self.posed]
-        freedom = sum(pose.degrees_of_freedom for pose in refined)
-        return sum(pose.cost for pose in refined) / freedom if freedom else float("nan")
+        freedom = sum(pose.degrees_of_freedom for _, pose in self.posed)
+        return sum(pose.cost for _, pose in self.posed) / freedom if freedom else float("nan")
 
     def planar(self) -> PlanarPoses:
         """The poses on the floor with their covariances."""
@@ -148,9 +147,9 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
                     round(float(heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
-                "rms_px": round(candidate.refined.rms_px, 4),
-                "cost": round(candidate.refined.cost, 3),
-                "degrees_of_freedom": candidate.refined.degrees_of_freedom,
+                "rms_px": round(candidate.rms_px, 4),
+                "cost": round(candidate.cost, 3),
+                "degrees_of_freedom": candidate.degrees_of_freedom,
                 "log_odds_against": round(odds, 3),
             }
             for candidate, odds in zip(estimate.candidates, estimate.log_odds)
@@ -159,7 +158,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
         {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
     ]
     if chosen is not None:
-        figures = iter(zip(chosen.refined.view_errors, chosen.refined.view_rms_px))
+        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
         for marker, is_used in zip(entry["markers"], chosen.views):
             marker["used"] = bool(is_used)
             if is_used:

@@ -52,8 +52,7 @@ class Distance:
 
     pose: int  # Number of the reference pose
     time_s: float  # When, on the ground truth's clock
-    # `point`, `fiducial`: The two ends
-    point: str
+    point: str  # The two ends
     fiducial: str
     distance_m: float
 

@@ -37,17 +37,13 @@ class PoseScore:
 
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
-    # `position_mean_m`, `position_sigma_m`, `position_rmse_m`, `position_max_m`: Of the distances
-    # from the truth; sigma with N - 1.
-    position_mean_m: float
+    position_mean_m: float  # Of the distances from the truth; sigma with N - 1
     position_sigma_m: float
     position_rmse_m: float
     position_max_m: float
-    # `angle_mean_rad`, `angle_sigma_rad`, `angle_max_rad`: Of the signed differences of heading;
-    # the largest without sign.
-    angle_mean_rad: float
+    angle_mean_rad: float  # Of the signed differences of heading
     angle_sigma_rad: float
-    angle_max_rad: float
+    angle_max_rad: float  # Without sign
     angle_abs_mean_rad: float  # Mean of the differences without sign
     position_median_m: float
     normalised: int  # Poses whose covariance could be inverted
@@ -116,9 +112,8 @@ def sigma_of(values: FloatArray) -> float:
 class Relations:
     """Poses of the robot at one time relative to another."""
 
-    # `from_s`, `to_s`: (N,): the two times (s); either may be the earlier one.
-    from_s: FloatArray
-    to_s: FloatArray
+    from_s: FloatArray  # (N,)
+    to_s: FloatArray  # (N,): may be the earlier one
     # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
     from_to: FloatArray
 
@@ -132,15 +127,12 @@ class RelativeScore:
 
     pairs: int  # Pairs of times compared with the truth
     unmatched: int  # Pairs that one side has no pose for, or that are too far apart
-    # `position_mean_m`, `position_sigma_m`, `position_median_m`, `position_rmse_m`,
-    # `position_max_m`: Of the lengths of the relative errors' translations; sigma with N - 1.
-    position_mean_m: float
+    position_mean_m: float  # Of the lengths of the errors' translations; sigma with N - 1
     position_sigma_m: float
     position_median_m: float
     position_rmse_m: float
     position_max_m: float
-    # `angle_rmse_rad`, `angle_abs_mean_rad`, `angle_max_rad`: Of the relative errors' rotations
-    angle_rmse_rad: float
+    angle_rmse_rad: float  # Of the errors' rotations
     angle_abs_mean_rad: float
     angle_max_rad: float
 
