@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
@@ -32,7 +31,7 @@ from redetect.groundtruth.markers.pairs import (
 )
 from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
-from redetect.groundtruth.markers.session import MarkerFrame, Rig, View, rig_views
+from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
@@ -59,14 +58,12 @@ class RigEstimate:
 
 def estimate_rig(
     groups: Sequence[Sequence[MarkerFrame]],
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
-    widths_m: Mapping[int, float],
+    network: Network,
     dictionary: str,
+    widths_m: Mapping[int, float],
     settings: RigSettings,
     *,
     reference: int | None = None,
-    camera_covariance: FloatArray | None = None,
 ) -> RigEstimate:
     """Estimate a rig.
 
@@ -74,14 +71,13 @@ def estimate_rig(
     ----------
     groups : sequence of sequences of MarkerFrame
         Images taken at one time; single ones where the cameras are not calibrated to each other.
-    world_from_camera : (C, 4, 4) array
-        Identities where the cameras are not calibrated to each other.
+    network : Network
+        The cameras; their places mean nothing where they are not calibrated to each other. If it
+        has a covariance, that is a prior of the cameras' adjustment.
     widths_m : mapping of int to float
         Widths of the markers that may be in the rig, by ID.
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
-    camera_covariance : (6 C, 6 C) array, optional
-        Covariance of the cameras' relative poses, a prior of their adjustment.
 
     Raises
     ------
@@ -92,7 +88,7 @@ def estimate_rig(
     candidates = _bare_rig(dictionary, ids, widths_m)
     seen = [rig_views(group, candidates) for group in groups]
     solved = [
-        [(v, _solutions(v, candidates, cameras, world_from_camera, settings)) for v in views]
+        [(v, _solutions(v, candidates, network, settings)) for v in views]
         for views in seen
         if len({view.rig_index for view in views}) > 1
     ]
@@ -119,10 +115,10 @@ def estimate_rig(
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionary, kept_ids, widths_m)
     bundle, views, times = _bundle(
-        solved, rig, renumbered, start, cameras, world_from_camera, renumbered[root], settings
+        solved, rig, renumbered, start, network, renumbered[root], settings
     )
-    if camera_covariance is not None and np.any(camera_covariance):
-        bundle = _with_free_cameras(bundle, camera_covariance)
+    if np.any(network.covariance):
+        bundle = _with_free_cameras(bundle, network.covariance)
     adjusted, rig = _adjusted(bundle, rig, settings)
     return RigEstimate(
         rig,
@@ -160,20 +156,13 @@ def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, floa
     )
 
 
-def _solutions(
-    view: View,
-    rig: Rig,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
-    settings: RigSettings,
-) -> MarkerPose | None:
+def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) -> MarkerPose | None:
     """Both poses of a marker in an image, refined; None if it has none."""
-    size = 6 * len(cameras)
     problem = PoseProblem(
-        cameras,
-        world_from_camera,
+        network.cameras,
+        network.world_from_camera,
         rig.robot_from_marker,  # identities: the marker itself is the body
-        np.zeros((size, size)),
+        np.zeros_like(network.covariance),
         rig.covariance,
         chain_points([view], rig.widths_m.tolist(), settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
@@ -244,8 +233,7 @@ def _bundle(
     rig: Rig,
     renumbered: Mapping[int, int],
     start: FloatArray,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
+    network: Network,
     root: int,
     settings: RigSettings,
 ) -> tuple[Bundle, tuple[View, ...], int]:
@@ -261,19 +249,20 @@ def _bundle(
         ]
         if len({view.rig_index for view, _ in own}) < 2:
             continue
-        pose = _best_start(own, rig, start, cameras, world_from_camera, settings)
+        pose = _best_start(own, rig, start, network, settings)
         if pose is None:
             continue
         views += [view for view, _ in own]
         bodies += [len(poses)] * len(own)
         poses.append(pose)
     points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
-    free = np.arange(len(cameras) + len(start) + len(poses)) >= len(cameras)
-    free[len(cameras) + root] = False
+    cameras = len(network.cameras)
+    free = np.arange(cameras + len(start) + len(poses)) >= cameras
+    free[cameras + root] = False
     bundle = Bundle(
-        cameras,
+        network.cameras,
         len(start),
-        np.concatenate([world_from_camera, start, poses]),
+        np.concatenate([network.world_from_camera, start, poses]),
         free,
         replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
         np.repeat(np.arange(len(views)), 4),
@@ -301,8 +290,7 @@ def _best_start(
     own: Sequence[tuple[View, MarkerPose]],
     rig: Rig,
     start: FloatArray,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
+    network: Network,
     settings: RigSettings,
 ) -> FloatArray | None:
     """The pose of the rig, among its markers' solutions, that explains most of a time's views."""
@@ -312,7 +300,9 @@ def _best_start(
     best, least = None, np.inf
     for view, solutions in own:
         for pose in solutions.poses @ inverse(start[view.rig_index]):
-            pixels = project_chain(cameras, world_from_camera, pose[None], start, points)
+            pixels = project_chain(
+                network.cameras, network.world_from_camera, pose[None], start, points
+            )
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue
