@@ -102,16 +102,12 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArr
         poses = []
         for index in used:
             chosen = problem.seen.camera == index
-            points = apply(
-                problem.robot_from_marker[problem.seen.part[chosen]], problem.seen.points[chosen]
-            )
+            lens, pixels = problem.network.cameras[index], problem.seen.pixels[chosen]
             try:
-                found = solve_camera(
-                    problem.cameras[index], points, problem.seen.pixels[chosen], solver
-                )
+                found = solve_camera(lens, problem.robot_points[chosen], pixels, solver)
             except GeometryError:
                 continue
-            poses += [problem.world_from_camera[index] @ pose for pose in found]
+            poses += [problem.network.world_from_camera[index] @ pose for pose in found]
     return _best_first(
         poses,
         lambda pose: robot_rms_px(problem, pose),
@@ -136,15 +132,15 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
     camera, marker = int(problem.seen.camera[chosen[0]]), int(problem.seen.part[chosen[0]])
     try:
         found = solve_camera(
-            problem.cameras[camera],
+            problem.network.cameras[camera],
             problem.seen.points[chosen],
             problem.seen.pixels[chosen],
             "ippe",
         )
     except GeometryError:
         return []
-    marker_from_robot = inverse(problem.robot_from_marker[marker])
-    return [problem.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
+    marker_from_robot = inverse(problem.rig.robot_from_marker[marker])
+    return [problem.network.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
 
 
 def robot_rms_px(problem: PoseProblem, world_from_robot: FloatArray) -> float:
@@ -192,21 +188,20 @@ def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> lis
 
 
 def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
-    points = apply(problem.robot_from_marker[problem.seen.part], problem.seen.points)
     used, index = np.unique(problem.seen.camera, return_inverse=True)
     pixels = np.empty_like(problem.seen.pixels)
     for camera in used:
         chosen = problem.seen.camera == camera
-        lens = problem.cameras[camera]
+        lens = problem.network.cameras[camera]
         pixels[chosen] = lens.undistort(problem.seen.pixels[chosen]) * lens.scale_x
     if not np.all(np.isfinite(pixels)):
         raise GeometryError("a corner lies where the lens sees nothing")
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
         pixels,
-        points,
+        problem.robot_points,
         index.tolist(),
-        [pycolmap.Rigid3d(inverse(problem.world_from_camera[c])[:3]) for c in used],
-        [_pinhole(problem.cameras[camera]) for camera in used],
+        [pycolmap.Rigid3d(inverse(problem.network.world_from_camera[c])[:3]) for c in used],
+        [_pinhole(problem.network.cameras[camera]) for camera in used],
         estimation_options=_ransac(),
     )
     return [] if found is None else [_matrix(found["rig_from_world"])]

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from camera import Camera
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
@@ -29,9 +28,9 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.session import Network, Rig, View, marker_corners
+from redetect.groundtruth.markers.session import Network, Rig, View
 from redetect.groundtruth.settings import Loss, PoseSettings
-from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
+from redetect.groundtruth.trajectories.transforms import apply, exp_se3, roll_pitch
 from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
@@ -45,11 +44,8 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 class PoseProblem:
     """The data on a robot's pose at one time."""
 
-    cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray  # (C, 4, 4)
-    robot_from_marker: FloatArray  # (M, 4, 4)
-    camera_covariance: FloatArray  # (6 C, 6 C): of the cameras' right perturbations
-    marker_covariance: FloatArray  # (6 M, 6 M): of the markers' right perturbations
+    network: Network
+    rig: Rig
     seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
     # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
     view: IntArray
@@ -60,13 +56,18 @@ class PoseProblem:
         """V, the number of markers in images."""
         return int(self.view.max()) + 1 if len(self.view) else 0
 
+    @property
+    def robot_points(self) -> FloatArray:
+        """(N, 3) corners in the robot's frame (m)."""
+        return apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
+
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
         return project_chain(
-            self.cameras,
-            self.world_from_camera,
+            self.network.cameras,
+            self.network.world_from_camera,
             world_from_robot[None],
-            self.robot_from_marker,
+            self.rig.robot_from_marker,
             self.seen,
         )
 
@@ -214,17 +215,17 @@ def predicted_errors(
 
 def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
     """None if one cannot be seen."""
-    seen = problem.seen
+    network, rig, seen = problem.network, problem.rig, problem.seen
     projection = project_chain_with_jacobians(
-        problem.cameras, problem.world_from_camera, pose[None], problem.robot_from_marker, seen
+        network.cameras, network.world_from_camera, pose[None], rig.robot_from_marker, seen
     )
     residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
         return None
     common = np.zeros((len(residuals), len(residuals)))
     for jacobian, index, covariance in (
-        (projection.by_camera, seen.camera, problem.camera_covariance),
-        (projection.by_part, seen.part, problem.marker_covariance),
+        (projection.by_camera, seen.camera, network.covariance),
+        (projection.by_part, seen.part, rig.covariance),
     ):
         if np.any(covariance):
             common += _common(jacobian, index, covariance)
@@ -314,16 +315,14 @@ def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatAr
     return missing / sigmas, jacobian / sigmas[:, None]
 
 
-def chain_points(
-    views: Sequence[View], widths_m: Sequence[float], corner_floor_px: float
-) -> ChainPoints:
+def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> ChainPoints:
     """Corners of views as points of a chain, with body 0 and the rig's markers as parts."""
     cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
     parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
     points = np.zeros((0, 3))
     pixels, covariances = np.zeros((0, 2)), np.zeros((0, 2, 2))
     if views:
-        points = np.concatenate([marker_corners(widths_m[view.rig_index]) for view in views])
+        points = np.concatenate([rig.corners[view.rig_index] for view in views])
         corners = [corner for view in views for corner in view.marker.corners]
         pixels = np.array([[c.u, c.v] for c in corners])
         covariances = np.array([[[c.cuu, c.cuv], [c.cuv, c.cvv]] for c in corners])
@@ -348,12 +347,9 @@ def pose_problem(
     tilt = float(np.radians(settings.floor_sigma_tilt_deg))
     floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
     return PoseProblem(
-        network.cameras,
-        network.world_from_camera,
-        rig.robot_from_marker,
-        network.covariance,
-        rig.covariance,
-        chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px),
+        network,
+        rig,
+        chain_points(views, rig, settings.corner_floor_px),
         np.repeat(np.arange(len(views)), 4),
         floor,
     )

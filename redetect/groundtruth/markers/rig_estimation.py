@@ -159,12 +159,9 @@ def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, floa
 def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) -> MarkerPose | None:
     """Both poses of a marker in an image, refined; None if it has none."""
     problem = PoseProblem(
-        network.cameras,
-        network.world_from_camera,
-        rig.robot_from_marker,  # identities: the marker itself is the body
-        np.zeros_like(network.covariance),
-        rig.covariance,
-        chain_points([view], rig.widths_m.tolist(), settings.corner_floor_px),
+        replace(network, covariance=np.zeros_like(network.covariance)),
+        rig,  # with identities: the marker itself is the body
+        chain_points([view], rig, settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
     )
     found = []
@@ -255,7 +252,7 @@ def _bundle(
         views += [view for view, _ in own]
         bodies += [len(poses)] * len(own)
         poses.append(pose)
-    points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
+    points = chain_points(views, rig, settings.corner_floor_px)
     cameras = len(network.cameras)
     free = np.arange(cameras + len(start) + len(poses)) >= cameras
     free[cameras + root] = False
@@ -294,9 +291,7 @@ def _best_start(
     settings: RigSettings,
 ) -> FloatArray | None:
     """The pose of the rig, among its markers' solutions, that explains most of a time's views."""
-    points = chain_points(
-        [view for view, _ in own], rig.widths_m.tolist(), settings.corner_floor_px
-    )
+    points = chain_points([view for view, _ in own], rig, settings.corner_floor_px)
     best, least = None, np.inf
     for view, solutions in own:
         for pose in solutions.poses @ inverse(start[view.rig_index]):

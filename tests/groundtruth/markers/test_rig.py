@@ -23,7 +23,7 @@ from redetect.groundtruth.markers.rig_estimation import (
     rig_by_known_markers,
     rig_by_reference_poses,
 )
-from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
+from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
@@ -41,6 +41,7 @@ from tests.groundtruth.markers.scene import (
     lens,
     looking_at,
     marker_rows,
+    network_of,
     points_of,
     visible,
 )
@@ -95,15 +96,6 @@ def estimated(
         RigSettings(corner_floor_px=0.0),
         reference=reference,
     )
-
-
-def network_of(
-    poses: FloatArray, covariance: FloatArray | None = None, scale_px: float = 900.0
-) -> Network:
-    names = tuple("abcd"[: len(poses)])
-    exact = np.zeros((6 * len(poses), 6 * len(poses)))
-    lenses = (lens(scale_px),) * len(poses)
-    return Network(names, lenses, names, poses, exact if covariance is None else covariance)
 
 
 def truth_in(rig: Rig, reference: int) -> FloatArray:
