@@ -118,8 +118,8 @@ def describe(
         entries.append(
             {
                 "name": scanner.name,
-                "correction": [float(v) if np.isfinite(v) else None for v in shift],
-                "sigma": [float(v) if np.isfinite(v) else None for v in sigma],
+                "correction": shift.tolist(),
+                "sigma": sigma.tolist(),
                 "suspect": bool(out or excess[k] > 1.0),
                 "left_out": out,
             }

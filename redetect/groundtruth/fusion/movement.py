@@ -442,7 +442,7 @@ def movement_problem(
         measured=MeasuredPoses(
             np.searchsorted(node_times, times).astype(np.int64), measured, covariances
         ),
-        streams=np.array(names),
+        streams=names,
         repaired=repaired,
         repeated=repeated,
         settings=settings,

@@ -138,7 +138,7 @@ def _scanners(inputs: Inputs) -> list[Part]:
         return [Part("note", "No aligned.json: groundtruth lasers writes it.")]
     content: list[Part] = []
     steps = _entry(document, "steps", dict)
-    names = [str(s.get("name")) for s in _entry(document, "scanners", list) if isinstance(s, dict)]
+    names = [str(s.get("name")) for s in _entries(document, "scanners")]
     rows = []
     try:
         last = np.array(steps.get("each to the map"), dtype=np.float64).reshape(len(names), 3)
@@ -308,7 +308,7 @@ def _validation(inputs: Inputs) -> list[Part]:
         if picture is not None:
             content.append(image_part(words, picture, "png", *size))
     content += [*_incidence(document), *_mounts(document)]
-    refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
+    refused = _entries(document, "refused")
     if refused:
         content.append(
             table(
@@ -330,7 +330,7 @@ def _incidence(document: dict[str, Any]) -> list[Part]:
         (f"{_number(r.get('from_deg'), 1.0, 0)} to {_number(r.get('to_deg'), 1.0, 0)}",
          _number(r.get("readings"), 1.0, 0), _number(r.get("mean_m"), 1e3),
          _number(r.get("sigma_m"), 1e3))
-        for r in _entry(document, "incidence", list)[:_MOST_ROWS] if isinstance(r, dict)
+        for r in _entries(document, "incidence")[:_MOST_ROWS]
     ]  # fmt: skip
     caption = "Ranges on board less the walls' distances, by the angle of incidence"
     head = ("incidence / deg", "readings", "mean / mm", "sigma")
@@ -339,8 +339,7 @@ def _incidence(document: dict[str, Any]) -> list[Part]:
 
 def _mounts(document: dict[str, Any]) -> list[Part]:
     rows = []
-    for mount in _entry(document, "mounts", list)[:_MOST_ROWS]:
-        entry = mount if isinstance(mount, dict) else {}
+    for entry in _entries(document, "mounts")[:_MOST_ROWS]:
         given, refined, sigma = (_entry(entry, key, list) for key in ("given", "refined", "sigma"))
         if len(given) == len(refined) == len(sigma) == 3:
             moved = [_float(b) - _float(a) for a, b in zip(given, refined)]
@@ -418,8 +417,8 @@ def _rejected(inputs: Inputs) -> list[Part]:
         content.append(table(caption, ("from / s", "to / s", "sets", "status"), rows, text=(3,)))
     suspects = [
         str(s.get("name"))
-        for s in _entry(inputs.documents.get("laser.json", {}), "scanners", list)
-        if isinstance(s, dict) and s.get("suspect")
+        for s in _entries(inputs.documents.get("laser.json", {}), "scanners")
+        if s.get("suspect")
     ]
     if suspects:
         words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
@@ -428,7 +427,7 @@ def _rejected(inputs: Inputs) -> list[Part]:
     if fused is None:
         content.append(Part("note", "No account of a fusion (fused.json)."))
         return content
-    rejected = [r for r in _entry(fused, "rejected", list) if isinstance(r, dict)]
+    rejected = _entries(fused, "rejected")
     used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
     restarts = _entry(fused, "restarts_s", list)
     words = f"Fusion used {used or 'nothing'}; rejected {len(rejected)}; {len(restarts)} restarts."
@@ -461,6 +460,11 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
         content.append(table(caption, ("file", "setting", "value"), rows, text=(1, 2)))
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
+
+
+def _entries(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """The objects of a list in a file that others may have written."""
+    return [entry for entry in _entry(document, key, list) if isinstance(entry, dict)]
 
 
 def _entry(document: dict[str, Any], key: str, kind: type) -> Any:
