@@ -160,12 +160,16 @@ def _segment(
             pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
         )
         offset, drift = _refine(pair, wandering, (offset, drift), bounds)
-    sigma_offset_s, sigma_rate = _sigmas(pair, wandering, offset, drift, bounds)
-    if not sigma_offset_s < _LEAST_DETERMINED * bounds.largest_offset_s:
+    sigma_offset_s, sigma_rate = _sigmas(pair, wandering, offset, drift, bounds).tolist()
+    alone_s = float(_sigmas(pair, wandering, offset, drift, bounds, unknowns=1)[0])
+    if not alone_s < _LEAST_DETERMINED * bounds.largest_offset_s:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     note = ""
     if not sigma_rate < _LEAST_DETERMINED * bounds.largest_drift:
-        note = "too short to determine the drift"
+        note = "too short to determine the drift: assumed to be 0"
+        offset, drift = _refine(pair, wandering, (offset, 0.0), bounds, unknowns=1)
+        # Only at the reference time is the offset independent of the unknown drift.
+        sigma_offset_s, sigma_rate = alone_s, bounds.largest_drift / math.sqrt(3.0)
     elif jumps_left > 0:
         place = find_jump(pair, offset, drift)
         if place is not None:
@@ -266,24 +270,23 @@ def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> BoolArray:
     return np.asarray(np.abs(level - centre) <= max(_OUTLIER_SIGMAS * sigma, 1e-6))
 
 
-def _prior_sigmas(bounds: SyncSettings) -> FloatArray:
-    """(2,) deviations of offset and drift before anything was measured: even between the bounds."""
-    return np.array([bounds.largest_offset_s, bounds.largest_drift]) / math.sqrt(3.0)
-
-
 def _refine(
-    pair: HeadingPair, wandering: Wandering, start: tuple[float, float], bounds: SyncSettings
+    pair: HeadingPair,
+    wandering: Wandering,
+    start: tuple[float, float],
+    bounds: SyncSettings,
+    unknowns: int = 2,
 ) -> tuple[float, float]:
-    """Least whitened squares near a result of the global search."""
+    """Least whitened squares near a result of the global search; of one unknown, the offset."""
     scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
-    begin = np.clip(np.array(start) / scale, -1.0, 1.0)
+    best = np.clip(np.array(start) / scale, -1.0, 1.0)
 
     def squared(x: FloatArray) -> float:
-        # Where turns say little about the drift, it is small.
-        prior = (x[1] * scale[1] / _prior_sigmas(bounds)[1]) ** 2
-        return wandering.squared(without_turns(pair.differences(*(x * scale)))) + float(prior)
+        tried = np.concatenate([x, best[unknowns:]]) * scale
+        return wandering.squared(without_turns(pair.differences(*tried)))
 
-    offset, drift = scale * _minimum(squared, begin, 1e-7, 1e-9)
+    best[:unknowns] = _minimum(squared, best[:unknowns], 1e-7, 1e-9)
+    offset, drift = best * scale
     return float(offset), float(drift)
 
 
@@ -298,15 +301,20 @@ def _minimum(
 
 
 def _sigmas(
-    pair: HeadingPair, wandering: Wandering, offset_s: float, drift: float, bounds: SyncSettings
-) -> tuple[float, float]:
-    """Deviations of offset and drift by the information in the segment's turns."""
-    jacobian = pair.sensitivities(offset_s, drift)
-    # In deviations before anything was measured, which differ much.
-    jacobian = jacobian * _prior_sigmas(bounds)
-    covariance = np.linalg.inv(jacobian.T @ wandering.whiten(jacobian) + np.eye(2))
-    offset, rate = np.sqrt(np.diag(covariance)) * _prior_sigmas(bounds)
-    return float(offset), float(rate)
+    pair: HeadingPair,
+    wandering: Wandering,
+    offset_s: float,
+    drift: float,
+    bounds: SyncSettings,
+    unknowns: int = 2,
+) -> FloatArray:
+    """(2,) deviations of offset and drift by the information in the segment's turns."""
+    # In deviations before anything was measured, which differ much: even between the bounds.
+    prior = np.array([bounds.largest_offset_s, bounds.largest_drift]) / math.sqrt(3.0)
+    jacobian = (pair.sensitivities(offset_s, drift) * prior)[:, :unknowns]
+    information = jacobian.T @ wandering.whiten(jacobian) + np.eye(unknowns)
+    prior[:unknowns] *= np.sqrt(np.diag(np.linalg.inv(information)))
+    return prior
 
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
