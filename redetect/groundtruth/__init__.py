@@ -5,9 +5,8 @@ Each package imports only from those named here; `errors`, `files` and `settings
 - `trajectories`: rigid motions in space and in the plane; poses over time and their files.
 - `markers`: poses from square markers, rigs and networks of cameras: `trajectories`.
 - `lasers`: scanners, scans, matching, alignment, tracking: `trajectories`.
-- `fusion`: odometry and measured poses together: `trajectories`.
-- `clocks`: the robot's clock against the ground truth's: `fusion`, `trajectories`.
-- `validation`: errors against a truth and at reference poses: `clocks`, `lasers` and before.
+- `fusion`: odometry and measured poses together, and the robot's clock: `trajectories`.
+- `validation`: errors against a truth and at reference poses: `fusion`, `lasers`, `trajectories`.
 - `report`: a session on one page, and pictures beside results: `validation` and before.
 - `commands`: files and messages round all of these; `cli` hands over to them.
 

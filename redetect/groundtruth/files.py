@@ -9,9 +9,9 @@ import math
 import os
 import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -236,6 +236,51 @@ def read_rows(
             blanks = len(content.split(None, 1)) > 1
             # Rows of hundreds of readings have commas alone: a quarter of the time.
             yield number, re.split(r"\s*,\s*|\s+", content) if blanks else content.split(",")
+
+
+class TableRow(NamedTuple):
+    """A row of a table."""
+
+    line: int  # In the file, counted from 1
+    words: list[str]  # Of the columns with words
+    numbers: list[float]  # Of the others; finite
+
+
+def read_table(
+    path: str | os.PathLike[str], head: str, words: Collection[str] = ()
+) -> list[TableRow]:
+    """Rows between commas or blanks under a head, which may be left out.
+
+    Parameters
+    ----------
+    head : str
+        Names of the columns between commas.
+    words : collection of str
+        The columns in which there are words; in the others are finite numbers.
+
+    Raises
+    ------
+    StreamError
+        If the file cannot be read or a row is malformed; it names file and line.
+    """
+    names = head.split(",")
+    rows: list[TableRow] = []
+    for line, found in read_rows(path):
+        if not rows and found == names:
+            continue
+        if len(found) != len(names):
+            raise StreamError(path, line, f"{len(found)} words: expected {head}")
+        texts = [word for name, word in zip(names, found) if name in words]
+        numbers = [word for name, word in zip(names, found) if name not in words]
+        rows.append(TableRow(line, texts, parse_numbers(path, line, numbers)))
+    return rows
+
+
+def known_name(path: str | os.PathLike[str], line: int, name: str, known: Collection[str]) -> str:
+    """A word of a row, which must be one of those known."""
+    if name not in known:
+        raise StreamError(path, line, f"{excerpt(name)}: expected one of {', '.join(known)}")
+    return name
 
 
 def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[float]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from camera import write_camera
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.commands.outputs import progress
-from redetect.groundtruth.markers.calibration import (
+from redetect.groundtruth.markers.session import (
     Network,
     Rig,
     read_network,

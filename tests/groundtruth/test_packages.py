@@ -10,13 +10,10 @@ BELOW = {
     "markers": {"trajectories"},
     "lasers": {"trajectories"},
     "fusion": {"trajectories"},
-    "clocks": {"trajectories", "fusion"},
-    "validation": {"trajectories", "lasers", "clocks"},
-    "report": {"trajectories", "markers", "lasers", "clocks", "validation"},
-    "commands": {
-        "trajectories", "markers", "lasers", "fusion", "clocks", "validation", "report",
-    },
-}  # fmt: skip
+    "validation": {"trajectories", "lasers", "fusion"},
+    "report": {"trajectories", "markers", "lasers", "fusion", "validation"},
+    "commands": {"trajectories", "markers", "lasers", "fusion", "validation", "report"},
+}
 FOR_ALL = {"errors", "files", "settings"}
 
 

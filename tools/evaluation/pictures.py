@@ -21,7 +21,7 @@ from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
-from redetect.groundtruth.clocks.clock import read_clock
+from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main as groundtruth
-from redetect.groundtruth.clocks.clock import ClockSegment, read_clock
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.clock import ClockSegment, read_clock
+from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
-from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
     OK,
     REACQUIRED,

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.commands.options import Fuse
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.fusion.fuse import fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,

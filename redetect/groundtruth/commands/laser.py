@@ -12,8 +12,8 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.sets import load_session
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -42,8 +42,8 @@ def perform(options: Laser) -> int:
     calibration = options.scanners or options.session / "aligned.json"
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
-    scanners, robot, tables, sets = load_session(options.session, calibration)
-    track, left_out = track_without_suspects(sets, tables, robot, scanners, options.settings)
+    scanners, robot, fixed, sets = load_session(options.session, calibration)
+    track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
@@ -118,8 +118,8 @@ def describe(
         entries.append(
             {
                 "name": scanner.name,
-                "correction": [float(v) if np.isfinite(v) else None for v in shift],
-                "sigma": [float(v) if np.isfinite(v) else None for v in sigma],
+                "correction": shift.tolist(),
+                "sigma": sigma.tolist(),
                 "suspect": bool(out or excess[k] > 1.0),
                 "left_out": out,
             }

@@ -61,13 +61,13 @@ def perform(options: Lasers) -> int:
     }
     del extra["version"]  # that of the file's form is there
     write_scanners(output, alignment.scanners, extra, overwrite=options.force)
-    scans = [still_scan(a, b) for a, b in zip(measured, empties)]
+    points = [still_scan(a, b.ranges_mm).points for a, b in zip(measured, empties)]
     by_step = [
-        icp_by_step(scan, building, scanner.pose, options.settings, _ICP_STEPS)
-        for scan, scanner in zip(scans, measured)
+        icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
+        for cloud, scanner in zip(points, measured)
     ]
     with write_whole(picture, overwrite=options.force) as stream:
-        stream.write(draw_alignment(measured, alignment, scans, building, by_step))
+        stream.write(draw_alignment(measured, alignment, points, building, by_step))
 
     for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
         shift = after.pose - before.pose

@@ -19,8 +19,8 @@ from redetect.groundtruth.commands.outputs import (
 )
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardView, find_boards, read_boards
-from redetect.groundtruth.markers.calibration import Network, write_network
 from redetect.groundtruth.markers.network_estimation import NetworkEstimate, estimate_network
+from redetect.groundtruth.markers.session import Network, write_network
 
 
 def perform(command: NetworkCommand) -> int:

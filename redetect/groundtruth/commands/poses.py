@@ -13,13 +13,15 @@ from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.markers.calibration import Network, read_network, read_rig
 from redetect.groundtruth.markers.session import (
     RIG_NAME,
     MarkerFrame,
+    Network,
     find_runs,
     group_by_time,
     read_marker_frames,
+    read_network,
+    read_rig,
 )
 from redetect.groundtruth.markers.track import report_entry, track_robot
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from camera import Camera, read_camera
-from redetect.array_types import FloatArray
+from camera import read_camera
 from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.commands.outputs import (
     check_outputs,
@@ -21,14 +20,21 @@ from redetect.groundtruth.commands.outputs import (
 )
 from redetect.groundtruth.commands.poses import read_all_frames
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Network, read_network, read_rig, write_rig
 from redetect.groundtruth.markers.rig_estimation import (
     RigEstimate,
     estimate_rig,
     rig_by_known_markers,
     rig_by_reference_poses,
 )
-from redetect.groundtruth.markers.session import MarkerFrame, group_by_time, read_marker_frames
+from redetect.groundtruth.markers.session import (
+    MarkerFrame,
+    Network,
+    group_by_time,
+    read_marker_frames,
+    read_network,
+    read_rig,
+    write_rig,
+)
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_whole
@@ -42,17 +48,10 @@ def perform(command: RigCommand) -> int:
         raise GroundTruthError("--reference-poses needs --network: where the cameras are")
     picture = command.picture if command.picture is not None else command.output.with_suffix(".png")
     check_outputs((command.output, picture), command.force)
-    cameras, poses, groups, network = _input(command)
+    network, groups = _input(command)
     dictionary, widths = _markers(command, groups)
     estimate = estimate_rig(
-        groups,
-        cameras,
-        poses,
-        widths,
-        dictionary,
-        command.settings,
-        reference=command.reference,
-        camera_covariance=None if network is None else network.covariance,
+        groups, network, dictionary, widths, command.settings, reference=command.reference
     )
     estimate, frame = _in_robot_frame(command, estimate)
     rig = estimate.rig
@@ -98,21 +97,26 @@ def perform(command: RigCommand) -> int:
     return 0
 
 
-def _input(
-    command: RigCommand,
-) -> tuple[tuple[Camera, ...], FloatArray, list[tuple[MarkerFrame, ...]], Network | None]:
-    """Cameras, their poses (identities without a network), images grouped by time, the network."""
+def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]:
+    """The cameras, and images grouped by time, or each by itself without a network's file."""
     if command.network is not None:
         network = read_network(command.network)
         frames = read_all_frames(command.runs, network)
-        groups = group_by_time(frames, command.settings.time_tolerance_s)
-        return network.cameras, network.world_from_camera, groups, network
-    cameras = []
-    alone: list[tuple[MarkerFrame, ...]] = []
-    for index, run in enumerate(command.runs):
-        cameras.append(read_camera(_calibration(run)))
-        alone += [(frame,) for frame in read_marker_frames(run, index, timed=False)]
-    return tuple(cameras), np.tile(np.eye(4), (len(cameras), 1, 1)), alone, None
+        return network, group_by_time(frames, command.settings.time_tolerance_s)
+    count = len(command.runs)
+    files = [_calibration(run) for run in command.runs]
+    network = Network(
+        tuple(run.name for run in command.runs),
+        tuple(map(read_camera, files)),
+        tuple(map(str, files)),
+        np.tile(np.eye(4), (count, 1, 1)),
+        np.zeros((6 * count, 6 * count)),
+    )
+    return network, [
+        (frame,)
+        for index, run in enumerate(command.runs)
+        for frame in read_marker_frames(run, index, timed=False)
+    ]
 
 
 def _calibration(run: Path) -> Path:

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.clocks.clock import (
+from redetect.groundtruth.commands.options import Sync
+from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.clock import (
     ClockModel,
     ClockSegment,
     PtpdLog,
     read_ptpd,
 )
-from redetect.groundtruth.clocks.sync import synchronise
-from redetect.groundtruth.commands.options import Sync
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
-from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,

@@ -13,39 +13,40 @@ from typing import Any
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import read_clock
 from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation.onboard import (
     INCIDENCES_DEG,
+    Onboard,
+    ReferencePose,
+    Refused,
     range_errors,
+    reference_poses,
     refine_mounts,
 )
 from redetect.groundtruth.validation.reference_poses import (
+    DistancePose,
     poses_from_distances,
     read_distances,
     read_survey,
 )
-from redetect.groundtruth.validation.reference_poses_scans import (
-    Onboard,
-    ReferencePose,
-    Refused,
-    reference_poses,
-)
-from redetect.groundtruth.validation.scoring import sigma_of
-from redetect.groundtruth.validation.validate import (
+from redetect.groundtruth.validation.scoring import (
     PUBLISHED,
-    Figures,
-    figures_of,
-    pose_errors,
+    PoseScore,
+    ReferenceErrors,
+    normalised_band,
+    normalised_errors,
+    reference_errors,
+    score_poses,
+    sigma_of,
     stream_of,
-    table_rows,
 )
 from redetect.storage import write_whole
 
@@ -86,21 +87,22 @@ def perform(options: Validate) -> int:
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
-        print("error: not a single reference pose", file=sys.stderr)
-        return 1
-    errors, without = pose_errors(references, poses)
+        raise GroundTruthError("not a single reference pose")
+    errors, without = reference_errors(references, poses)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
     if not errors.references:
-        print("error: no ground truth at the time of any reference pose", file=sys.stderr)
-        return 1
-    figures = figures_of(errors)
-    rows = table_rows(references, errors)
+        raise GroundTruthError("no ground truth at the time of any reference pose")
+    score = score_poses(errors.poses, errors.reference_poses, len(without))
+    rows = _table_rows(references, errors)
+    figures: dict[str, Any] = asdict(score)
+    if score.normalised:
+        figures["normalised_band"] = normalised_band(score.normalised)
     content = {
         **provenance({"refine": options.refine}, files),
         "poses": str(options.poses.name),
         "clock": None if clock_path is None else clock_path.name,
-        "figures": asdict(figures),
+        "figures": figures,
         "published": [asdict(published) for published in PUBLISHED],
         "refused": [asdict(r) for r in (*refused, *without)],
         "distances": _distance_figures(solved, survey.sigma_m),
@@ -113,17 +115,17 @@ def perform(options: Validate) -> int:
             for r, (linear, angular) in zip(errors.references, errors.sigma.tolist())
         ],
     }  # fmt: skip
-    pictures = {"errors.png": draw_errors(errors, figures, segments)}
+    pictures = {"errors.png": draw_errors(errors, score, segments)}
     if segments is not None and any(r.still is not None for r in errors.references):
         content |= _scanners_on_board(references, segments)
         pictures["scans.png"] = draw_scans(errors, segments)
     folder.mkdir(parents=True, exist_ok=True)
     write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
-    for name, data in (("table.csv", table_text(rows).encode()), *pictures.items()):
+    for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         with write_whole(outputs[name], overwrite=options.force) as stream:
             stream.write(data)
-    for line in account(references, refused, figures, content["distances"]):
+    for line in account(references, refused, score, content["distances"]):
         print(line)
     print(f"{folder}: written")
     return 0
@@ -152,9 +154,38 @@ def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray
     return {"incidence": rows, "mounts": mounts}
 
 
-def table_text(rows: Sequence[dict[str, Any]]) -> str:
+def _table_rows(
+    references: Sequence[ReferencePose], errors: ReferenceErrors
+) -> list[dict[str, Any]]:
+    """Rows of the table: every reference pose with its error, NaN if it has none."""
+    columns = ("error_x_m", "error_y_m", "linear_m", "angular_deg", "nees")
+    x, y, theta = errors.error.T
+    nees = 3.0 * normalised_errors(errors.poses, errors.reference_poses)
+    table = np.column_stack([x, y, np.hypot(x, y), np.degrees(theta), nees])
+    by_index = {r.index: row for r, row in zip(errors.references, table.tolist())}
+    rows: list[dict[str, Any]] = []
+    for r in references:
+        sigma = np.sqrt(np.diagonal(r.covariance))
+        good = r.distances.residuals_m[r.distances.used]
+        rows.append(
+            {
+                "pose": r.index,
+                "t": r.time_s,
+                **dict(zip(("x_m", "y_m", "theta_rad"), r.pose.tolist())),
+                **dict(zip(("sigma_x_m", "sigma_y_m", "sigma_theta_rad"), sigma.tolist())),
+                "distances": int(r.distances.used.sum()),
+                "gross": int((~r.distances.used).sum()),
+                "distance_rms_m": float(np.sqrt(np.mean(good**2))),
+                "scans": r.scans,
+                **dict(zip(columns, by_index.get(r.index, [math.nan] * len(columns)))),
+            }
+        )
+    return rows
+
+
+def _table_text(rows: Sequence[dict[str, Any]]) -> str:
     """Rows as lines between commas, with a head; empty where there is no value."""
-    decimals = {"t": 6, "nees": 4, "angular_deg": 5}
+    decimals = {"nees": 4, "angular_deg": 5}
 
     def word(name: str, value: Any) -> str:
         if isinstance(value, float) and math.isnan(value):
@@ -169,7 +200,7 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
 def account(
     references: Sequence[ReferencePose],
     refused: Sequence[Refused],
-    figures: Figures,
+    score: PoseScore,
     distances: dict[str, Any],
 ) -> list[str]:
     """The printed figures, with RAWSEEDS' beside them."""
@@ -181,11 +212,10 @@ def account(
         f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
         f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}, "
         f"{distances['gross']} gross errors",
-        f"linear error       mean {1e3 * figures.linear_mean_m:.2f} mm, sigma "
-        f"{1e3 * figures.linear_sigma_m:.2f}, worst {1e3 * figures.linear_worst_m:.2f}",
-        f"angular error      mean {math.degrees(figures.angular_mean_rad):+.3f} deg, sigma "
-        f"{math.degrees(figures.angular_sigma_rad):.3f}, worst "
-        f"{math.degrees(figures.angular_worst_rad):.3f}",
+        f"linear error       mean {1e3 * score.position_mean_m:.2f} mm, sigma "
+        f"{1e3 * score.position_sigma_m:.2f}, worst {1e3 * score.position_max_m:.2f}",
+        f"angular error      mean {math.degrees(score.angle_mean_rad):+.3f} deg, sigma "
+        f"{math.degrees(score.angle_sigma_rad):.3f}, worst {math.degrees(score.angle_max_rad):.3f}",
     ]
     for p in PUBLISHED:
         lines.append(
@@ -193,10 +223,11 @@ def account(
             f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
             f"{p.angle_sigma_deg:.2f} (published)"
         )
-    if figures.normalised:
+    if score.normalised:
+        low, high = normalised_band(score.normalised)
         lines.append(
-            f"NEES / 3           {figures.nees:.3f} over {figures.normalised} poses; 95 % of right "
-            f"ones between {figures.nees_low:.3f} and {figures.nees_high:.3f}"
+            f"NEES / 3           {score.normalised_error:.3f} over {score.normalised} poses; 95 % "
+            f"of right ones between {low:.3f} and {high:.3f}"
         )
     else:
         lines.append("NEES / 3           none: no covariance that can be inverted")
@@ -222,7 +253,7 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
     return boards, files
 
 
-def _distance_figures(solved: Any, sigma_m: float) -> dict[str, Any]:
+def _distance_figures(solved: Sequence[DistancePose], sigma_m: float) -> dict[str, Any]:
     good = [d for d in solved if d.status in ("ok", "ambiguous")]
     residuals = np.concatenate([d.residuals_m[d.used] for d in good]) if good else np.zeros(0)
     freedom = sum(d.freedom for d in good)

@@ -1,1 +1,1 @@
-"""Odometry and measured poses together: filter forward, smoothing backward."""
+"""Odometry and measured poses together, and the clocks of both."""

@@ -71,7 +71,7 @@ def likeliest_noise(problem: MovementProblem) -> FloatArray:
             def surprise(value: float, axis: int = axis) -> float:
                 tried = logarithms.copy()
                 tried[axis] = value
-                return sum(part.surprise(scaled(tried)) for part in some)
+                return sum(part.account(scaled(tried)).surprise for part in some)
 
             found = minimize_scalar(
                 surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}
@@ -95,7 +95,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
             _LONGEST_GAP_TO_LEARN_FROM_S
         )
     ]
-    numbers = POSE * sum(len(part.nodes) - 1 for part in some)
+    numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
     looser = 1.0
@@ -153,19 +153,13 @@ class Rejected:
 class OdometryErrors:
     """Odometry's errors estimated from the measurements."""
 
-    # `turn_scale`, `turn_bias_per_metre`, `distance_scale`: By what share turns are longer than
-    # odometry says, the turn it misses per metre (rad), by what share ways are longer
-    turn_scale: float
-    turn_bias_per_metre: float
-    distance_scale: float
-    # `turn_scale_sigma`, `turn_bias_per_metre_sigma`, `distance_scale_sigma`: Their standard
-    # deviations
-    turn_scale_sigma: float
+    turn_scale: float  # By what share turns are longer than odometry says
+    turn_bias_per_metre: float  # The turn that it misses per metre (rad)
+    distance_scale: float  # By what share ways are longer
+    turn_scale_sigma: float  # Standard deviations of these three
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
-    # `distance_sigma`, `lateral_sigma`, `turn_sigma`, `turn_per_metre_sigma`: Its random errors, as
-    # in `FuseSettings`
-    distance_sigma: float
+    distance_sigma: float  # Random errors, as in `FuseSettings`
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
@@ -263,17 +257,12 @@ def fuse(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
         rejected=tuple(
-            Rejected(
-                problem.streams[i],
-                float(problem.times_s[problem.nodes[i]]),
-                float(squared[i]),
-            )
+            Rejected(str(problem.streams[i]), float(problem.measured_s[i]), float(squared[i]))
             for i in np.flatnonzero(~accepted)
         ),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
-            name: int(np.count_nonzero(accepted & (np.array(problem.streams) == name)))
-            for name in streams
+            name: int(np.count_nonzero(accepted & (problem.streams == name))) for name in streams
         },
         odometry=OdometryErrors(
             *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()
@@ -306,16 +295,13 @@ _LARGEST_GAP_S = 2.0
 class LeftOut:
     """A segment of the ground truth, predicted without it."""
 
-    # `from_s`, `to_s`: The segment
-    from_s: float
+    from_s: float  # When the segment begins
     to_s: float
     poses: int  # Of the ground truth in it that have a prediction
-    # `position_rms_m`, `heading_rms_rad`: Root of the mean squared error of the fused path
-    position_rms_m: float
+    position_rms_m: float  # Root of the mean squared error of the fused path
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
-    # `aligned_position_rms_m`, `aligned_heading_rms_rad`: The same of odometry after the rigid
-    # motion that fits it to the other segments best
+    # The same of odometry after the rigid motion that fits it to the other segments best
     aligned_position_rms_m: float
     aligned_heading_rms_rad: float
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -170,15 +171,14 @@ def variances_of(
 
 def gather(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
-) -> tuple[list[str], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
+) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
     Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
     stream how many covariances had to be raised and how many rows repeat the row before to the last
     digit: these are left out, since one measurement must not count twice.
     """
-    names: list[str] = []
-    times, poses, covariances = [], [], []
+    found = []
     repaired, repeated = {}, {}
     for name, stream in streams.items():
         if stream.covariances is None:
@@ -188,25 +188,16 @@ def gather(
         repeated[name] = int(np.count_nonzero(again))
         inside &= ~again
         usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
-        names += [name] * int(np.count_nonzero(inside))
-        times.append(stream.times_s[inside])
-        poses.append(stream.poses[inside])
-        covariances.append(usable)
-    if not names:
+        names = np.full(len(usable), name)
+        found.append((names, stream.times_s[inside], stream.poses[inside], usable))
+    names, times, poses, covariances = (np.concatenate(parts) for parts in zip(*found))
+    if not len(names):
         raise GroundTruthError(
             "no measured pose within the odometry's time "
             f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
         )
-    all_times = np.concatenate(times)
-    order = np.argsort(all_times, kind="stable")
-    return (
-        [names[i] for i in order],
-        all_times[order],
-        np.concatenate(poses)[order],
-        np.concatenate(covariances)[order],
-        repaired,
-        repeated,
-    )
+    order = np.argsort(times, kind="stable")
+    return names[order], times[order], poses[order], covariances[order], repaired, repeated
 
 
 def _repeats(stream: PlanarPoses, covariances: FloatArray) -> BoolArray:

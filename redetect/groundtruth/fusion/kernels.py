@@ -19,10 +19,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
 
 #: Length of the state, and of the pose at its beginning.
 STATE = 6
@@ -33,7 +33,7 @@ NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 _SERIES_BELOW = 0.1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     """Effect of errors along an arc of length 1.
 
@@ -61,7 +61,7 @@ def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     return chord, mean_along, variance_along, variance_across, mean_cosine
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def move(
     x: FloatArray,
     p: FloatArray,
@@ -129,12 +129,12 @@ def move(
         p[j, i] += value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
@@ -151,7 +151,7 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
     return float(determinant)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _squared_innovation(
     p: FloatArray,
     measured_covariance: FloatArray,
@@ -171,7 +171,7 @@ def _squared_innovation(
     return squared, determinant
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _update(
     x: FloatArray,
     p: FloatArray,
@@ -212,9 +212,8 @@ class MeasuredPoses(NamedTuple):
     """M poses measured at some of the nodes, in ascending order."""
 
     nodes: IntArray  # (M,)
-    # `poses`, `covariances`: (M, 3), (M, 3, 3)
-    poses: FloatArray
-    covariances: FloatArray
+    poses: FloatArray  # (M, 3)
+    covariances: FloatArray  # (M, 3, 3)
 
 
 class Gating(NamedTuple):
@@ -230,25 +229,25 @@ class Gating(NamedTuple):
 
 
 class FilterHistory(NamedTuple):
-    """States (N, 6) and covariances (N, 6, 6) at all nodes, for the smoother."""
+    """States (N, d) and covariances (N, d, d) at all nodes, for the smoother."""
 
     predicted: FloatArray
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
-    # (N, 6, 6): derivatives of each node's prediction with respect to the node before
+    # (N, d, d): derivatives of each node's prediction with respect to the node before
     transitions: FloatArray
 
 
-def empty_history(nodes: int) -> FilterHistory:
+def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
     """A history to be filled; of no nodes where none is wanted."""
-    states, spreads = (nodes, STATE), (nodes, STATE, STATE)
+    states, spreads = (nodes, state), (nodes, state, state)
     return FilterHistory(
         np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def filter_forward(
     odometry: Odometry,
     start: FloatArray,
@@ -343,14 +342,14 @@ def filter_forward(
     return squared_innovations, accepted, restarted, surprise
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """Smooth what `filter_forward` left, from the last node to the first.
+    """Smooth what a filter left, from the last node to the first (Rauch, Tung, Striebel).
 
     Where the filter began anew, poses before learn from what came after only what it says of
     odometry's systematic errors.
 
-    Returns `states`, `covariances` (N, 6), (N, 6, 6).
+    Returns `states`, `covariances` (N, d), (N, d, d).
     """
     predicted, predicted_covariance = history.predicted, history.predicted_covariance
     filtered, filtered_covariance = history.filtered, history.filtered_covariance
@@ -362,7 +361,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     for k in range(last - 1, -1, -1):
         p = filtered_covariance[k]
         expected = predicted_covariance[k + 1].copy()
-        for i in range(STATE):
+        for i in range(len(expected)):
             # States without any variance stay as they are.
             if expected[i, i] == 0.0:
                 expected[i, i] = 1.0

@@ -15,11 +15,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import minimize
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.fusion.kernels import POSE
+from redetect.compiled import kernel
+from redetect.groundtruth.fusion.kernels import (
+    POSE,
+    FilterHistory,
+    empty_history,
+    smooth_backward,
+)
 from redetect.groundtruth.fusion.movement import MovementProblem
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -58,13 +63,9 @@ _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 class LocalisationErrors:
     """How odometry errs that is a localisation."""
 
-    # `position_sigma`, `heading_sigma`: Standard deviations of x and y (m each), and of the heading
-    # (rad)
-    position_sigma: float
-    heading_sigma: float
-    # `position_correlation_s`, `heading_correlation_s`: After which time errors are alike by 1/e
-    # only
-    position_correlation_s: float
+    position_sigma: float  # Standard deviation of x and y, each (m)
+    heading_sigma: float  # Of the heading (rad)
+    position_correlation_s: float  # After which time errors are alike by 1/e only
     heading_correlation_s: float
     # Heading of the ground truth beyond that of the aligned localisation (rad)
     heading_offset: float
@@ -75,10 +76,8 @@ class LocalisationProblem(NamedTuple):
 
     odometry: PlanarPoses  # Aligned rigidly with the measured poses
     times_s: FloatArray  # (M,)
-    # `differences`, `covariances`: (M, 3), (M, 3, 3): measured poses minus odometry's at their
-    # times; covariances of the former.
-    differences: FloatArray
-    covariances: FloatArray
+    differences: FloatArray  # (M, 3): measured poses minus odometry's at their times
+    covariances: FloatArray  # (M, 3, 3): of the measured poses
     offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
     centroid: FloatArray  # (2,)
     gate: float  # Largest squared normalised innovation
@@ -136,7 +135,8 @@ def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]
                 errors,
                 np.array(_ALIGNMENT_SIGMAS),
                 problem.gate,
-            ).surprise
+                empty_history(0, _STATE),
+            )[1]
         )
 
     def with_prior(logarithms: FloatArray) -> float:
@@ -156,16 +156,7 @@ def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]
     return np.asarray(errors), surprise(found.x, 1)
 
 
-class _Filtered(NamedTuple):
-    predicted: FloatArray
-    predicted_covariance: FloatArray
-    filtered: FloatArray
-    filtered_covariance: FloatArray
-    squared: FloatArray
-    surprise: float
-
-
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _filter(
     times_s: FloatArray,
     differences: FloatArray,
@@ -174,8 +165,13 @@ def _filter(
     errors: FloatArray,
     alignment_sigmas: FloatArray,
     gate: float,
-) -> _Filtered:
-    """Kalman filter over the errors; differences that are NaN are not measured."""
+    history: FilterHistory,
+) -> tuple[FloatArray, float]:
+    """Kalman filter over the errors; differences that are NaN are not measured.
+
+    `history`: filled, unless it is of no nodes. Returns the squared normalised innovations (M,) and
+    minus twice the logarithm of the measurements' likelihood.
+    """
     count = len(times_s)
     variances = np.array([errors[0] ** 2, errors[0] ** 2, errors[1] ** 2])
     x = np.zeros(_STATE)
@@ -184,22 +180,24 @@ def _filter(
         p[i, i] = variances[i]
     for i in range(POSE, _STATE):
         p[i, i] = alignment_sigmas[i - POSE] ** 2
-    predicted, filtered = np.empty((count, _STATE)), np.empty((count, _STATE))
-    predicted_covariance = np.empty((count, _STATE, _STATE))
-    filtered_covariance = np.empty((count, _STATE, _STATE))
+    keep = len(history.predicted) > 0
     squared = np.zeros(count)
     surprise = 0.0
     h = np.zeros((POSE, _STATE))
     h[0, 0] = h[0, 3] = h[1, 1] = h[1, 4] = h[2, 2] = h[2, 5] = h[2, 6] = 1.0
     for k in range(count):
+        f = np.eye(_STATE)
         if k > 0:
             for i in range(POSE):
                 share = math.exp(-(times_s[k] - times_s[k - 1]) / errors[3 if i == 2 else 2])
+                f[i, i] = share
                 x[i] *= share
                 p[i] *= share
                 p[:, i] *= share
                 p[i, i] += variances[i] * (1.0 - share * share)
-        predicted[k], predicted_covariance[k] = x, p
+        if keep:
+            history.transitions[k] = f
+            history.predicted[k], history.predicted_covariance[k] = x, p
         if math.isnan(differences[k, 0]):
             squared[k] = math.inf
             surprise += _OUTLIER_SURPRISE
@@ -215,27 +213,9 @@ def _filter(
                 x = x + gain @ innovation
                 p = p - gain @ s @ gain.T
                 p = 0.5 * (p + p.T)
-        filtered[k], filtered_covariance[k] = x, p
-    return _Filtered(
-        predicted, predicted_covariance, filtered, filtered_covariance, squared, surprise
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def _smooth(
-    times_s: FloatArray, errors: FloatArray, filtered: _Filtered
-) -> tuple[FloatArray, FloatArray]:
-    """Rauch-Tung-Striebel: states and covariances."""
-    x, p = filtered.filtered.copy(), filtered.filtered_covariance.copy()
-    f = np.ones(_STATE)
-    for k in range(len(times_s) - 2, -1, -1):
-        passed = times_s[k + 1] - times_s[k]
-        f[:2], f[2] = math.exp(-passed / errors[2]), math.exp(-passed / errors[3])
-        before = filtered.predicted_covariance[k + 1]
-        gain = np.linalg.solve(before, (p[k] * f).T).T
-        x[k] += gain @ (x[k + 1] - filtered.predicted[k + 1])
-        p[k] += gain @ (p[k + 1] - before) @ gain.T
-    return x, p
+        if keep:
+            history.filtered[k], history.filtered_covariance[k] = x, p
+    return squared, surprise
 
 
 def smooth_localisation(
@@ -251,7 +231,8 @@ def smooth_localisation(
     order = np.argsort(all_times, kind="stable")
     none = np.full((len(times_s), POSE), np.nan)
     offsets = np.concatenate([there.poses[:, :2] - problem.centroid, problem.offsets])[order]
-    filtered = _filter(
+    history = empty_history(len(order), _STATE)
+    squared, _ = _filter(
         all_times[order],
         np.concatenate([none, problem.differences])[order],
         np.concatenate([np.zeros((len(times_s), POSE, POSE)), problem.covariances])[order],
@@ -259,8 +240,9 @@ def smooth_localisation(
         errors,
         np.array(_ALIGNMENT_SIGMAS),
         problem.gate,
+        history,
     )
-    states, spreads = _smooth(all_times[order], errors, filtered)
+    states, spreads = smooth_backward(history)
     own = np.flatnonzero(order < len(times_s))
     h = np.zeros((len(own), POSE, _STATE))
     h[:, [0, 0, 1, 1, 2, 2, 2], [0, 3, 1, 4, 2, 5, 6]] = 1.0
@@ -268,8 +250,11 @@ def smooth_localisation(
     poses = there.poses + np.einsum("nij,nj->ni", h, states[own])
     poses[:, 2] = wrap_angle(poses[:, 2])
     covariances = h @ spreads[own] @ np.swapaxes(h, 1, 2)
-    squared = filtered.squared[order >= len(times_s)]
-    return PlanarPoses(times_s, poses, covariances), squared, float(states[-1, 6])
+    return (
+        PlanarPoses(times_s, poses, covariances),
+        squared[order >= len(times_s)],
+        float(states[-1, 6]),
+    )
 
 
 def as_localisation(
@@ -282,7 +267,7 @@ def as_localisation(
     left out.
     """
     thin = problem.thinned(_SPACING_S)
-    if len(thin.nodes) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
+    if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None
     errors, surprise = learn_localisation(_beside(odometry, thin))
     if not surprise < thin.account(noise).surprise - _CLEAR_LEAD:
@@ -292,6 +277,6 @@ def as_localisation(
 
 
 def _beside(odometry: PlanarPoses, problem: MovementProblem) -> LocalisationProblem:
-    times_s = problem.times_s[problem.nodes]
-    measured = PlanarPoses(times_s, problem.measured, problem.covariances)
+    _, poses, covariances = problem.measured
+    measured = PlanarPoses(problem.measured_s, poses, covariances)
     return localisation_problem(odometry, measured, problem.gate())

@@ -15,13 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion.inputs import (
     gather,
     movements,
@@ -67,37 +66,8 @@ class Bridge:
     looser: float  # By what factor odometry's variances had to be raised to explain it, 1 or more
 
 
-def gaps_where_lost(
-    nodes: IntArray, accepted: BoolArray, restarted: NDArray[np.int8]
-) -> list[tuple[int, int]]:
-    """Nodes of the last measurement before, and the first one after, each gap that is too long."""
-    good = nodes[accepted]
-    return [
-        (int(good[np.searchsorted(good, end) - 1]), int(end))
-        for end in np.flatnonzero(restarted == WHERE_LOST)
-    ]
-
-
-def ends_that_did_not_fit(
-    times_s: FloatArray,
-    nodes: IntArray,
-    accepted: BoolArray,
-    restarted: NDArray[np.int8],
-) -> list[int]:
-    """Nodes after gaps where those rejections began that made the filter restart."""
-    found = []
-    for node in np.flatnonzero(restarted == AFTER_REJECTIONS):
-        first = int(np.searchsorted(nodes, node))
-        while first > 0 and not accepted[first - 1]:
-            first -= 1
-        if first > 0 and times_s[nodes[first]] - times_s[nodes[first - 1]] > UNMEASURED_S:
-            found.append(int(nodes[first]))
-    return found
-
-
 def bridge(
-    controls: FloatArray,
-    variances: FloatArray,
+    odometry: Odometry,
     forward: FloatArray,
     spread: FloatArray,
     end: FloatArray,
@@ -106,18 +76,18 @@ def bridge(
 ) -> Bridge:
     """Find the likeliest path between two known ends.
 
-    `controls` (N, 4) and `variances` (N, 3) are those of the movements to each node; the first are
-    not used. `forward` (N - 1, 6) is where odometry leads from the first node, whose covariance is
-    `spread` (6, 6). `end` (3,) is the pose at the last node, with `end_spread` (3, 3). Beyond the
-    `gate`, a squared normalised distance of the end, odometry is taken to err more in this gap than
-    elsewhere.
+    `odometry` leads to the N nodes of the gap. `forward` (N - 1, 6) is where it leads from the
+    first node, whose covariance is `spread` (6, 6). `end` (3,) is the pose at the last node, with
+    `end_spread` (3, 3). Beyond the `gate`, a squared normalised distance of the end, odometry is
+    taken to err more in this gap than elsewhere.
     """
     looser = 1.0
     for _ in range(_MOST_LOOSENINGS):
         tried = []
         for turns in range(-_MOST_TURNS, _MOST_TURNS + 1):
-            start = _bent(controls, forward, end, turns)
-            found = _likeliest(controls, looser * variances, start, forward[0], spread, end_spread)
+            start = _bent(odometry.controls, forward, end, turns)
+            loose = odometry._replace(variances=looser * odometry.variances)
+            found = _likeliest(loose, start, forward[0], spread, end_spread)
             if found is not None:
                 tried.append(found)
         if not tried:
@@ -152,17 +122,16 @@ def _bent(controls: FloatArray, forward: FloatArray, end: FloatArray, turns: int
 
 
 def _likeliest(
-    controls: FloatArray,
-    variances: FloatArray,
+    odometry: Odometry,
     path: FloatArray,
     begin: FloatArray,
     spread: FloatArray,
     end_spread: FloatArray,
 ) -> tuple[float, float, FloatArray] | None:
     """Surprise, squared distance of the end and states, by Gauss-Newton steps, if they settle."""
-    count = len(controls)
+    count = len(path)
     measured = MeasuredPoses(np.array([count - 1]), path[-1:, :POSE].copy(), end_spread[None])
-    odometry, history = Odometry(controls, variances), empty_history(count)
+    history = empty_history(count)
     for _ in range(_MOST_STEPS):
         squared, _, _, surprise = filter_forward(
             odometry, begin, spread, measured, _no_gate(count), path, history
@@ -183,13 +152,13 @@ def _no_gate(nodes: int) -> Gating:
 
 
 def back_from(
-    controls: FloatArray, variances: FloatArray, end: FloatArray, end_spread: FloatArray
+    odometry: Odometry, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
 
-    `controls` (N, 4) and `variances` (N, 3) as for `bridge`; `end` (6,) and `end_spread` (6, 6) are
-    those at the last node.
+    `end` (6,) and `end_spread` (6, 6) are those at the last of the N nodes.
     """
+    controls, variances = odometry
     count = len(controls)
     # Driven backward, all rates change their signs; the turn per metre does so by itself.
     mirror = np.ones(STATE)
@@ -228,13 +197,6 @@ class MeasurementAccount:
     surprise: float  # Minus twice the logarithm of their likelihood
 
 
-class Smoothed(NamedTuple):
-    """Smoothed states (N, 6) and covariances (N, 6, 6) at the nodes."""
-
-    states: FloatArray
-    covariances: FloatArray
-
-
 @dataclass(frozen=True, eq=False)
 class MovementProblem:
     """Odometry and measured poses on common nodes, whatever odometry errs at random."""
@@ -246,48 +208,46 @@ class MovementProblem:
     controls: FloatArray
     # (N, 2): way (m) and turn (rad) that it may have made besides, where odometry pauses
     unseen: FloatArray
-    nodes: IntArray  # (M,): at which node each measurement was made, ascending
-    # `measured`, `covariances`: (M, 3), (M, 3, 3): the measured poses
-    measured: FloatArray
-    covariances: FloatArray
-    streams: tuple[str, ...]  # Their streams
+    measured: MeasuredPoses
+    streams: NDArray[np.str_]  # (M,): their streams
     repaired: dict[str, int]  # Covariances that had to be raised, by stream
     repeated: dict[str, int]  # Rows that repeated the row before and were left out, by stream
     settings: FuseSettings
+
+    @property
+    def measured_s(self) -> FloatArray:
+        """(M,) times of the measurements."""
+        return self.times_s[self.measured.nodes]
 
     def shortened(self, count: int) -> MovementProblem:
         """The contiguous nodes, at most `count`, that have the most measurements."""
         if len(self.times_s) <= count:
             return self
-        begins = self.nodes[self.nodes + count <= len(self.times_s)]
+        nodes = self.measured.nodes
+        begins = nodes[nodes + count <= len(self.times_s)]
         if len(begins) == 0:
             begins = np.array([len(self.times_s) - count], dtype=np.int64)
-        held = np.searchsorted(self.nodes, begins + count) - np.searchsorted(self.nodes, begins)
+        held = np.searchsorted(nodes, begins + count) - np.searchsorted(nodes, begins)
         begin = int(begins[int(np.argmax(held))])
         return self._part(begin, begin + count)
 
     def _part(self, begin: int, end: int) -> MovementProblem:
-        here = (self.nodes >= begin) & (self.nodes < end)
+        nodes = self.measured.nodes
+        some = self.with_only((nodes >= begin) & (nodes < end))
         return replace(
-            self.with_only(here),
+            some,
             times_s=self.times_s[begin:end],
             controls=self.controls[begin:end],
             unseen=self.unseen[begin:end],
-            nodes=self.nodes[here] - begin,
+            measured=some.measured._replace(nodes=some.measured.nodes - begin),
         )
 
     def split(self, longest_s: float) -> list[MovementProblem]:
         """The parts between which nothing was measured for longer than this, without the gaps."""
-        at = self.times_s[self.nodes]
-        cuts = np.flatnonzero(np.diff(at) > longest_s) + 1
+        cuts = np.flatnonzero(np.diff(self.measured_s) > longest_s) + 1
         return [
-            self._part(int(self.nodes[own[0]]), int(self.nodes[own[-1]]) + 1)
-            for own in np.split(np.arange(len(at)), cuts)
+            self._part(int(own[0]), int(own[-1]) + 1) for own in np.split(self.measured.nodes, cuts)
         ]
-
-    def surprise(self, noise: FloatArray) -> float:
-        """Minus twice the logarithm of the measurements' likelihood."""
-        return self.account(noise).surprise
 
     def account(
         self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
@@ -297,20 +257,13 @@ class MovementProblem:
         It begins with the given means and deviations of odometry's systematic errors, by default
         with those of the settings.
         """
-        return self._forward(
-            self._variances(noise),
-            np.empty((1, STATE)),
-            np.zeros(len(self.times_s), dtype=np.bool_),
-            None,
-            systematic,
-        )
+        return self._forward(self._variances(noise), systematic=systematic)
 
     def thinned(self, spacing_s: float) -> MovementProblem:
         """With no measurement sooner than this after the one before."""
-        at = self.times_s[self.nodes]
-        kept = np.zeros(len(at), dtype=np.bool_)
+        kept = np.zeros(len(self.streams), dtype=np.bool_)
         last = -np.inf
-        for i, time in enumerate(at):
+        for i, time in enumerate(self.measured_s):
             if time - last >= spacing_s:
                 kept[i] = True
                 last = time
@@ -318,19 +271,14 @@ class MovementProblem:
 
     def with_only(self, kept: BoolArray) -> MovementProblem:
         """With some of its measurements."""
-        return replace(
-            self,
-            nodes=self.nodes[kept],
-            measured=self.measured[kept],
-            covariances=self.covariances[kept],
-            streams=tuple(self.streams[i] for i in np.flatnonzero(kept)),
-        )
+        nodes, poses, covariances = self.measured
+        measured = MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
+        return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (N, 6) and covariances (N, 6, 6) by the filter alone: from what was before."""
         history = empty_history(len(self.times_s))
-        no_cuts = np.zeros(len(self.times_s), dtype=np.bool_)
-        self._forward(self._variances(noise), np.empty((1, STATE)), no_cuts, history)
+        self._forward(self._variances(noise), history=history)
         return history.filtered, history.filtered_covariance
 
     def smooth(
@@ -344,41 +292,61 @@ class MovementProblem:
         """
         variances = self._variances(noise)
         as_sampled = variances.copy()
-        after = np.flatnonzero(np.diff(self.times_s[self.nodes]) > UNMEASURED_S)
-        for begin, end in zip(self.nodes[after], self.nodes[after + 1]):
+        nodes = self.measured.nodes
+        after = np.flatnonzero(np.diff(self.measured_s) > UNMEASURED_S)
+        for begin, end in zip(nodes[after], nodes[after + 1]):
             variances[begin + 1 : end + 1] *= looser_in_gaps
         history = empty_history(len(self.times_s))
-        points = np.empty((1, STATE))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
-            account = self._forward(variances, points, cuts, history)
-            unfit = ends_that_did_not_fit(
-                self.times_s, self.nodes, account.accepted, account.restarted
-            )
+            account = self._forward(variances, cuts=cuts, history=history)
+            unfit = self._ends_that_did_not_fit(account)
             if not unfit:
                 break
             cuts[unfit] = True
-        smoothed = Smoothed(*smooth_backward(history))
-        gaps = gaps_where_lost(self.nodes, account.accepted, account.restarted)
-        points = smoothed.states.copy()
+        states, covariances = smooth_backward(history)
+        good = nodes[account.accepted]
+        # The nodes of the last measurement before, and the first one after, gaps that are too long.
+        gaps = [
+            (int(good[np.searchsorted(good, end) - 1]), int(end))
+            for end in np.flatnonzero(account.restarted == WHERE_LOST)
+        ]
+        points = states.copy()
         cuts[:] = False
         for begin, end in gaps:
-            found = self._bridge(begin, end, as_sampled, points, smoothed)
+            found = self._bridge(begin, end, as_sampled, points, covariances)
             cuts[end] = found.path is None
             variances[begin + 1 : end + 1] *= max(1.0, found.looser / looser_in_gaps)
         # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
         # too far off on its way for its derivatives to hold.
         for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
             account = self._forward(variances, points, cuts, history)
-            smoothed = Smoothed(*smooth_backward(history))
-            points = smoothed.states.copy()
+            states, covariances = smooth_backward(history)
+            points = states.copy()
         for begin, end in gaps:
             if cuts[end]:
-                self._anchor(begin, end, variances, smoothed)
-        return smoothed.states, smoothed.covariances, account
+                self._anchor(begin, end, variances, states, covariances)
+        return states, covariances, account
+
+    def _ends_that_did_not_fit(self, account: MeasurementAccount) -> list[int]:
+        """Nodes after gaps where those rejections began that made the filter restart."""
+        nodes, times_s = self.measured.nodes, self.measured_s
+        found = []
+        for node in np.flatnonzero(account.restarted == AFTER_REJECTIONS):
+            first = int(np.searchsorted(nodes, node))
+            while first > 0 and not account.accepted[first - 1]:
+                first -= 1
+            if first > 0 and times_s[first] - times_s[first - 1] > UNMEASURED_S:
+                found.append(int(nodes[first]))
+        return found
 
     def _bridge(
-        self, begin: int, end: int, variances: FloatArray, points: FloatArray, smoothed: Smoothed
+        self,
+        begin: int,
+        end: int,
+        variances: FloatArray,
+        points: FloatArray,
+        covariances: FloatArray,
     ) -> Bridge:
         """Bridge a gap that was cut with points, if possible.
 
@@ -386,12 +354,11 @@ class MovementProblem:
         """
         gap = slice(begin, end + 1)
         found = bridge(
-            self.controls[gap],
-            variances[gap],
+            Odometry(self.controls[gap], variances[gap]),
             points[begin:end],
-            smoothed.covariances[begin],
+            covariances[begin],
             points[end, :POSE],
-            smoothed.covariances[end, :POSE, :POSE],
+            covariances[end, :POSE, :POSE],
             self.gate(),
         )
         if found.path is None:
@@ -402,19 +369,23 @@ class MovementProblem:
         points[end:, 2] += 2.0 * math.pi * turns
         return found
 
-    def _anchor(self, begin: int, end: int, variances: FloatArray, smoothed: Smoothed) -> None:
+    def _anchor(
+        self,
+        begin: int,
+        end: int,
+        variances: FloatArray,
+        states: FloatArray,
+        covariances: FloatArray,
+    ) -> None:
         """Determine the second half of a gap that was cut from the measurements after it."""
         gap = slice(begin, end + 1)
-        states, spreads = back_from(
-            self.controls[gap],
-            variances[gap],
-            smoothed.states[end],
-            smoothed.covariances[end],
+        back, spreads = back_from(
+            Odometry(self.controls[gap], variances[gap]), states[end], covariances[end]
         )
         way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
         half = int(np.searchsorted(way, 0.5 * (way[0] + way[-1]))) + 1
-        smoothed.states[begin + half : end] = states[half:-1]
-        smoothed.covariances[begin + half : end] = spreads[half:-1]
+        states[begin + half : end] = back[half:-1]
+        covariances[begin + half : end] = spreads[half:-1]
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""
@@ -427,26 +398,26 @@ class MovementProblem:
     def _forward(
         self,
         variances: FloatArray,
-        points: FloatArray,
-        cuts: BoolArray,
-        history: FilterHistory | None,
+        points: FloatArray | None = None,
+        cuts: BoolArray | None = None,
+        history: FilterHistory | None = None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:
         means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
         return MeasurementAccount(
             *filter_forward(
                 Odometry(self.controls, variances),
-                np.concatenate([self.measured[0], means]),
+                np.concatenate([self.measured.poses[0], means]),
                 np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
-                MeasuredPoses(self.nodes, self.measured, self.covariances),
+                self.measured,
                 Gating(
                     self.gate(),
                     _RESTART_AFTER,
                     _RESTART_VARIANCES,
-                    _LOST_VARIANCE if len(points) == 1 else math.inf,
-                    cuts,
+                    _LOST_VARIANCE if points is None else math.inf,
+                    np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
                 ),
-                points,
+                np.empty((1, STATE)) if points is None else points,
                 empty_history(0) if history is None else history,
             )
         )
@@ -468,10 +439,10 @@ def movement_problem(
         times_s=node_times,
         controls=controls,
         unseen=unseen,
-        nodes=np.searchsorted(node_times, times).astype(np.int64),
-        measured=measured,
-        covariances=covariances,
-        streams=tuple(names),
+        measured=MeasuredPoses(
+            np.searchsorted(node_times, times).astype(np.int64), measured, covariances
+        ),
+        streams=names,
         repaired=repaired,
         repeated=repeated,
         settings=settings,

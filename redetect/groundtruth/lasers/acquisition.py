@@ -1,24 +1,42 @@
-"""The robot's outline, and finding it anywhere: every heap of new readings, every heading."""
+"""Scans in sets, the background that the scanners see, and finding the robot in a set anywhere.
+
+New readings, which are nearer than the background, form heaps; at each heap the outline is tried in
+every heading.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
-from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
+from redetect.groundtruth.lasers.scanners import (
+    Robot,
+    Scanner,
+    Scans,
+    find_scans,
+    read_robot,
+    read_scanners,
+    read_scans,
+)
 from redetect.groundtruth.lasers.tracking_kernels import (
-    BeamCounts,
+    Body,
+    FixedScanners,
     OutlineFit,
     OutlinePose,
+    ScanSet,
     Seen,
     explain_set,
     new_points,
@@ -27,6 +45,155 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 from redetect.groundtruth.settings import LaserSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert, rotation
+
+# A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
+# than the nearest object that the beam saw, which is at this quantile of its readings.
+_LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
+
+
+class Background(NamedTuple):
+    """A scanner's static background, beam by beam."""
+
+    # (readings,): a reading below this is something that was not there; infinite where the beam
+    # sees nothing
+    near_m: FloatArray
+    quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
+
+
+def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
+    """Learn the background of the beams from scans (N, readings) of the empty area.
+
+    Readings are 0, or `max_range_m` and more, where nothing came back. The nearest object of a beam
+    is at a low quantile of its readings: beams along an edge see near and far in turn, and nearer
+    readings than that are treated as passing objects.
+    """
+    if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
+        raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
+    metres = ranges_mm * 1e-3
+    hit = (ranges_mm > 0) & (metres < max_range_m)
+    ordered = np.sort(np.where(hit, metres, np.inf), axis=0)
+    count = hit.sum(axis=0)
+    beams = np.arange(ranges_mm.shape[1])
+
+    def quantile(values: FloatArray, share: float) -> FloatArray:
+        row = np.minimum((share * count).astype(np.int64), np.maximum(count - 1, 0))
+        return np.asarray(values[row, beams])
+
+    median = quantile(ordered, 0.5)
+    # Two readings in a hundred scans say nothing about the background.
+    seen = count >= max(1, round(0.02 * len(ranges_mm)))
+    deviation = np.full_like(metres, np.inf)
+    np.subtract(metres, median, out=deviation, where=hit)
+    deviation = np.sort(np.abs(deviation), axis=0)
+    sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
+    near = np.where(seen, quantile(ordered, _PASSING), 0.0)
+    near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
+    return Background(
+        np.where(seen, np.maximum(near, 0.0), np.inf),
+        1e-3 * float(np.gcd.reduce(ranges_mm, axis=None)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSets:
+    """Scans that belong together."""
+
+    times_s: FloatArray  # (sets,): mean time of the set's scans
+    # (sets, scanners): row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
+    rows: IntArray
+    ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
+    ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def __getitem__(self, index: int) -> ScanSet:
+        return ScanSet(self.ranges_mm, self.rows[index], self.ages_s[index])
+
+
+def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> FixedScanners:
+    """Arrange scanners, and the background in their scans of the empty area, for the kernels."""
+    if not scanners:
+        raise GroundTruthError("no scanners: expected some")
+    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
+    width = max(scanner.readings for scanner in scanners)
+    near = np.zeros((len(scanners), width))
+    direction = np.zeros((len(scanners), width, 2))
+    for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
+        reach = np.minimum(background.near_m, scanner.max_range_m)
+        near[i, : scanner.readings] = 1e3 * reach
+        angle = scanner.pose[2] + scanner.angles_rad
+        direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return FixedScanners(
+        near,
+        direction,
+        np.stack([scanner.pose[:2] for scanner in scanners]),
+        # Rounding to a quantum is an error more, evenly spread over it.
+        np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
+        block_diag(*(scanner.covariance for scanner in scanners)),
+    )
+
+
+def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> ScanSets:
+    """Put the scans of scanners that run independently into sets.
+
+    Going through all scans in the order of time, a set ends where a scanner would come a second
+    time, or where its first scan is more than the window ago. So each scan is in one set, and
+    scanners that run slightly faster than others occasionally have a set of their own.
+
+    `scans`: per scanner. `window_s`: by default the median time between a scanner's scans.
+    """
+    total = sum(len(one) for one in scans)
+    if total == 0:
+        raise GroundTruthError("no scans of any scanner")
+    width = max(one.ranges_mm.shape[1] for one in scans)
+    ranges = np.zeros((total, width), dtype=np.uint16)
+    first = np.cumsum([0, *(len(one) for one in scans)])
+    for begin, one in zip(first, scans):
+        ranges[begin : begin + len(one), : one.ranges_mm.shape[1]] = one.ranges_mm
+    if window_s is None:
+        steps = [float(np.median(np.diff(one.times_s))) for one in scans if len(one) > 1]
+        window_s = min(steps) if steps else 0.0
+    times = np.concatenate([one.times_s for one in scans])
+    owner = np.concatenate([np.full(len(one), i) for i, one in enumerate(scans)])
+    order = np.lexsort((owner, times))
+    rows = _group(order, owner, times, len(scans), window_s)
+    seen = rows >= 0
+    at = np.where(seen, times[rows], 0.0)
+    when = at.sum(axis=1) / seen.sum(axis=1)
+    return ScanSets(when, rows, np.where(seen, when[:, None] - at, 0.0), ranges)
+
+
+def _group(
+    order: IntArray, owner: IntArray, times: FloatArray, scanners: int, window_s: float
+) -> IntArray:
+    rows: list[list[int]] = []
+    begun = -np.inf
+    for i, scanner, t in zip(order.tolist(), owner[order].tolist(), times[order].tolist()):
+        if not rows or rows[-1][scanner] >= 0 or t - begun > window_s:
+            rows.append([-1] * scanners)
+            begun = t
+        rows[-1][scanner] = i
+    return np.array(rows, dtype=np.int64).reshape(-1, scanners)
+
+
+def load_session(
+    folder: Path, calibration: Path
+) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
+    """Read fixed scanners, robot, scans, and learn the background.
+
+    Raises
+    ------
+    GroundTruthError
+        If a file is missing or does not fit the others.
+    """
+    scanners = read_scanners(calibration)
+    robot = read_robot(folder / "robot.json")
+    empties, scans = (
+        [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
+        for place in (folder / "empty", folder)
+    )
+    return scanners, robot, fixed_scanners(scanners, empties), sets_of_scans(scans)
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:
@@ -117,8 +284,6 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
     )
 
 
-#: A reading within this of where a beam should meet the robot agrees (m).
-AGREES_M = 0.05
 #: Steps of the refinement.
 _STEPS = 8
 
@@ -126,20 +291,10 @@ _EVERYWHERE_M = 1e6
 _LARGEST_CHI2 = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Body:
-    """The robot's data for the kernels."""
-
-    faces: FloatArray  # (k, 4): counter-clockwise
-    middle: FloatArray  # (2,): of its bounding box, in its frame
-    radius_m: float  # Of its farthest corner from there
-    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
-
-
 def refine(
     seen: Seen,
     start: FloatArray,
-    tables: ScannerTables,
+    fixed: FixedScanners,
     body: Body,
     settings: LaserSettings,
     prior_m: float,
@@ -150,17 +305,7 @@ def refine(
         s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
         _STEPS,
     )  # fmt: skip
-    return refine_outline(seen, body.faces, start, tables.origins, tables.sigmas_m, fit)
-
-
-def explain(
-    sets: ScanSets, index: int, tables: ScannerTables, body: Body, pose: FloatArray
-) -> BeamCounts:
-    """How a pose explains the beams of a set."""
-    return explain_set(
-        sets.ranges_mm, sets.rows[index], tables.as_beams(), body.faces, body.middle,
-        body.radius_m, pose, AGREES_M,
-    )  # fmt: skip
+    return refine_outline(seen, body.faces, start, fixed.origins, fixed.sigmas_m, fit)
 
 
 def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
@@ -171,7 +316,7 @@ def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_
 
 
 def acquire(
-    sets: ScanSets, index: int, tables: ScannerTables, body: Body, settings: LaserSettings
+    scans: ScanSet, fixed: FixedScanners, body: Body, settings: LaserSettings
 ) -> FloatArray | None:
     """Find the robot in one set of scans: x, y (m), theta (rad), or None.
 
@@ -181,10 +326,7 @@ def acquire(
     outline's symmetries and explain the scans about as well, none is returned; with a symmetric
     outline it is one of the equivalent poses.
     """
-    seen = new_points(
-        sets.ranges_mm, sets.rows[index], tables.as_beams(), np.zeros(2), _EVERYWHERE_M,
-        np.zeros(5), sets.ages_s[index],
-    )  # fmt: skip
+    seen = new_points(scans, fixed, np.zeros(2), _EVERYWHERE_M, np.zeros(5))
     if len(seen.points) < settings.acquire_readings:
         return None
     found: list[tuple[float, FloatArray]] = []
@@ -192,7 +334,7 @@ def acquire(
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
         if int(near.sum()) < settings.acquire_readings:
             continue
-        found += _search(place, seen.where(near), sets, index, tables, body, settings)
+        found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
     found.sort(key=lambda entry: -entry[0])
@@ -230,9 +372,8 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
 def _search(
     place: FloatArray,
     seen: Seen,
-    sets: ScanSets,
-    index: int,
-    tables: ScannerTables,
+    scans: ScanSet,
+    fixed: FixedScanners,
     body: Body,
     settings: LaserSettings,
 ) -> list[tuple[float, FloatArray]]:
@@ -249,12 +390,12 @@ def _search(
         if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
-        refined = refine(seen, pose, tables, body, settings, 0.1)
+        refined = refine(seen, pose, fixed, body, settings, 0.1)
         if refined.used < settings.acquire_readings or refined.open_directions:
             continue
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
-        _, agree, through, hidden, _, beside = explain(sets, index, tables, body, refined.pose)
+        _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
         if agree < settings.least_agreement * (agree + through + hidden + beside):
             continue
         found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))

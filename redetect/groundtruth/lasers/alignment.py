@@ -11,36 +11,31 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import (
-    IcpSettings,
     Scan,
     align_scans,
     explained,
     fit_outline,
-    icp_to_segments,
-    rigid_fit,
     scan_normals,
 )
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.tracking_kernels import (
-    OutlineFit,
-    OutlinePose,
-    Seen,
-    refine_outline,
-)
+from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
 from redetect.groundtruth.settings import AlignmentSettings
-from redetect.landmarks import wrap_angle
-from redetect.plane import apply, between, compose, invert
+from redetect.plane import apply, between, compose, fitted, invert, rotation
 
 #: Steps of the published order, by which results are named.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
 
-_NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD = 0.4, 4, 0.2
+# Of lines through a scan's points: the longest step to a neighbour (m), neighbours on either side,
+# and the largest extent across of that along.
+_NORMALS = (0.4, 4, 0.2)
 _JUDGED_M = 0.05
 _ROUNDS = 50
 #: Standard deviations of readings, wall and map together, as the fit to the map narrows (m).
@@ -48,21 +43,11 @@ _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
 _FLOOR_M = 0.001
 _WEAK_M = 0.02
 _LONE_STEPS = 30
+_MOST_STEPS = 500
 # Pairs are begun from the measured headings turned by these.
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 # A scanner whose place on the map is farther from that among the other scanners is named.
 _INCONSISTENT_M = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class StillScan:
-    """Points of a scanner in the empty area, averaged over its scans."""
-
-    points: FloatArray  # (n, 2): in the scanner's frame, in the order of the beams (m)
-    range_m: FloatArray  # (n,)
-    direction: FloatArray  # (n, 2): of the beams
-    sigma_m: float  # Of the averaged readings
-    normals: FloatArray  # (n, 2): of lines through the points; zeros where there is none.
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,34 +65,120 @@ class Alignment:
     inconsistent: tuple[str, ...]  # Scanners whose place on the map is not that among the others
 
 
-def still_scan(scanner: Scanner, empty: Scans) -> StillScan:
-    """Average the scans of the empty area.
+class StillScan(NamedTuple):
+    """What a scanner sees while nothing moves: its readings, averaged beam by beam."""
+
+    range_m: FloatArray  # (n,)
+    direction: FloatArray  # (n, 2): of the beams, in the scanner's frame
+    sigma_m: float  # Standard deviation of an averaged reading
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 2) points in the scanner's frame, in the order of the beams (m)."""
+        return self.range_m[:, None] * self.direction
+
+
+def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
+    """Average scans (N, readings) in which nothing moves.
 
     Beams without a reading in half of the scans, and those along an edge, which see near and far
     in turn, are left out; a beam's readings far off its median, which passed by, too.
     """
-    metres = empty.ranges_mm * 1e-3
-    hit = scanner.has_return(empty.ranges_mm)
+    metres = ranges_mm * 1e-3
+    hit = scanner.has_return(ranges_mm)
     masked = np.where(hit, metres, np.nan)
-    usable = hit.sum(axis=0) >= max(1.0, 0.5 * len(empty))
+    usable = hit.sum(axis=0) >= max(1.0, 0.5 * len(ranges_mm))
     median = np.full(scanner.readings, np.nan)
     median[usable] = np.nanmedian(masked[:, usable], axis=0)
-    off = np.abs(masked - median)
-    close = off < 4.0 * max(scanner.sigma_m, 0.005)
+    close = np.abs(masked - median) < 4.0 * max(scanner.sigma_m, 0.005)
     count = close.sum(axis=0)
     usable &= count >= 0.8 * hit.sum(axis=0)
-    if int(usable.sum()) < 10:
-        raise GroundTruthError(
-            f"scanner {scanner.name}: {int(usable.sum())} beams see something in the empty area: "
-            "expected 10 or more"
-        )
     mean = np.where(close, metres, 0.0).sum(axis=0)[usable] / count[usable]
     angle = scanner.angles_rad[usable]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    points = np.ascontiguousarray(mean[:, None] * direction)
-    normals = scan_normals(points, _NORMAL_RADIUS_M, _NORMAL_REACH, _NORMAL_SPREAD)
-    sigma = max(scanner.sigma_m, 0.003) / math.sqrt(float(np.median(count[usable])))
-    return StillScan(points, mean, direction, sigma, normals)
+    readings = float(np.median(count[usable])) if usable.any() else 1.0
+    return StillScan(mean, direction, max(scanner.sigma_m, 0.003) / math.sqrt(readings))
+
+
+class WallFit(NamedTuple):
+    """Where scanners that are fixed to each other are, by the walls that they see."""
+
+    pose: FloatArray  # (3,): of their common frame on the map
+    covariance: FloatArray  # (3, 3): from the residuals' size and the geometry
+    by_mounts: FloatArray  # (3, 3 scanners): derivative of the pose by theirs in the common frame
+    used: int  # Readings that it rests on
+    rms_m: float  # Of their distances from the walls
+    open_directions: int  # Directions that the walls leave open
+
+
+def fit_to_walls(
+    scans: Sequence[StillScan],
+    mounts: FloatArray,
+    walls: FloatArray,
+    start: FloatArray,
+    gate_m: float,
+    narrowing_m: Sequence[float],
+    weak_sigma_m: float,
+) -> WallFit:
+    """Most likely pose of scanners on the map, near a start.
+
+    A reading belongs to the wall that its beam meets first. Readings of objects in front of a wall
+    are far from the wall that the beam would hit, and are excluded as the fit narrows.
+
+    Parameters
+    ----------
+    scans : sequence of StillScan
+        One of each scanner.
+    mounts : (scanners, 3) float64
+        Poses of the scanners in their common frame.
+    walls : (S, 4) float64
+        Pieces of wall on the map, seen from both sides (m).
+    start : (3,) float64
+        Of the common frame on the map.
+    gate_m : float
+        Farthest that a reading may lie from its wall at first.
+    narrowing_m : sequence of float
+        Standard deviations of readings, wall and map together, as the fit narrows; farther than
+        three of them is of no wall. Last, the residuals themselves say how large it is.
+    weak_sigma_m : float
+        Directions along which the standard deviation would be larger are open; they hold on to the
+        start.
+
+    Raises
+    ------
+    GeometryError
+        If fewer than ten readings are on walls.
+    """
+    # The kernel moves faces to points: here the map to the scanners' frame.
+    faces = np.vstack([walls, walls[:, [2, 3, 0, 1]]])
+    seen = Seen(
+        np.concatenate([apply(mount, scan.points) for mount, scan in zip(mounts, scans)]),
+        np.repeat(np.arange(len(scans)), [len(scan.range_m) for scan in scans]),
+        np.concatenate([s.direction @ rotation(m[2]).T for m, s in zip(mounts, scans)]),
+        np.concatenate([scan.range_m for scan in scans]),
+    )
+    origins, sigmas = mounts[:, :2].copy(), np.array([scan.sigma_m for scan in scans])
+    pose, ratio = invert(start), 1.0
+    for floor in (*narrowing_m, None):
+        floor = max(_FLOOR_M, narrowing_m[-1] * math.sqrt(ratio)) if floor is None else floor
+        fit = OutlineFit(floor, 0.25, 3.0, gate_m, 0.5, weak_sigma_m, 1.0, _LONE_STEPS)
+        found = refine_outline(seen, faces, pose, origins, sigmas, fit)
+        if found.used < 10:
+            raise GeometryError(f"{found.used} readings lie on the map: expected 10 or more")
+        pose, ratio = found.pose, found.chi2 / (found.used - 3.0)
+    world = invert(pose)
+    # The inverse's derivatives: x' = -R' t and theta' = -theta.
+    c, s = math.cos(world[2]), math.sin(world[2])
+    jacobian = np.array([[-c, s, world[1]], [-s, -c, -world[0]], [0.0, 0.0, -1.0]])
+    covariance = max(ratio, 0.1) * jacobian @ found.covariance @ jacobian.T
+    return WallFit(
+        world,
+        0.5 * (covariance + covariance.T),
+        jacobian @ found.by_scanner,
+        found.used,
+        found.rms_m,
+        found.open_directions,
+    )
 
 
 def align_scanners(
@@ -137,7 +208,14 @@ def align_scanners(
     s = AlignmentSettings() if settings is None else settings
     if not scanners:
         raise GroundTruthError("no scanners: expected some")
-    scans = [still_scan(a, b) for a, b in zip(scanners, empties)]
+    stills = [still_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
+    for scanner, still in zip(scanners, stills):
+        if len(still.range_m) < 10:
+            raise GroundTruthError(
+                f"scanner {scanner.name}: {len(still.range_m)} beams see something in the empty "
+                "area: expected 10 or more"
+            )
+    scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
     measured = np.stack([scanner.pose for scanner in scanners])
     steps: dict[str, FloatArray] = {}
     shares, relative = _pairs(scans, measured, s)
@@ -146,25 +224,36 @@ def align_scanners(
     steps["realigned"] = _round(scans, steps["merged"], s)
     steps["together"] = _together(scans, steps["realigned"], s)
     steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
-    found, matched, rms, weak = [], [], [], []
-    for scanner, scan, start in zip(scanners, scans, steps["map as a whole"]):
-        pose, covariance, fit = _to_map(scanner.name, scan, start, building, s)
-        found.append(replace(scanner, pose=pose, covariance=covariance))
-        matched.append(fit.used)
-        rms.append(fit.rms_m)
-        if fit.open_directions:
-            weak.append(scanner.name)
-    steps["each to the map"] = np.stack([scanner.pose for scanner in found])
+    narrowing = (*(n for n in _NARROWING_M if n <= s.gate_m), _FLOOR_M)
+    fits = []
+    for scanner, still, start in zip(scanners, stills, steps["map as a whole"]):
+        try:
+            fits.append(
+                fit_to_walls(
+                    [still], np.zeros((1, 3)), building, start, s.gate_m, narrowing, _WEAK_M
+                )
+            )
+        except GeometryError as error:
+            raise GeometryError(f"scanner {scanner.name}: {error}") from None
+    steps["each to the map"] = np.stack([fit.pose for fit in fits])
     moved = steps["each to the map"] - steps["map as a whole"]
     far = np.hypot(moved[:, 0], moved[:, 1]) > _INCONSISTENT_M
-    names = tuple(scanner.name for scanner, is_far in zip(found, far) if is_far)
     return Alignment(
-        tuple(found), steps, shares, np.array(matched), np.array(rms), tuple(weak), names
+        scanners=tuple(
+            replace(scanner, pose=fit.pose, covariance=fit.covariance)
+            for scanner, fit in zip(scanners, fits)
+        ),
+        steps=steps,
+        pairs=shares,
+        matched=np.array([fit.used for fit in fits]),
+        rms_m=np.array([fit.rms_m for fit in fits]),
+        undetermined=tuple(one.name for one, fit in zip(scanners, fits) if fit.open_directions),
+        inconsistent=tuple(one.name for one, is_far in zip(scanners, far) if is_far),
     )
 
 
 def _pairs(
-    scans: list[StillScan], measured: FloatArray, s: AlignmentSettings
+    scans: list[Scan], measured: FloatArray, s: AlignmentSettings
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], FloatArray]]:
     """ICP of every pair, from the measured poses: shares explained, and poses j in i."""
     shares: dict[tuple[int, int], float] = {}
@@ -172,7 +261,7 @@ def _pairs(
     gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
     for i, j in combinations(range(len(scans)), 2):
         apart = between(measured[i], measured[j])
-        target, points = Scan(scans[i].points, scans[i].normals), scans[j].points
+        target, points = scans[i], scans[j].points
         best = (0.0, apart)
         for turn in np.radians(_TURNS_DEG):
             start = apart + np.array([0.0, 0.0, turn])
@@ -206,7 +295,7 @@ def _chained(
     return poses
 
 
-def _merge(scans: list[StillScan], poses: FloatArray, members: Iterable[int]) -> Scan:
+def _merge(scans: list[Scan], poses: FloatArray, members: Iterable[int]) -> Scan:
     """Several scans in one frame."""
     return Scan(
         np.concatenate([apply(poses[k], scans[k].points) for k in members]),
@@ -215,14 +304,14 @@ def _merge(scans: list[StillScan], poses: FloatArray, members: Iterable[int]) ->
 
 
 def _align_one(
-    scans: list[StillScan], poses: FloatArray, k: int, target: Scan, gates: FloatArray, kept: float
+    scans: list[Scan], poses: FloatArray, k: int, target: Scan, gates: FloatArray, kept: float
 ) -> FloatArray:
     pose = align_scans(scans[k].points, target, poses[k], gates, kept, 1e-7)
     return pose if np.isfinite(pose).all() else poses[k]
 
 
 def _merged(
-    scans: list[StillScan], poses: FloatArray, shares: dict[tuple[int, int], float],
+    scans: list[Scan], poses: FloatArray, shares: dict[tuple[int, int], float],
     s: AlignmentSettings,
 ) -> FloatArray:  # fmt: skip
     """One scan after the other, best overlapping first, aligned with those merged already."""
@@ -237,7 +326,7 @@ def _merged(
     return poses
 
 
-def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
+def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
     """Each scanner but the first aligned again with the merged scans of all others."""
     poses = poses.copy()
     gates = np.geomspace(0.15, 0.06, 4)
@@ -247,7 +336,7 @@ def _round(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> F
     return poses
 
 
-def _together(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
+def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
     """Rounds until no scanner moves."""
     for _ in range(_ROUNDS):
         before = poses
@@ -258,66 +347,36 @@ def _together(scans: list[StillScan], poses: FloatArray, s: AlignmentSettings) -
 
 
 def _whole_to_map(
-    scans: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    scans: list[Scan], poses: FloatArray, measured: FloatArray, building: FloatArray,
     s: AlignmentSettings,
 ) -> FloatArray:  # fmt: skip
     """All scanners as one rigid body on the map, from where they were measured."""
     if len(poses) > 1:
-        body = rigid_fit(poses[:, :2].copy(), measured[:, :2].copy(), np.ones(len(poses), bool))
+        body = fitted(poses[:, :2], measured[:, :2])
     else:
         body = compose(measured[0], invert(poses[0]))
     everything = _merge(scans, poses, range(len(scans))).points
+    from_map = invert(body)
     for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
-        body = icp_to_segments(everything, building, body, IcpSettings(gate, s.keep, 1e-5)).pose
-    return compose(np.broadcast_to(body, poses.shape), poses)
+        from_map, _, count = fit_outline(
+            everything, building, from_map, gate, s.keep, 1e-5, _MOST_STEPS
+        )
+        if count < 3:
+            raise GeometryError(f"{count} readings near the map: expected 3 or more")
+    return compose(np.broadcast_to(invert(from_map), poses.shape), poses)
 
 
 def icp_by_step(
-    scan: StillScan, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
+    points: FloatArray, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
 ) -> FloatArray:
     """(steps + 1,) root mean square distances (m) from the map of the readings that count.
 
-    Those of an ICP of a scanner's readings to the map, from a start (3,), after each of its steps.
+    Those of an ICP of a scanner's points (n, 2) to the map, from a start (3,), after each of its
+    steps.
     """
     return np.array(
         [
-            fit_outline(scan.points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
+            fit_outline(points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
             for k in range(steps + 1)
         ]
     )
-
-
-def _to_map(
-    name: str, scan: StillScan, start: FloatArray, building: FloatArray, s: AlignmentSettings
-) -> tuple[FloatArray, FloatArray, OutlinePose]:
-    """Pose of one scanner on the map, its covariance, and the fit.
-
-    The kernel moves faces to points: here the map to the scanner's frame. Walls are seen from both
-    sides. Readings of objects in front of a wall are far from the wall that the beam would hit, and
-    are excluded as the gate narrows.
-    """
-    faces = np.vstack([building, building[:, [2, 3, 0, 1]]])
-    lone = np.zeros(len(scan.points), dtype=np.int64)
-    seen = Seen(scan.points, lone, scan.direction, scan.range_m)
-    pose, floor = invert(start), _FLOOR_M
-    for narrow in (*(n for n in _NARROWING_M if n <= s.gate_m), _FLOOR_M, 0.0):
-        # Last, the residuals themselves say how large the errors are.
-        floor = narrow if narrow > 0.0 else floor
-        fit = OutlineFit(floor, 0.25, 3.0, s.gate_m, 0.5, _WEAK_M, 1.0, _LONE_STEPS)
-        found = refine_outline(seen, faces, pose, np.zeros((1, 2)), np.array([scan.sigma_m]), fit)
-        pose = found.pose
-        if found.used < 10:
-            raise GeometryError(
-                f"scanner {name}: {found.used} readings lie on the map: expected 10 or more"
-            )
-        if narrow == _FLOOR_M:
-            ratio = found.chi2 / (found.used - 3.0)
-            floor = max(_FLOOR_M * math.sqrt(max(ratio, 1.0)), _FLOOR_M)
-    ratio = max(found.chi2 / (found.used - 3.0), 0.1)
-    world = invert(pose)
-    # The inverse's covariance: x' = -R' t and theta' = -theta.
-    c, sn = math.cos(world[2]), math.sin(world[2])
-    jacobian = np.array([[-c, sn, world[1]], [-sn, -c, -world[0]], [0.0, 0.0, -1.0]])
-    covariance = ratio * jacobian @ found.covariance @ jacobian.T
-    world[2] = wrap_angle(world[2])
-    return world, 0.5 * (covariance + covariance.T), found

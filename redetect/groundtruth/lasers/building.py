@@ -18,7 +18,7 @@ from ezdxf.filemanagement import readfile
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.trajectories.streams import read_rows_of_numbers
+from redetect.groundtruth.files import read_table
 from redetect.storage.bounded import read_bounded
 from redetect.storage.messages import one_line
 
@@ -65,7 +65,9 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
     if Path(path).suffix.lower() == ".dxf":
         segments = _read_drawing(path)
     else:
-        segments = read_rows_of_numbers(path, 4, "walls as x1, y1, x2, y2", head=HEAD)
+        segments = np.array([row.numbers for row in read_table(path, HEAD)])
+    if not len(segments):
+        raise GroundTruthError(f"{path}: no lines or curves: expected walls")
     if len(segments) > MOST_SEGMENTS:
         raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
     # NaN fails this comparison too.
@@ -96,8 +98,6 @@ def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
     except Exception as error:  # a damaged drawing may fail anywhere within the library
         text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
         raise GroundTruthError(f"{path}: is no DXF that can be read: {text}") from None
-    if not pieces:
-        raise GroundTruthError(f"{path}: no lines or curves: expected walls")
     return unit_m * np.array(pieces, dtype=np.float64)
 
 

@@ -15,109 +15,18 @@ A. Censi, "An ICP variant using a point-to-line metric", ICRA 2008.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
-from scipy.special import ndtri
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.plane import apply, invert
-from redetect.storage.bounds import Positive, ShareAbove0, demand_fields
+from redetect.compiled import kernel
+from redetect.plane import apply
 
-_MOST_STEPS = 500
 # How often the last gate of a match of scans is repeated at most, and its damping: a millimetre's
 # worth, so that a direction without evidence stays where it is.
 _REPEATED, _DAMPING = 10, 1e-3
-
-
-@dataclass(frozen=True)
-class IcpSettings:
-    """Settings of an ICP."""
-
-    gate_m: Positive = 0.2  # Pairs farther apart than this do not count (m)
-    kept: ShareAbove0 = 0.95  # Share of the pairs within the gate that counts: the best
-    # The ICP ends when the root mean square error changes by less than this (m)
-    threshold_m: Positive = 1e-7
-    # A direction is undetermined if the pose's standard deviation along it is larger than this (m;
-    # a rotation counts by what it does to the points, root mean square).
-    weak_sigma_m: Positive = 0.05
-
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
-
-
-@dataclass(frozen=True, eq=False)
-class IcpResult:
-    """Where an ICP ended."""
-
-    pose: FloatArray  # (3,): x, y (m), theta (rad): takes the points to the target's frame
-    # (3, 3): of the pose, from the residuals' size and the geometry; infinite on the diagonal where
-    # the geometry determines nothing at all.
-    covariance: FloatArray
-    rms_m: float  # Root mean square distance of the pairs that count
-    used: BoolArray  # (n,): which points count
-    # (k, 3): directions of (x, y, theta) that the geometry leaves open, of unit length with theta
-    # measured by what it does to the points; k is 0 for a good pose.
-    undetermined: FloatArray
-
-
-def icp_to_segments(
-    points: ArrayLike,
-    segments: ArrayLike,
-    start: ArrayLike = (0.0, 0.0, 0.0),
-    settings: IcpSettings | None = None,
-) -> IcpResult:
-    """Align points with line segments: an outline, a building map.
-
-    `points` (n, 2): to be moved (m). `segments` (k, 4): x1, y1, x2, y2 (m). `start` (3,): pose to
-    start from.
-    """
-    s = IcpSettings() if settings is None else settings
-    lines = np.ascontiguousarray(segments, dtype=np.float64)
-    cloud = np.ascontiguousarray(points, dtype=np.float64)
-    found, rms, count = fit_outline(
-        cloud, lines, invert(start), s.gate_m, s.kept, s.threshold_m, _MOST_STEPS
-    )
-    if count < 3:
-        raise GeometryError(
-            f"{count} of {len(cloud)} points within {s.gate_m:g} m of the target: "
-            "expected 3 or more"
-        )
-    pose = invert(found)
-    world = moved(cloud, pose)
-    target, index, squared = nearest_on_segments(world, lines)
-    used = best_share(squared, s.gate_m, s.kept)
-    along = lines[:, 2:] - lines[:, :2]
-    length = np.hypot(along[:, 0], along[:, 1])
-    normals = (
-        np.stack([-along[:, 1], along[:, 0]], -1) / np.where(length > 0.0, length, 1.0)[:, None]
-    )
-    covariance, undetermined = pose_uncertainty(
-        pose, world[used], target[used], normals[index[used]], s.kept, s.weak_sigma_m
-    )
-    return IcpResult(pose, covariance, rms, used, undetermined)
-
-
-def trimmed_variance(kept: float) -> tuple[float, float]:
-    """Factors of variances due to keeping only the best share of Gaussian residuals.
-
-    With the cut c at +-c sigma and phi the normal density, both follow from
-    v = kept - 2 c phi(c), the part of the variance within the cut, which is also the derivative of
-    the estimating equation: shrinkage v / kept, variance v / v^2 per residual, kept or not.
-
-    Returns `shrinkage`: variance of the residuals kept, relative to all. `inflation`: variance of a
-    mean of those kept by their own distance from it, relative to the mean of as many residuals as
-    were kept.
-    """
-    if kept >= 1.0:
-        return 1.0, 1.0
-    cut = float(ndtri(0.5 * (1.0 + kept)))
-    inside = kept - 2.0 * cut * math.exp(-0.5 * cut * cut) / math.sqrt(2.0 * math.pi)
-    return inside / kept, kept / inside
 
 
 def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
@@ -128,41 +37,6 @@ def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
         last = math.ceil(kept * count) - 1
         within &= squared <= np.partition(squared[within], last)[last]
     return within
-
-
-def pose_uncertainty(
-    pose: FloatArray,
-    world: FloatArray,
-    target: FloatArray,
-    normals: FloatArray,
-    kept: float,
-    weak_sigma_m: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Covariance (3, 3) of a converged pose, and the directions (k, 3) that are open.
-
-    From points in the world and those they are paired with, with normals of these (zeros where a
-    point is on no line); of the pairs the best share was kept.
-    """
-    lever = world - pose[:2]
-    rows = np.column_stack([normals, normals[:, 1] * lever[:, 0] - normals[:, 0] * lever[:, 1]])
-    residual = np.sum(normals * (world - target), axis=1)
-    freedom = max(int(np.any(normals != 0.0, axis=1).sum()) - 3, 1)
-    shrinkage, inflation = trimmed_variance(kept)
-    variance = float(residual @ residual) / freedom / shrinkage
-    # Exactly fitting points do not make a pose exact to less than rounding.
-    information = rows.T @ rows / max(variance * inflation, 1e-18)
-    # About the middle of the points, where rotation and translation are least correlated; a
-    # rotation counts by what it does to the points.
-    middle = lever.mean(axis=0)
-    scale_m = max(math.sqrt(float(np.mean(np.sum((lever - middle) ** 2, axis=1)))), 1e-9)
-    shift = np.array([[1.0, 0.0, middle[1]], [0.0, 1.0, -middle[0]], [0.0, 0.0, 1.0]])
-    shift[:, 2] /= scale_m
-    values, vectors = np.linalg.eigh(shift.T @ information @ shift)
-    undetermined = np.asarray(vectors[:, values < 1.0 / weak_sigma_m**2].T)
-    values, vectors = np.linalg.eigh(information)
-    if values[0] <= 1e-12 * values[2]:
-        return np.diag(np.full(3, np.inf)), undetermined
-    return np.asarray((vectors / values) @ vectors.T), undetermined
 
 
 class Scan:
@@ -258,7 +132,7 @@ def explained(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float
     return float(np.mean(np.exp(-0.5 * np.concatenate([there, back**2]) / sigma_m**2)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def nearest_on_segments(
     points: FloatArray, segments: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -288,7 +162,7 @@ def nearest_on_segments(
     return nearest, index, squared
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatArray:
     """Pose (3,) with the least sum of squared distances between the used pairs of points.
 
@@ -322,7 +196,7 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
     return pose
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points taken by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -333,7 +207,7 @@ def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def fit_outline(
     points: FloatArray,
     faces: FloatArray,

@@ -59,8 +59,7 @@ class Scanner:
     pose: FloatArray
     # (3, 3): of the pose, (x, y, theta) in the same frame; zeros where it is known exactly.
     covariance: FloatArray
-    # `first_angle_rad`, `angle_step_rad`: Beam i points to first_angle + i step in the scanner's
-    # frame; the step is above 0.
+    # Beam i points to first_angle + i step in the scanner's frame.
     first_angle_rad: Annotated[float, FINITE]
     angle_step_rad: Positive
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
@@ -105,8 +104,7 @@ class Robot:
 
     # (K, 2): corners of the closed polygon that the scanners see, in the robot's frame (m)
     outline: FloatArray
-    # `largest_speed_m_s`, `largest_turn_rad_s`: It moves no faster
-    largest_speed_m_s: float
+    largest_speed_m_s: float  # It moves no faster
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 

@@ -14,17 +14,18 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import (
-    Body,
-    acquire,
-    explain,
-    refine,
-    robot_body,
-)
+from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from redetect.groundtruth.lasers.sets import ScannerTables, ScanSets
-from redetect.groundtruth.lasers.tracking_kernels import BeamCounts, OutlinePose, Seen, new_points
+from redetect.groundtruth.lasers.tracking_kernels import (
+    BeamCounts,
+    Body,
+    FixedScanners,
+    OutlinePose,
+    Seen,
+    explain_set,
+    new_points,
+)
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
@@ -100,18 +101,17 @@ class Tracker:
     def __init__(
         self,
         sets: ScanSets,
-        tables: ScannerTables,
+        fixed: FixedScanners,
         body: Body,
         largest_speed_m_s: float,
         settings: LaserSettings,
     ) -> None:
-        self.sets, self.tables, self.body = sets, tables, body
+        self.sets, self.fixed, self.body = sets, fixed, body
         self.speed, self.settings = largest_speed_m_s, settings
-        self.seen_by = tables.as_beams()
-        self.track = LaserTrack.empty(sets.times_s, len(tables.names))
+        self.track = LaserTrack.empty(sets.times_s, len(fixed.origins))
         self.prior_m = np.full(len(sets), 0.02)
-        self.information = np.zeros((len(tables.names), 3, 3))
-        self.gradient = np.zeros((len(tables.names), 3))
+        self.information = np.zeros((len(fixed.origins), 3, 3))
+        self.gradient = np.zeros((len(fixed.origins), 3))
 
     def run(self) -> LaserTrack:
         """Track, resolve the front, and work the poses out again with their motion known."""
@@ -127,7 +127,7 @@ class Tracker:
                 if t - looked < self.settings.acquire_s:
                     continue
                 looked = t
-                found = acquire(self.sets, i, self.tables, self.body, self.settings)
+                found = acquire(self.sets[i], self.fixed, self.body, self.settings)
                 if found is None:
                     continue
                 fitted = self._fit(i, found, np.zeros(3), 0.0)
@@ -185,7 +185,7 @@ class Tracker:
         if far > 0.1 + 2.0 * self.speed * alone_s:
             self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
             return None
-        beams = explain(self.sets, i, self.tables, self.body, pose)
+        beams = explain_set(self.sets[i], self.fixed, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
             self.track.reasons[i] = (
                 f"{beams.through} beams see through the robot, {beams.agree} see it"
@@ -206,15 +206,11 @@ class Tracker:
         centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
         about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
-        return new_points(
-            self.sets.ranges_mm, self.sets.rows[i], self.seen_by, centre, reach, about,
-            self.sets.ages_s[i],
-        )  # fmt: skip
+        return new_points(self.sets[i], self.fixed, centre, reach, about)
 
     def _refine(self, i: int, seen: Seen, start: FloatArray) -> OutlinePose:
-        tables = self.tables
-        found = refine(seen, start, tables, self.body, self.settings, float(self.prior_m[i]))
-        calibration = found.by_scanner @ tables.covariance @ found.by_scanner.T
+        found = refine(seen, start, self.fixed, self.body, self.settings, float(self.prior_m[i]))
+        calibration = found.by_scanner @ self.fixed.covariance @ found.by_scanner.T
         self.track.noise[i] = found.covariance
         self.track.covariances[i] = found.covariance + calibration
         self.track.weak[i] = found.weak
@@ -254,7 +250,7 @@ class Tracker:
             self.track.reasons[i] = f"{found.used} readings on the outline"
             self.track.status[i], self.track.poses[i] = COASTING, np.nan
             return
-        self._store(i, found, explain(self.sets, i, self.tables, self.body, found.pose))
+        self._store(i, found, explain_set(self.sets[i], self.fixed, self.body, found.pose))
         # Keeps what the whole visit, or its first set, has determined.
         if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
             self.track.status[i] = status
@@ -297,8 +293,10 @@ class Tracker:
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
         start, _ = self._aligned(seen, start)
-        found = refine(seen, start, self.tables, body, s, 0.02)
-        _, _, through, hidden, _, beside = explain(self.sets, i, self.tables, self.body, found.pose)
+        found = refine(seen, start, self.fixed, body, s, 0.02)
+        _, _, through, hidden, _, beside = explain_set(
+            self.sets[i], self.fixed, self.body, found.pose
+        )
         return float(found.chi2 + s.gate_sigma**2 * (through + hidden + beside))
 
     def _ahead(
@@ -366,17 +364,17 @@ _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 
 
 def track_robot(
-    sets: ScanSets, tables: ScannerTables, robot: Robot, settings: LaserSettings | None = None
+    sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings | None = None
 ) -> LaserTrack:
     """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`)."""
     settings = LaserSettings() if settings is None else settings
     body = robot_body(robot.outline, settings.symmetry_m)
-    return Tracker(sets, tables, body, robot.largest_speed_m_s, settings).run()
+    return Tracker(sets, fixed, body, robot.largest_speed_m_s, settings).run()
 
 
 def track_without_suspects(
     sets: ScanSets,
-    tables: ScannerTables,
+    fixed: FixedScanners,
     robot: Robot,
     scanners: tuple[Scanner, ...],
     settings: LaserSettings | None = None,
@@ -391,7 +389,7 @@ def track_without_suspects(
         By scanner, the shift that its readings suggest and its standard deviations.
     """
     left_out: dict[str, FloatArray] = {}
-    track = track_robot(sets, tables, robot, settings)
+    track = track_robot(sets, fixed, robot, settings)
     while len(scanners) - len(left_out) >= 3:
         excess = excess_shifts(track, scanners)
         worst = int(np.argmax(excess))
@@ -403,7 +401,7 @@ def track_without_suspects(
         rows = sets.rows.copy()
         rows[:, worst] = -1
         sets = replace(sets, rows=rows)
-        track = track_robot(sets, tables, robot, settings)
+        track = track_robot(sets, fixed, robot, settings)
     return track, left_out
 
 

@@ -11,19 +11,41 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.compiled import kernel
+
+#: A reading within this of where a beam should meet the robot agrees (m).
+AGREES_M = 0.05
 
 
-class Beams(NamedTuple):
-    """The beams of all scanners."""
+class ScanSet(NamedTuple):
+    """Scans that belong together, one of each scanner."""
 
-    # (scanners, readings): below this a reading is new: nearer than the background
+    ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all sets
+    rows: IntArray  # (scanners,): each scanner's scan of this set; -1 where it has none
+    ages_s: FloatArray  # (scanners,): the set's time minus the scan's
+
+
+class FixedScanners(NamedTuple):
+    """Scanners as arrays, padded to the longest scan."""
+
+    # (scanners, readings): below this a reading is new: nearer than the background; 0 for padding
     near_mm: FloatArray
-    direction: FloatArray  # (scanners, readings, 2): in the world
+    direction: FloatArray  # (scanners, readings, 2): of the beams in the world
     origins: FloatArray  # (scanners, 2): in the world (m)
+    sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
+    covariance: FloatArray  # (3 scanners, 3 scanners): of the scanners' poses, jointly
+
+
+class Body(NamedTuple):
+    """The robot as the scanners see it."""
+
+    faces: FloatArray  # (k, 4): counter-clockwise
+    middle: FloatArray  # (2,): of its bounding box, in its frame
+    radius_m: float  # Of its farthest corner from there
+    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
 
 
 class Seen(NamedTuple):
@@ -75,34 +97,25 @@ class OutlineFit(NamedTuple):
 
     floor_m: float  # Standard deviation of what the outline and the scanner are not
     least_slope: float  # Beams that graze a face count as if they met it at this sine
-    # `gate_sigma`, `gate_m`: Readings farther off do not count; metres in the first step.
-    gate_sigma: float
-    gate_m: float
+    gate_sigma: float  # Readings farther off do not count
+    gate_m: float  # Instead of this in the first step
     prior_sigma_m: float  # With it, open directions hold on to the start
     weak_sigma_m: float  # Directions along which the standard deviation would be larger are open
     scale_m: float  # A radian counts as this
     steps: int  # At most
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def new_points(
-    ranges_mm: NDArray[np.uint16],
-    rows: IntArray,
-    beams: Beams,
-    centre: FloatArray,
-    reach_m: float,
-    motion: FloatArray,
-    ages_s: FloatArray,
+    scans: ScanSet, fixed: FixedScanners, centre: FloatArray, reach_m: float, motion: FloatArray
 ) -> Seen:
     """Points of a set that are nearer than the background and within reach of a place.
 
-    `ranges_mm` (scans, readings). `rows` (scanners,): each scanner's scan of the set. `centre`
-    (2,): points farther than `reach_m` from here are left out. `motion` (5,): of the robot:
-    velocity (m/s), turn (rad/s), and the point it turns about at the set's time. `ages_s`
-    (scanners,): the set's time minus the scan's: the points are moved on by as much. Returns
-    `points` (n, 2): in the world (m). `scanner` (n,). `direction` (n, 2): of the beams that saw
-    them. `range_m` (n,): their readings.
+    `centre` (2,): points farther than `reach_m` from here are left out. `motion` (5,): of the
+    robot: velocity (m/s), turn (rad/s), and the point it turns about at the set's time. By it the
+    points are moved on from their scan's time to the set's.
     """
+    ranges_mm, rows, ages_s = scans
     most = rows.size * ranges_mm.shape[1]
     points = np.empty((most, 2))
     scanner = np.empty(most, dtype=np.int64)
@@ -118,17 +131,17 @@ def new_points(
         then_x, then_y = motion[3] - motion[0] * age, motion[4] - motion[1] * age
         for i in range(ranges_mm.shape[1]):
             r = float(ranges_mm[rows[s], i])
-            if r <= 0.0 or r >= beams.near_mm[s, i]:
+            if r <= 0.0 or r >= fixed.near_mm[s, i]:
                 continue
-            x = beams.origins[s, 0] + 1e-3 * r * beams.direction[s, i, 0]
-            y = beams.origins[s, 1] + 1e-3 * r * beams.direction[s, i, 1]
+            x = fixed.origins[s, 0] + 1e-3 * r * fixed.direction[s, i, 0]
+            y = fixed.origins[s, 1] + 1e-3 * r * fixed.direction[s, i, 1]
             dx, dy = x - centre[0], y - centre[1]
             if dx * dx + dy * dy > reach_m * reach_m:
                 continue
             dx, dy = x - then_x, y - then_y
             points[n, 0] = motion[3] + c * dx - sn * dy
             points[n, 1] = motion[4] + sn * dx + c * dy
-            bx, by = beams.direction[s, i, 0], beams.direction[s, i, 1]
+            bx, by = fixed.direction[s, i, 0], fixed.direction[s, i, 1]
             direction[n, 0], direction[n, 1] = c * bx - sn * by, sn * bx + c * by
             scanner[n] = s
             range_m[n] = 1e-3 * r
@@ -136,7 +149,7 @@ def new_points(
     return Seen(points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy())
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _face_of(
     x: float,
     y: float,
@@ -177,7 +190,7 @@ def _face_of(
     return face
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _hold_open(
     h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
 ) -> tuple[int, FloatArray]:
@@ -207,7 +220,7 @@ def _hold_open(
     return open_count, vectors[:, 0].copy()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def refine_outline(
     seen: Seen,
     faces: FloatArray,
@@ -309,18 +322,11 @@ def refine_outline(
     )
 
 
-@njit(cache=True, error_model="numpy")
-def explain_set(
-    ranges_mm: NDArray[np.uint16],
-    rows: IntArray,
-    beams: Beams,
-    faces: FloatArray,
-    middle: FloatArray,
-    radius_m: float,
-    pose: FloatArray,
-    tolerance_m: float,
-) -> BeamCounts:
+@kernel()
+def explain_set(scans: ScanSet, fixed: FixedScanners, body: Body, pose: FloatArray) -> BeamCounts:
     """How a pose explains the beams of a set, by casting each of them at the outline."""
+    ranges_mm, rows, _ = scans
+    faces, middle, radius_m = body.faces, body.middle, body.radius_m
     expected = agree = through = hidden = none = beside = 0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     centre_x = pose[0] + c * middle[0] - s * middle[1]
@@ -328,12 +334,12 @@ def explain_set(
     for q in range(rows.size):
         if rows[q] < 0:
             continue
-        to_x, to_y = centre_x - beams.origins[q, 0], centre_y - beams.origins[q, 1]
-        ox = -c * (pose[0] - beams.origins[q, 0]) - s * (pose[1] - beams.origins[q, 1])
-        oy = s * (pose[0] - beams.origins[q, 0]) - c * (pose[1] - beams.origins[q, 1])
+        to_x, to_y = centre_x - fixed.origins[q, 0], centre_y - fixed.origins[q, 1]
+        ox = -c * (pose[0] - fixed.origins[q, 0]) - s * (pose[1] - fixed.origins[q, 1])
+        oy = s * (pose[0] - fixed.origins[q, 0]) - c * (pose[1] - fixed.origins[q, 1])
         for i in range(ranges_mm.shape[1]):
-            bx, by = beams.direction[q, i, 0], beams.direction[q, i, 1]
-            if beams.near_mm[q, i] <= 0.0:
+            bx, by = fixed.direction[q, i, 0], fixed.direction[q, i, 1]
+            if fixed.near_mm[q, i] <= 0.0:
                 continue
             off = to_x * by - to_y * bx
             ahead = to_x * bx + to_y * by
@@ -352,16 +358,16 @@ def explain_set(
                 if r > 0.0 and 0.0 <= t <= 1.0 and r < best:
                     best = r
             reading = 1e-3 * ranges_mm[rows[q], i]
-            if best < 1e-3 * beams.near_mm[q, i]:
+            if best < 1e-3 * fixed.near_mm[q, i]:
                 expected += 1
                 if reading <= 0.0:
                     none += 1
-                elif reading > best + tolerance_m:
+                elif reading > best + AGREES_M:
                     through += 1
-                elif reading < best - tolerance_m:
+                elif reading < best - AGREES_M:
                     hidden += 1
                 else:
                     agree += 1
-            elif 0.0 < reading < 1e-3 * beams.near_mm[q, i] and abs(reading - ahead) < radius_m:
+            elif 0.0 < reading < 1e-3 * fixed.near_mm[q, i] and abs(reading - ahead) < radius_m:
                 beside += 1
     return BeamCounts(expected, agree, through, hidden, none, beside)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,8 +52,7 @@ UNDETERMINED = "the points do not determine all poses"
 class ChainPoints:
     """Points seen in images."""
 
-    # `camera`, `body`, `part`: (N,): which camera, body and part each point belongs to
-    camera: IntArray
+    camera: IntArray  # (N,): which camera, body and part each point belongs to
     body: IntArray
     part: IntArray
     points: FloatArray  # (N, 3): in the part's frame (m)
@@ -74,8 +73,7 @@ class ChainProjection:
 
     # (N, 2): naN where a point is not in front of its camera or past the distortion's fold
     pixels: FloatArray
-    # `by_camera`, `by_body`, `by_part`: (N, 2, 6): d(u, v) / d(translation m, rotation rad)
-    by_camera: FloatArray
+    by_camera: FloatArray  # (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_body: FloatArray
     by_part: FloatArray
 
@@ -135,8 +133,6 @@ def _by_tangent(by_point: FloatArray, points: FloatArray) -> FloatArray:
     return np.concatenate([by_point, -(by_point @ hat(points))], axis=-1)
 
 
-PoseKind = Literal["camera", "body", "part"]
-
 # Of the first pass, which only has to come near: points farther off than this pull less.
 _PLAIN, _ROBUST, _NEAR = Loss(), Loss("huber", 3.0), 1e-6
 _TOLERANCE = 1e-15
@@ -146,8 +142,7 @@ _TOLERANCE = 1e-15
 class PosePrior:
     """Prior of a pose: its value, and the covariance of right perturbations."""
 
-    kind: PoseKind
-    index: int
+    index: int  # Of the bundle's poses
     pose: FloatArray
     covariance: FloatArray
 
@@ -156,22 +151,34 @@ class PosePrior:
 class Bundle:
     """Points in images, the poses that they depend on, and which of those are free."""
 
-    cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray  # (C, 4, 4)
-    world_from_body: FloatArray  # (B, 4, 4)
-    body_from_part: FloatArray  # (P, 4, 4)
-    # `free_camera`, `free_body`, `free_part`: (C | B | P,)
-    free_camera: BoolArray
-    free_body: BoolArray
-    free_part: BoolArray
+    cameras: tuple[Camera, ...]  # C lenses
+    parts: int  # P, the number of parts
+    # (C + P + B, 4, 4): `world_from_camera`, then `body_from_part`, then `world_from_body`
+    poses: FloatArray
+    free: BoolArray  # (C + P + B,)
     seen: ChainPoints
     view: IntArray  # (N,): which part in which image each point is of: 0 to V - 1
     priors: tuple[PosePrior, ...] = ()  # Of free poses
 
     @property
-    def free(self) -> BoolArray:
-        """(C + P + B,) which poses are free: cameras, then parts, then bodies."""
-        return np.concatenate([self.free_camera, self.free_part, self.free_body])
+    def shared(self) -> int:
+        """C + P: how many poses come before those of the bodies."""
+        return len(self.cameras) + self.parts
+
+    @property
+    def world_from_camera(self) -> FloatArray:
+        """(C, 4, 4)."""
+        return self.poses[: len(self.cameras)]
+
+    @property
+    def body_from_part(self) -> FloatArray:
+        """(P, 4, 4)."""
+        return self.poses[len(self.cameras) : self.shared]
+
+    @property
+    def world_from_body(self) -> FloatArray:
+        """(B, 4, 4)."""
+        return self.poses[self.shared :]
 
     @property
     def unknowns(self) -> int:
@@ -183,16 +190,10 @@ class Bundle:
         return replace(self, seen=self.seen.only(chosen), view=self.view[chosen])
 
     def moved(self, step: FloatArray) -> Bundle:
-        """With free poses moved by right perturbations, in the order of `free`."""
+        """With free poses moved by right perturbations."""
         steps = np.zeros((len(self.free), 6))
         steps[self.free] = step.reshape(-1, 6)
-        cameras, parts = len(self.free_camera), len(self.free_part)
-        return replace(
-            self,
-            world_from_camera=self.world_from_camera @ exp_se3(steps[:cameras]),
-            body_from_part=self.body_from_part @ exp_se3(steps[cameras : cameras + parts]),
-            world_from_body=self.world_from_body @ exp_se3(steps[cameras + parts :]),
-        )
+        return replace(self, poses=self.poses @ exp_se3(steps))
 
     def pixels(self) -> FloatArray:
         """(N, 2) pixels at which the points are expected; NaN where they cannot be seen."""
@@ -206,12 +207,7 @@ class Bundle:
 
     def prior_error(self, prior: PosePrior) -> FloatArray:
         """(6,) right perturbation that leads from the prior's pose to the bundle's."""
-        poses = {
-            "camera": self.world_from_camera,
-            "body": self.world_from_body,
-            "part": self.body_from_part,
-        }
-        return log_se3(inverse(prior.pose) @ poses[prior.kind][prior.index])
+        return log_se3(inverse(prior.pose) @ self.poses[prior.index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +219,21 @@ class AdjustedBundle:
     residuals: FloatArray  # (N, 2): pixels seen minus pixels expected, of all points
     cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
-    camera_covariance: FloatArray  # (6 C, 6 C)
-    # (6 P, 6 P): of right perturbations, all other poses marginalised; zeros for fixed ones. They
-    # are those of the corners' covariances, not scaled by the residuals.
-    part_covariance: FloatArray
+    # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, the bodies marginalised;
+    # zeros for fixed ones. That of the corners' covariances, not scaled by the residuals.
+    covariance: FloatArray
+
+    @property
+    def camera_covariance(self) -> FloatArray:
+        """(6 C, 6 C)."""
+        cameras = 6 * len(self.bundle.cameras)
+        return self.covariance[:cameras, :cameras]
+
+    @property
+    def part_covariance(self) -> FloatArray:
+        """(6 P, 6 P)."""
+        cameras = 6 * len(self.bundle.cameras)
+        return self.covariance[cameras:, cameras:]
 
     @property
     def reduced_cost(self) -> float:
@@ -262,8 +269,11 @@ def adjust_bundle(
             break
         used = kept
         # A body of which nothing is left to be used stays where it is.
-        seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body[used])
-        bundle = replace(bundle, free_body=bundle.free_body & seen)
+        free = bundle.free.copy()
+        free[bundle.shared :] &= np.isin(
+            np.arange(len(bundle.world_from_body)), bundle.seen.body[used]
+        )
+        bundle = replace(bundle, free=free)
         bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)
     return _result(bundle, used)
 
@@ -281,22 +291,20 @@ def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
         bundle.body_from_part,
         seen,
     )
-    cameras, parts = len(bundle.free_camera), len(bundle.free_part)
-    begin = {"camera": 0, "part": cameras, "body": cameras + parts}
     unknown = np.where(free, 6 * (np.cumsum(free) - 1), -1)
     white = whitening(seen.covariances)
     derivatives = [
         (unknown[seen.camera], -white @ projection.by_camera),
-        (unknown[begin["part"] + seen.part], -white @ projection.by_part),
-        (unknown[begin["body"] + seen.body], -white @ projection.by_body),
+        (unknown[len(bundle.cameras) + seen.part], -white @ projection.by_part),
+        (unknown[bundle.shared + seen.body], -white @ projection.by_body),
     ]
     residuals = (white @ (seen.pixels - projection.pixels)[..., None])[..., 0]
     blocks = [Block(residuals, derivatives, loss=loss)]
     for prior in bundle.priors:
         error, root = bundle.prior_error(prior), whitening(prior.covariance)
         by_pose = root @ np.linalg.inv(right_jacobian(error))
-        pose = begin[prior.kind] + prior.index
-        blocks.append(Block((root @ error)[None], [(unknown[pose : pose + 1], by_pose[None])]))
+        at = unknown[prior.index : prior.index + 1]
+        blocks.append(Block((root @ error)[None], [(at, by_pose[None])]))
     return stack(blocks, bundle.unknowns, 0)
 
 
@@ -350,19 +358,16 @@ def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
 
 def _result(bundle: Bundle, used: BoolArray) -> AdjustedBundle:
     problem = linearised(bundle.only(used))
-    shared = len(bundle.free_camera) + len(bundle.free_part)
-    at = np.flatnonzero(np.repeat(bundle.free[:shared], 6))
-    covariance = np.zeros((6 * shared, 6 * shared))
+    at = np.flatnonzero(np.repeat(bundle.free[: bundle.shared], 6))
+    covariance = np.zeros((6 * bundle.shared, 6 * bundle.shared))
     covariance[np.ix_(at, at)] = inverted_information(_shared_information(problem, len(at)))
-    cameras = 6 * len(bundle.free_camera)
     return AdjustedBundle(
         bundle,
         used,
         bundle.seen.pixels - bundle.pixels(),
         float(problem.residual @ problem.residual),
         len(problem.residual) - bundle.unknowns,
-        covariance[:cameras, :cameras],
-        covariance[cameras:, cameras:],
+        covariance,
     )
 
 

@@ -33,7 +33,7 @@ from camera.errors import CalibrationError
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject
-from redetect.groundtruth.markers.calibration import parse_pose
+from redetect.groundtruth.markers.session import parse_pose
 from redetect.storage.bounded import path_inside
 from redetect.storage.messages import excerpt
 

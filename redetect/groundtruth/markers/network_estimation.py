@@ -23,6 +23,7 @@ from redetect.groundtruth.markers.adjustment import (
     adjust_bundle,
 )
 from redetect.groundtruth.markers.boards import BoardView, DoubleBoard
+from redetect.groundtruth.markers.pairs import chained_poses, spanning_tree
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
@@ -151,44 +152,37 @@ def _chained(
     seen: _Seen,
     world_from_board: Mapping[str, FloatArray],
     parts: Mapping[str, FloatArray],
-) -> tuple[dict[str, FloatArray], dict[int, FloatArray]]:
-    """Cameras, and the double board of each shot, in the world; from camera to camera."""
-    bodies: dict[int, FloatArray] = {}
-    fixed: dict[str, list[FloatArray]] = {}
-    for shot in seen:
+) -> tuple[FloatArray, dict[int, FloatArray]]:
+    """Cameras (C, 4, 4), and the double board of each shot, in the world; from camera to camera."""
+    # Estimates of one frame in another: the world is number 0, the cameras follow.
+    estimates: dict[tuple[int, int], list[FloatArray]] = {}
+    held: dict[int, list[tuple[int, FloatArray]]] = {}  # of each shot: `camera_from_body`
+    for number, shot in enumerate(seen):
         for view, pose in shot:
+            camera = 1 + names.index(view.camera)
             if view.board in world_from_board:
-                fixed.setdefault(view.camera, []).append(
-                    world_from_board[view.board] @ inverse(pose)
-                )
-    cameras = {name: _most_central(poses) for name, poses in fixed.items()}
-    while True:
-        reached: dict[str, list[FloatArray]] = {}
-        for number, shot in enumerate(seen):
-            moving = [(v, pose) for v, pose in shot if v.board not in world_from_board]
-            known = [(v, pose) for v, pose in moving if v.camera in cameras]
-            if not known:
-                continue
-            view, pose = known[0]
-            body = cameras[view.camera] @ pose @ inverse(parts[view.board])
-            bodies[number] = body
-            for other, other_pose in moving:
-                if other.camera not in cameras:
-                    reached.setdefault(other.camera, []).append(
-                        body @ parts[other.board] @ inverse(other_pose)
-                    )
-        if not reached:
-            break
-        # The best supported first: chains stay short and sure.
-        name = max(sorted(reached), key=lambda camera: len(reached[camera]))
-        cameras[name] = _most_central(reached[name])
-    missing = [name for name in names if name not in cameras]
-    if missing:
+                world_from_camera = world_from_board[view.board] @ inverse(pose)
+                estimates.setdefault((0, camera), []).append(world_from_camera)
+            else:
+                here = held.setdefault(number, [])
+                here.append((camera, pose @ inverse(parts[view.board])))
+                for other, other_from_body in here[:-1]:
+                    pair = ((camera, here[-1][1]), (other, other_from_body))
+                    (a, a_from_body), (b, b_from_body) = sorted(pair, key=lambda one: one[0])
+                    if a != b:
+                        estimates.setdefault((a, b), []).append(a_from_body @ inverse(b_from_body))
+    support = {pair: len(poses) for pair, poses in estimates.items()}
+    parents = spanning_tree(support, 1 + len(names), 0)
+    if min(parents) < 0:
         raise GroundTruthError(
-            f"camera {missing[0]} is not connected to the world: expected shots in which it sees "
-            "a board of the world, or the double board together with a camera that is connected"
+            f"camera {names[parents.index(-1) - 1]} is not connected to the world: expected shots "
+            "in which it sees a board of the world, or the double board together with a camera "
+            "that is connected"
         )
-    return cameras, bodies
+    central = {pair: _most_central(poses) for pair, poses in estimates.items()}
+    poses = chained_poses(central, parents, 0)
+    bodies = {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
+    return poses[1:], bodies
 
 
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
@@ -208,7 +202,7 @@ def _bundle(
     parts: Mapping[str, FloatArray],
     double: DoubleBoard | None,
     seen: _Seen,
-    placed: tuple[Mapping[str, FloatArray], Mapping[int, FloatArray]],
+    placed: tuple[FloatArray, Mapping[int, FloatArray]],
     settings: NetworkSettings,
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
     names, (poses, bodies) = sorted(cameras), placed
@@ -234,25 +228,21 @@ def _bundle(
         np.concatenate([view.corners for view in views]),
         np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
-    free_part = np.zeros(len(order), dtype=np.bool_)
+    free = np.arange(len(names) + len(order) + 1 + len(bodies)) != len(names) + len(order)
+    free[len(names) : len(names) + len(order)] = False
     priors: tuple[PosePrior, ...] = ()
     if double is not None and any(view.board == double.second for view in views):
-        free = double.offset is None or bool(np.any(double.covariance))
-        free_part[order.index(double.second)] = free
-        if free and double.offset is not None:
+        second = len(names) + order.index(double.second)
+        free[second] = double.offset is None or bool(np.any(double.covariance))
+        if free[second] and double.offset is not None:
             # Exactly known poses beside uncertain ones are held to a micrometre.
-            covariance = double.covariance + 1e-12 * np.eye(6)
-            priors = (PosePrior("part", order.index(double.second), double.offset, covariance),)
-    free_body = np.ones(1 + len(bodies), dtype=np.bool_)
-    free_body[0] = False
+            priors = (PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),)
+    of_bodies = [np.eye(4), *(bodies[number] for number in sorted(bodies))]
     bundle = Bundle(
         tuple(cameras[name] for name in names),
-        np.stack([poses[name] for name in names]),
-        np.stack([np.eye(4), *(bodies[number] for number in sorted(bodies))]),
-        np.stack([parts[name] for name in order]),
-        np.ones(len(names), dtype=np.bool_),
-        free_body,
-        free_part,
+        len(order),
+        np.stack([*poses, *(parts[name] for name in order), *of_bodies]),
+        free,
         points,
         np.repeat(np.arange(len(views)), counts),
         priors,

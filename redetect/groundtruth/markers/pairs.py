@@ -105,9 +105,9 @@ def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairCo
 
 
 def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
-    """Each marker's parent in the tree over the best supported pairs (Prim).
+    """Parents of markers, or cameras, in the tree over the best supported pairs (Prim).
 
-    The root's parent is itself; markers that are not connected have -1. `pairs` is each pair's
+    The root's parent is itself; those that are not connected have -1. `pairs` is each pair's
     support.
     """
     parents = [-1] * count
@@ -126,20 +126,16 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
 
 
 def chained_poses(
-    consensus: Mapping[tuple[int, int], PairConsensus], parents: Sequence[int], root: int
+    relative: Mapping[tuple[int, int], FloatArray], parents: Sequence[int], root: int
 ) -> FloatArray:
-    """(M, 4, 4) poses `root_from_marker` along a tree that reaches all markers."""
+    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b."""
     poses: dict[int, FloatArray] = {root: np.eye(4)}
     while len(poses) < len(parents):
         before = len(poses)
         for marker, parent in enumerate(parents):
             if marker not in poses and parent in poses:
-                known = consensus.get((parent, marker))
-                step = (
-                    known.a_from_b
-                    if known is not None
-                    else inverse(consensus[marker, parent].a_from_b)
-                )
+                known = relative.get((parent, marker))
+                step = inverse(relative[marker, parent]) if known is None else known
                 poses[marker] = poses[parent] @ step
         if len(poses) == before:
             raise GroundTruthError("a marker is not connected to the others")

@@ -48,7 +48,7 @@ def solve_camera(
     ----------
     points : (N, 3) array
         In the object's frame (m). For `ippe` they are the corners of one square marker in its own
-        frame, as `redetect.groundtruth.markers.calibration.marker_corners` gives them.
+        frame, as `redetect.groundtruth.markers.session.marker_corners` gives them.
     pixels : (N, 2) array
         In the original image; the lens' distortion is removed here.
     solver : str
@@ -102,16 +102,12 @@ def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArr
         poses = []
         for index in used:
             chosen = problem.seen.camera == index
-            points = apply(
-                problem.robot_from_marker[problem.seen.part[chosen]], problem.seen.points[chosen]
-            )
+            lens, pixels = problem.network.cameras[index], problem.seen.pixels[chosen]
             try:
-                found = solve_camera(
-                    problem.cameras[index], points, problem.seen.pixels[chosen], solver
-                )
+                found = solve_camera(lens, problem.robot_points[chosen], pixels, solver)
             except GeometryError:
                 continue
-            poses += [problem.world_from_camera[index] @ pose for pose in found]
+            poses += [problem.network.world_from_camera[index] @ pose for pose in found]
     return _best_first(
         poses,
         lambda pose: robot_rms_px(problem, pose),
@@ -136,15 +132,15 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
     camera, marker = int(problem.seen.camera[chosen[0]]), int(problem.seen.part[chosen[0]])
     try:
         found = solve_camera(
-            problem.cameras[camera],
+            problem.network.cameras[camera],
             problem.seen.points[chosen],
             problem.seen.pixels[chosen],
             "ippe",
         )
     except GeometryError:
         return []
-    marker_from_robot = inverse(problem.robot_from_marker[marker])
-    return [problem.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
+    marker_from_robot = inverse(problem.rig.robot_from_marker[marker])
+    return [problem.network.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
 
 
 def robot_rms_px(problem: PoseProblem, world_from_robot: FloatArray) -> float:
@@ -192,21 +188,20 @@ def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> lis
 
 
 def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
-    points = apply(problem.robot_from_marker[problem.seen.part], problem.seen.points)
     used, index = np.unique(problem.seen.camera, return_inverse=True)
     pixels = np.empty_like(problem.seen.pixels)
     for camera in used:
         chosen = problem.seen.camera == camera
-        lens = problem.cameras[camera]
+        lens = problem.network.cameras[camera]
         pixels[chosen] = lens.undistort(problem.seen.pixels[chosen]) * lens.scale_x
     if not np.all(np.isfinite(pixels)):
         raise GeometryError("a corner lies where the lens sees nothing")
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
         pixels,
-        points,
+        problem.robot_points,
         index.tolist(),
-        [pycolmap.Rigid3d(inverse(problem.world_from_camera[c])[:3]) for c in used],
-        [_pinhole(problem.cameras[camera]) for camera in used],
+        [pycolmap.Rigid3d(inverse(problem.network.world_from_camera[c])[:3]) for c in used],
+        [_pinhole(problem.network.cameras[camera]) for camera in used],
         estimation_options=_ransac(),
     )
     return [] if found is None else [_matrix(found["rig_from_world"])]
@@ -245,21 +240,10 @@ _FARTHEST_M = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidate:
-    """A pose that may be the robot's."""
+class PoseCandidate(RefinedPose):
+    """A pose that may be the robot's, refined over the views that it explains."""
 
-    refined: RefinedPose  # Over the views that it explains
     views: BoolArray  # (V,): which of all views those are
-
-    @property
-    def world_from_robot(self) -> FloatArray:
-        """(4, 4) the pose."""
-        return self.refined.world_from_robot
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(6, 6) covariance of its right perturbation."""
-        return self.refined.covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,13 +291,15 @@ def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
         alone = problem.only(views)
         starts = _starts(alone, settings)[:1] + _mirrored(alone)
         minima = _distinct(refined + _refined(alone, starts, settings))
-        candidates += [PoseCandidate(pose, views) for pose in _likely(minima, settings)]
+        candidates += [
+            PoseCandidate(**vars(pose), views=views) for pose in _likely(minima, settings)
+        ]
     if contradiction:
         # Different views were explained: their costs are not comparable.
         return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
-    best = candidates[0].refined
+    best = candidates[0]
     inflation = _inflation(best)
-    log_odds = tuple(0.5 * (c.refined.cost - best.cost) / inflation for c in candidates)
+    log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
     return PoseEstimate(tuple(candidates), log_odds, False)
 
 

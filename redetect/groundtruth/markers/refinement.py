@@ -13,14 +13,14 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from camera import Camera
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     UNDETERMINED,
     ChainPoints,
@@ -28,8 +28,9 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.settings import Loss
-from redetect.groundtruth.trajectories.transforms import exp_se3, roll_pitch
+from redetect.groundtruth.markers.session import Network, Rig, View
+from redetect.groundtruth.settings import Loss, PoseSettings
+from redetect.groundtruth.trajectories.transforms import apply, exp_se3, roll_pitch
 from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
@@ -43,11 +44,8 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 class PoseProblem:
     """The data on a robot's pose at one time."""
 
-    cameras: tuple[Camera, ...]
-    world_from_camera: FloatArray  # (C, 4, 4)
-    robot_from_marker: FloatArray  # (M, 4, 4)
-    camera_covariance: FloatArray  # (6 C, 6 C): of the cameras' right perturbations
-    marker_covariance: FloatArray  # (6 M, 6 M): of the markers' right perturbations
+    network: Network
+    rig: Rig
     seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
     # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
     view: IntArray
@@ -58,13 +56,18 @@ class PoseProblem:
         """V, the number of markers in images."""
         return int(self.view.max()) + 1 if len(self.view) else 0
 
+    @property
+    def robot_points(self) -> FloatArray:
+        """(N, 3) corners in the robot's frame (m)."""
+        return apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
+
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
         return project_chain(
-            self.cameras,
-            self.world_from_camera,
+            self.network.cameras,
+            self.network.world_from_camera,
             world_from_robot[None],
-            self.robot_from_marker,
+            self.rig.robot_from_marker,
             self.seen,
         )
 
@@ -212,17 +215,17 @@ def predicted_errors(
 
 def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
     """None if one cannot be seen."""
-    seen = problem.seen
+    network, rig, seen = problem.network, problem.rig, problem.seen
     projection = project_chain_with_jacobians(
-        problem.cameras, problem.world_from_camera, pose[None], problem.robot_from_marker, seen
+        network.cameras, network.world_from_camera, pose[None], rig.robot_from_marker, seen
     )
     residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
         return None
     common = np.zeros((len(residuals), len(residuals)))
     for jacobian, index, covariance in (
-        (projection.by_camera, seen.camera, problem.camera_covariance),
-        (projection.by_part, seen.part, problem.marker_covariance),
+        (projection.by_camera, seen.camera, network.covariance),
+        (projection.by_part, seen.part, rig.covariance),
     ):
         if np.any(covariance):
             common += _common(jacobian, index, covariance)
@@ -310,3 +313,43 @@ def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatAr
     jacobian[1, 3:] = (up[2] * by_rotation[1] - up[1] * by_rotation[2]) / across
     jacobian[2, 3:] = -by_rotation[0] / np.sqrt(across)
     return missing / sigmas, jacobian / sigmas[:, None]
+
+
+def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> ChainPoints:
+    """Corners of views as points of a chain, with body 0 and the rig's markers as parts."""
+    cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
+    parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
+    points = np.zeros((0, 3))
+    pixels, covariances = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    if views:
+        points = np.concatenate([rig.corners[view.rig_index] for view in views])
+        corners = [corner for view in views for corner in view.marker.corners]
+        pixels = np.array([[c.u, c.v] for c in corners])
+        covariances = np.array([[[c.cuu, c.cuv], [c.cuv, c.cvv]] for c in corners])
+        covariances += corner_floor_px**2 * np.eye(2)
+        determinants = covariances[:, 0, 0] * covariances[:, 1, 1] - covariances[:, 0, 1] ** 2
+        wrong = np.flatnonzero(~((covariances[:, 0, 0] > 0.0) & (determinants > 0.0)))
+        if wrong.size:
+            view = views[int(wrong[0]) // 4]
+            raise GroundTruthError(
+                f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
+                "is not positive definite: expected one, or a corner floor above 0"
+            )
+    return ChainPoints(
+        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
+    )
+
+
+def pose_problem(
+    views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
+) -> PoseProblem:
+    """The problem of the robot's pose at one time."""
+    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
+    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
+    return PoseProblem(
+        network,
+        rig,
+        chain_points(views, rig, settings.corner_floor_px),
+        np.repeat(np.arange(len(views)), 4),
+        floor,
+    )

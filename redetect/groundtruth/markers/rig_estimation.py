@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
@@ -22,7 +21,6 @@ from redetect.groundtruth.markers.adjustment import (
     adjust_bundle,
     project_chain,
 )
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -32,8 +30,8 @@ from redetect.groundtruth.markers.pairs import (
     spanning_tree,
 )
 from redetect.groundtruth.markers.poses import view_poses
-from redetect.groundtruth.markers.refinement import PoseProblem, refine_pose
-from redetect.groundtruth.markers.session import MarkerFrame, View, chain_points, rig_views
+from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
+from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
@@ -60,14 +58,12 @@ class RigEstimate:
 
 def estimate_rig(
     groups: Sequence[Sequence[MarkerFrame]],
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
-    widths_m: Mapping[int, float],
+    network: Network,
     dictionary: str,
+    widths_m: Mapping[int, float],
     settings: RigSettings,
     *,
     reference: int | None = None,
-    camera_covariance: FloatArray | None = None,
 ) -> RigEstimate:
     """Estimate a rig.
 
@@ -75,14 +71,13 @@ def estimate_rig(
     ----------
     groups : sequence of sequences of MarkerFrame
         Images taken at one time; single ones where the cameras are not calibrated to each other.
-    world_from_camera : (C, 4, 4) array
-        Identities where the cameras are not calibrated to each other.
+    network : Network
+        The cameras; their places mean nothing where they are not calibrated to each other. If it
+        has a covariance, that is a prior of the cameras' adjustment.
     widths_m : mapping of int to float
         Widths of the markers that may be in the rig, by ID.
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
-    camera_covariance : (6 C, 6 C) array, optional
-        Covariance of the cameras' relative poses, a prior of their adjustment.
 
     Raises
     ------
@@ -93,7 +88,7 @@ def estimate_rig(
     candidates = _bare_rig(dictionary, ids, widths_m)
     seen = [rig_views(group, candidates) for group in groups]
     solved = [
-        [(v, _solutions(v, candidates, cameras, world_from_camera, settings)) for v in views]
+        [(v, _solutions(v, candidates, network, settings)) for v in views]
         for views in seen
         if len({view.rig_index for view in views}) > 1
     ]
@@ -115,14 +110,15 @@ def estimate_rig(
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
-    start = chained_poses(pairs, tree, renumbered[root])
+    relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
+    start = chained_poses(relative, tree, renumbered[root])
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionary, kept_ids, widths_m)
     bundle, views, times = _bundle(
-        solved, rig, renumbered, start, cameras, world_from_camera, renumbered[root], settings
+        solved, rig, renumbered, start, network, renumbered[root], settings
     )
-    if camera_covariance is not None and np.any(camera_covariance):
-        bundle = _with_free_cameras(bundle, camera_covariance)
+    if np.any(network.covariance):
+        bundle = _with_free_cameras(bundle, network.covariance)
     adjusted, rig = _adjusted(bundle, rig, settings)
     return RigEstimate(
         rig,
@@ -160,22 +156,12 @@ def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, floa
     )
 
 
-def _solutions(
-    view: View,
-    rig: Rig,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
-    settings: RigSettings,
-) -> MarkerPose | None:
+def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) -> MarkerPose | None:
     """Both poses of a marker in an image, refined; None if it has none."""
-    size = 6 * len(cameras)
     problem = PoseProblem(
-        cameras,
-        world_from_camera,
-        rig.robot_from_marker,  # identities: the marker itself is the body
-        np.zeros((size, size)),
-        rig.covariance,
-        chain_points([view], rig.widths_m.tolist(), settings.corner_floor_px),
+        replace(network, covariance=np.zeros_like(network.covariance)),
+        rig,  # with identities: the marker itself is the body
+        chain_points([view], rig, settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
     )
     found = []
@@ -244,8 +230,7 @@ def _bundle(
     rig: Rig,
     renumbered: Mapping[int, int],
     start: FloatArray,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
+    network: Network,
     root: int,
     settings: RigSettings,
 ) -> tuple[Bundle, tuple[View, ...], int]:
@@ -261,23 +246,21 @@ def _bundle(
         ]
         if len({view.rig_index for view, _ in own}) < 2:
             continue
-        pose = _best_start(own, rig, start, cameras, world_from_camera, settings)
+        pose = _best_start(own, rig, start, network, settings)
         if pose is None:
             continue
         views += [view for view, _ in own]
         bodies += [len(poses)] * len(own)
         poses.append(pose)
-    points = chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px)
-    free_part = np.ones(len(rig.ids), dtype=np.bool_)
-    free_part[root] = False
+    points = chain_points(views, rig, settings.corner_floor_px)
+    cameras = len(network.cameras)
+    free = np.arange(cameras + len(start) + len(poses)) >= cameras
+    free[cameras + root] = False
     bundle = Bundle(
-        cameras,
-        world_from_camera,
-        np.stack(poses),
-        start,
-        np.zeros(len(cameras), dtype=np.bool_),
-        np.ones(len(poses), dtype=np.bool_),
-        free_part,
+        network.cameras,
+        len(start),
+        np.concatenate([network.world_from_camera, start, poses]),
+        free,
         replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
         np.repeat(np.arange(len(views)), 4),
     )
@@ -286,35 +269,35 @@ def _bundle(
 
 def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     """The bundle with its cameras free, each with its own covariance as a prior."""
-    free = np.isin(np.arange(len(bundle.cameras)), bundle.seen.camera)
+    seen = np.unique(bundle.seen.camera)
+    free = bundle.free.copy()
+    free[seen] = True
     priors = tuple(
-        PosePrior(
-            "camera",
-            int(c),
-            bundle.world_from_camera[c],
-            covariance[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] + 1e-12 * np.eye(6),
-        )
-        for c in np.flatnonzero(free)
+        PosePrior(int(c), bundle.poses[c], _block(covariance, c) + _EXACT * np.eye(6)) for c in seen
     )
-    return replace(bundle, free_camera=free, priors=priors)
+    return replace(bundle, free=free, priors=priors)
+
+
+def _block(covariance: FloatArray, index: int) -> FloatArray:
+    """The (6, 6) covariance of one of several poses."""
+    return covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
 
 
 def _best_start(
     own: Sequence[tuple[View, MarkerPose]],
     rig: Rig,
     start: FloatArray,
-    cameras: tuple[Camera, ...],
-    world_from_camera: FloatArray,
+    network: Network,
     settings: RigSettings,
 ) -> FloatArray | None:
     """The pose of the rig, among its markers' solutions, that explains most of a time's views."""
-    points = chain_points(
-        [view for view, _ in own], rig.widths_m.tolist(), settings.corner_floor_px
-    )
+    points = chain_points([view for view, _ in own], rig, settings.corner_floor_px)
     best, least = None, np.inf
     for view, solutions in own:
         for pose in solutions.poses @ inverse(start[view.rig_index]):
-            pixels = project_chain(cameras, world_from_camera, pose[None], start, points)
+            pixels = project_chain(
+                network.cameras, network.world_from_camera, pose[None], start, points
+            )
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue
@@ -351,8 +334,9 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
     priors, starts = [], []
     for marker in common:
         i, j = ids.index(marker), known.ids.index(marker)
-        covariance = known.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] + _EXACT * np.eye(6)
-        priors.append(PosePrior("part", i, known.robot_from_marker[j], covariance))
+        covariance = _block(known.covariance, j) + _EXACT * np.eye(6)
+        cameras = len(estimate.adjusted.bundle.cameras)
+        priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
         starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
     start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings)
@@ -393,7 +377,7 @@ def rig_by_reference_poses(
         x, y, theta = reference.poses[k]
         pose = planar_transform(float(x), float(y), float(theta))
         covariance = _reference_covariance(reference, k, pose)
-        priors.append(PosePrior("body", body, pose, covariance))
+        priors.append(PosePrior(bundle.shared + body, pose, covariance))
         starts.append(inverse(pose) @ bundle.world_from_body[body])
     if not priors:
         raise GroundTruthError(
@@ -421,14 +405,21 @@ def _readjusted(
     settings: RigSettings,
 ) -> RigEstimate:
     bundle = estimate.adjusted.bundle
-    seen = np.isin(np.arange(len(bundle.free_body)), bundle.seen.body)
+    cameras = len(bundle.cameras)
+    free = bundle.free.copy()
+    free[cameras : bundle.shared] = True
+    free[bundle.shared :] = np.isin(np.arange(len(bundle.world_from_body)), bundle.seen.body)
     moved = replace(
         bundle,
-        world_from_body=bundle.world_from_body @ inverse(robot_from_rig),
-        body_from_part=robot_from_rig @ bundle.body_from_part,
-        free_body=seen,
-        free_part=np.ones(len(bundle.free_part), dtype=np.bool_),
-        priors=(*(p for p in bundle.priors if p.kind == "camera"), *priors),
+        poses=np.concatenate(
+            [
+                bundle.world_from_camera,
+                robot_from_rig @ bundle.body_from_part,
+                bundle.world_from_body @ inverse(robot_from_rig),
+            ]
+        ),
+        free=free,
+        priors=(*(p for p in bundle.priors if p.index < cameras), *priors),
     )
     adjusted, rig = _adjusted(moved, estimate.rig, settings)
     return replace(estimate, rig=rig, adjusted=adjusted)

@@ -1,21 +1,218 @@
-"""A session on disk: the images of several cameras, their times, and the markers found in them."""
+"""What a session with markers has on disk: rig, network, the images and the markers found in them.
+
+``rig.json`` holds `robot_from_marker` for each marker, ``network.json`` `world_from_camera` for
+each camera; both may say how uncertain that is (see docs/groundtruth.md).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from camera import Camera, read_camera
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.adjustment import ChainPoints
-from redetect.groundtruth.markers.calibration import Network, Rig, marker_corners
-from redetect.groundtruth.markers.refinement import Floor, PoseProblem
-from redetect.groundtruth.settings import PoseSettings
+from redetect.groundtruth.files import JsonObject, write_json
 from redetect.groundtruth.trajectories.streams import read_times
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.landmarks import MarkerLandmark, read_frames
+from redetect.storage.bounds import Bounds
 from redetect.storage.messages import excerpt
+
+_QUATERNION_TOLERANCE = 1e-3
+_WIDTH = Bounds("metres above 0", 0.0, above=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Square markers on a robot."""
+
+    dictionary: str  # Which set of markers the identifiers are from
+    ids: tuple[int, ...]  # The markers, M of them
+    widths_m: FloatArray  # (M,): widths of the black squares
+    # (M, 4, 4): marker frame: origin at the centre, x right, y up, z out of the printed face
+    robot_from_marker: FloatArray
+    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
+    # known.
+    covariance: FloatArray
+
+    @property
+    def corners(self) -> FloatArray:
+        """(M, 4, 3) corners in each marker's frame: top left, right, bottom right, left (m)."""
+        return np.stack([marker_corners(width) for width in self.widths_m])
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Cameras fixed in the world."""
+
+    names: tuple[str, ...]  # The cameras, C of them
+    # Their calibrations. The mounting that a ``.cam`` file holds means nothing here.
+    cameras: tuple[Camera, ...]
+    calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's own
+    world_from_camera: FloatArray  # (C, 4, 4)
+    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
+    # known.
+    covariance: FloatArray
+
+
+def marker_corners(width_m: float) -> FloatArray:
+    """(4, 3) corners in a marker's frame: top left, top right, bottom right, bottom left (m)."""
+    half = 0.5 * width_m
+    return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+
+
+def read_rig(path: str | os.PathLike[str]) -> Rig:
+    """Read a ``rig.json``.
+
+    Returns
+    -------
+    Rig
+        Markers in the order of their identifiers.
+
+    Raises
+    ------
+    GroundTruthError
+        If the file cannot be read, or an entry is missing or impossible.
+    """
+    content = JsonObject.read(path)
+    dictionary = content.text("dictionary", "its name")
+    markers = content.objects("markers")
+    try:
+        by_id = {int(key): entry for key, entry in markers.items()}
+    except ValueError:
+        raise GroundTruthError(f"{path}: markers: expected whole numbers as keys") from None
+    ids = tuple(sorted(by_id))
+    if len(ids) != len(markers) or (ids and ids[0] < 0):
+        raise GroundTruthError(f"{path}: markers: expected different IDs of 0 or more")
+    entries = {str(marker): by_id[marker] for marker in ids}
+    widths = np.array([entry.number("width_m", _WIDTH) for entry in entries.values()])
+    poses = np.stack([parse_pose(entry) for entry in entries.values()])
+    return Rig(dictionary, ids, widths, poses, _joint_covariance(content, "markers", entries))
+
+
+def read_network(path: str | os.PathLike[str]) -> Network:
+    """Read a ``network.json`` and the calibrations that it names.
+
+    Returns
+    -------
+    Network
+        Cameras in the order of their names.
+
+    Raises
+    ------
+    GroundTruthError, camera.CameraError
+        If a file cannot be read, or an entry is missing or impossible.
+    """
+    content = JsonObject.read(path)
+    cameras = dict(sorted(content.objects("cameras").items()))
+    calibrations = tuple(entry.text("calibration", "a file") for entry in cameras.values())
+    for calibration, entry in zip(calibrations, cameras.values()):
+        # It may well lie beside the network's folder; but only a calibration is ever opened.
+        relative = not Path(calibration).is_absolute() and "\0" not in calibration
+        if not relative or not calibration.endswith(".cam"):
+            raise entry.wrong("calibration", "a .cam file by a relative path")
+    return Network(
+        tuple(cameras),
+        tuple(read_camera(Path(path).parent / calibration) for calibration in calibrations),
+        calibrations,
+        np.stack([parse_pose(entry) for entry in cameras.values()]),
+        _joint_covariance(content, "cameras", cameras),
+    )
+
+
+def write_rig(
+    path: str | os.PathLike[str],
+    rig: Rig,
+    extra: Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
+    entries = {
+        str(marker): {"width_m": float(width), **_pose_entries(pose)}
+        for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
+    }
+    head = {"dictionary": rig.dictionary}
+    content = {**head, **_with_covariance("markers", entries, rig.covariance), **(extra or {})}
+    write_json(path, content, overwrite=overwrite)
+
+
+def write_network(
+    path: str | os.PathLike[str],
+    network: Network,
+    extra: Mapping[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
+    entries = {
+        name: {"calibration": calibration, **_pose_entries(pose)}
+        for name, calibration, pose in zip(
+            network.names, network.calibrations, network.world_from_camera
+        )
+    }
+    content = {**_with_covariance("cameras", entries, network.covariance), **(extra or {})}
+    write_json(path, content, overwrite=overwrite)
+
+
+def _with_covariance(key: str, entries: dict[str, Any], covariance: FloatArray) -> dict[str, Any]:
+    """Entries, and their joint covariance if there is one."""
+    content: dict[str, Any] = {key: entries}
+    if np.any(covariance):
+        content["covariance"] = {key: list(entries), "matrix": covariance.tolist()}
+    return content
+
+
+def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
+    return {
+        "translation_m": pose[:3, 3].tolist(),
+        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+    }
+
+
+def parse_pose(entry: JsonObject) -> FloatArray:
+    """(4, 4) pose of a JSON object with translation_m and quaternion_xyzw."""
+    translation = entry.numbers("translation_m", 3)
+    quaternion = entry.numbers("quaternion_xyzw", 4)
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1.0) <= _QUATERNION_TOLERANCE:
+        raise GroundTruthError(
+            f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
+        )
+    return transform_from_quaternion(quaternion / length, translation)
+
+
+def _joint_covariance(
+    content: JsonObject, key: str, entries: Mapping[str, JsonObject]
+) -> FloatArray:
+    """(6 N, 6 N) covariance of all entries' poses, in their order."""
+    if "covariance" not in content:
+        return np.asarray(block_diag(*(entry.uncertainty(6) for entry in entries.values())))
+    if any("covariance" in entry or "sigmas" in entry for entry in entries.values()):
+        raise GroundTruthError(
+            f"{content.place}: covariance for all {key} together and for one of them: expected one "
+            "of both"
+        )
+    joint = content.values["covariance"]
+    if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
+        raise content.wrong("covariance", f"an object with {key} and matrix")
+    order, names = [str(name) for name in joint[key]], list(entries)
+    if sorted(order) != sorted(names):
+        raise GroundTruthError(
+            f"{content.place}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
+        )
+    place = f"{content.place}: covariance"
+    matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
+    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
+    return np.asarray(matrix[np.ix_(index, index)])
+
 
 DETECTED_NAME = "detected.markers"
 NETWORK_NAME = "network.json"
@@ -109,51 +306,6 @@ def rig_views(group: Sequence[MarkerFrame], rig: Rig) -> list[View]:
         for marker in frame.markers
         if marker.dictionary == rig.dictionary and marker.id in index
     ]
-
-
-def chain_points(
-    views: Sequence[View], widths_m: Sequence[float], corner_floor_px: float
-) -> ChainPoints:
-    """Corners of views as points of a chain, with body 0 and the rig's markers as parts."""
-    cameras = np.repeat([view.frame.camera for view in views], 4).astype(np.int64)
-    parts = np.repeat([view.rig_index for view in views], 4).astype(np.int64)
-    points = np.zeros((0, 3))
-    pixels, covariances = np.zeros((0, 2)), np.zeros((0, 2, 2))
-    if views:
-        points = np.concatenate([marker_corners(widths_m[view.rig_index]) for view in views])
-        corners = [corner for view in views for corner in view.marker.corners]
-        pixels = np.array([[c.u, c.v] for c in corners])
-        covariances = np.array([[[c.cuu, c.cuv], [c.cuv, c.cvv]] for c in corners])
-        covariances += corner_floor_px**2 * np.eye(2)
-        determinants = covariances[:, 0, 0] * covariances[:, 1, 1] - covariances[:, 0, 1] ** 2
-        wrong = np.flatnonzero(~((covariances[:, 0, 0] > 0.0) & (determinants > 0.0)))
-        if wrong.size:
-            view = views[int(wrong[0]) // 4]
-            raise GroundTruthError(
-                f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
-                "is not positive definite: expected one, or a corner floor above 0"
-            )
-    return ChainPoints(
-        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
-    )
-
-
-def pose_problem(
-    views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
-) -> PoseProblem:
-    """The problem of the robot's pose at one time."""
-    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
-    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
-    return PoseProblem(
-        network.cameras,
-        network.world_from_camera,
-        rig.robot_from_marker,
-        network.covariance,
-        rig.covariance,
-        chain_points(views, rig.widths_m.tolist(), settings.corner_floor_px),
-        np.repeat(np.arange(len(views)), 4),
-        floor,
-    )
 
 
 def _times_by_name(path: Path) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.calibration import Network, Rig
 from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.refinement import pose_problem
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
+    Network,
+    Rig,
     View,
-    pose_problem,
     rig_views,
 )
 from redetect.groundtruth.settings import PoseSettings
@@ -74,9 +75,8 @@ class Track:
     @property
     def reduced_cost(self) -> float:
         """Sum of all costs over their degrees of freedom: 1 if the covariances are right."""
-        refined = [pose.refined for _, pose in self.posed]
-        freedom = sum(pose.degrees_of_freedom for pose in refined)
-        return sum(pose.cost for pose in refined) / freedom if freedom else float("nan")
+        freedom = sum(pose.degrees_of_freedom for _, pose in self.posed)
+        return sum(pose.cost for _, pose in self.posed) / freedom if freedom else float("nan")
 
     def planar(self) -> PlanarPoses:
         """The poses on the floor with their covariances."""
@@ -147,9 +147,9 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
                     round(float(heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
-                "rms_px": round(candidate.refined.rms_px, 4),
-                "cost": round(candidate.refined.cost, 3),
-                "degrees_of_freedom": candidate.refined.degrees_of_freedom,
+                "rms_px": round(candidate.rms_px, 4),
+                "cost": round(candidate.cost, 3),
+                "degrees_of_freedom": candidate.degrees_of_freedom,
                 "log_odds_against": round(odds, 3),
             }
             for candidate, odds in zip(estimate.candidates, estimate.log_odds)
@@ -158,7 +158,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
         {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
     ]
     if chosen is not None:
-        figures = iter(zip(chosen.refined.view_errors, chosen.refined.view_rms_px))
+        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
         for marker, is_used in zip(entry["markers"], chosen.views):
             marker["used"] = bool(is_used)
             if is_used:
@@ -248,20 +248,11 @@ def _cheapest_paths(
         skipped: _step_costs(times_s, estimates, skipped + 1, settings)
         for skipped in range(_MOST_LEFT_OUT + 1)
     }
-    ahead = [np.full(size, _REJECT_COST * i) for i, size in enumerate(sizes)]
-    for i in range(count):
-        for skipped, costs in steps.items():
-            j = i - skipped - 1
-            if j >= 0:
-                came = ahead[j][:, None] + costs[j] + _REJECT_COST * skipped
-                ahead[i] = np.minimum(ahead[i], came.min(axis=0))
-    back = [np.full(size, _REJECT_COST * (count - 1 - i)) for i, size in enumerate(sizes)]
-    for i in reversed(range(count)):
-        for skipped, costs in steps.items():
-            j = i + skipped + 1
-            if j < count:
-                goes = costs[i] + back[j][None, :] + _REJECT_COST * skipped
-                back[i] = np.minimum(back[i], goes.min(axis=1))
+    ahead = _cheapest_before(sizes, steps)
+    backward = {
+        skipped: [costs.T for costs in reversed(of_steps)] for skipped, of_steps in steps.items()
+    }
+    back = _cheapest_before(sizes[::-1], backward)[::-1]
     through = [a + b for a, b in zip(ahead, back)]
     without = np.full(count, _REJECT_COST * count)
     for i in range(count):
@@ -277,6 +268,23 @@ def _cheapest_paths(
                 inside = slice(j + 1, j + skipped + 1)
                 without[inside] = np.minimum(without[inside], cost)
     return through, without
+
+
+def _cheapest_before(
+    sizes: Sequence[int], steps: Mapping[int, Sequence[FloatArray]]
+) -> list[FloatArray]:
+    """Costs of the cheapest sequences that lead to each candidate of each frame.
+
+    `sizes` are the numbers of candidates, `steps` the costs of moving on from each frame, by how
+    many frames are left out.
+    """
+    costs = [np.full(size, _REJECT_COST * i) for i, size in enumerate(sizes)]
+    for i in range(len(sizes)):
+        for skipped, of_steps in steps.items():
+            if (j := i - skipped - 1) >= 0:
+                came = costs[j][:, None] + of_steps[j] + _REJECT_COST * skipped
+                costs[i] = np.minimum(costs[i], came.min(axis=0))
+    return costs
 
 
 def _step_costs(

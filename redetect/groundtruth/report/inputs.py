@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Callable
@@ -13,9 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_json
+from redetect.groundtruth.files import read_json, read_text
+from redetect.groundtruth.fusion.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -25,14 +24,14 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     segments_between_gaps,
 )
-from redetect.groundtruth.validation.dimensions import (
+from redetect.groundtruth.validation.reference_poses import (
     Dimension,
     SurveyedFiducials,
     read_dimensions,
     read_fiducial_distances,
+    read_survey,
     survey_fiducials,
 )
-from redetect.groundtruth.validation.reference_poses import read_survey
 from redetect.storage.bounded import read_bounded
 
 T = TypeVar("T")
@@ -177,9 +176,10 @@ def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
     counts: dict[str, int] = {}
     intervals: list[Interval] = []
     before = ""
-    for number, line in enumerate(io.BytesIO(_content(path, _MOST_LINES_BYTES)), 1):
+    lines = read_text(path, _MOST_LINES_BYTES, "lines of JSON").splitlines()
+    for number, line in enumerate(lines, 1):
         try:
-            entry = json.loads(line.decode("utf-8"))
+            entry = json.loads(line)
             status, time = str(entry["status"]), float(entry["t"])
         except (ValueError, TypeError, KeyError, RecursionError):
             raise GroundTruthError(
@@ -197,17 +197,13 @@ def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
 
 
 def _picture(path: Path) -> bytes:
-    content = _content(path, _MOST_PICTURE_BYTES)
+    try:
+        content = read_bounded(path, _MOST_PICTURE_BYTES)
+    except OSError as error:
+        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
     if not content.startswith(_PNG):
         raise GroundTruthError(f"{path}: is no PNG")
     return content
-
-
-def _content(path: Path, largest_bytes: int) -> bytes:
-    try:
-        return read_bounded(path, largest_bytes)
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _visits(inputs: Inputs) -> list[tuple[float, float]]:

@@ -21,9 +21,8 @@ from redetect.groundtruth.report.pictures import (
     stages_figure,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
-from redetect.groundtruth.validation.dimensions import Dimension, SurveyedFiducials
-from redetect.groundtruth.validation.scoring import PoseScore, score_poses, sigma_of
-from redetect.groundtruth.validation.validate import PUBLISHED
+from redetect.groundtruth.validation.reference_poses import Dimension, SurveyedFiducials
+from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, score_poses, sigma_of
 from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of
 
@@ -139,7 +138,7 @@ def _scanners(inputs: Inputs) -> list[Part]:
         return [Part("note", "No aligned.json: groundtruth lasers writes it.")]
     content: list[Part] = []
     steps = _entry(document, "steps", dict)
-    names = [str(s.get("name")) for s in _entry(document, "scanners", list) if isinstance(s, dict)]
+    names = [str(s.get("name")) for s in _entries(document, "scanners")]
     rows = []
     try:
         last = np.array(steps.get("each to the map"), dtype=np.float64).reshape(len(names), 3)
@@ -270,13 +269,6 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _is_outside(figures: dict[str, Any]) -> bool:
-    """Whether the normalised error is outside its band."""
-    values = [figures.get(name) for name in ("nees_low", "nees", "nees_high")]
-    numbers = [float(value) for value in values if is_number(value)]
-    return len(numbers) == 3 and not numbers[0] <= numbers[1] <= numbers[2]
-
-
 def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
@@ -287,9 +279,9 @@ def _validation(inputs: Inputs) -> list[Part]:
         (
             str(document.get("poses", "ground truth")),
             *(_number(figures.get(k), 1e3) for k in
-              ("linear_mean_m", "linear_sigma_m", "linear_worst_m")),
+              ("position_mean_m", "position_sigma_m", "position_max_m")),
             *(_number(figures.get(k), 180.0 / math.pi, 3) for k in
-              ("angular_mean_rad", "angular_sigma_rad", "angular_worst_rad")),
+              ("angle_mean_rad", "angle_sigma_rad", "angle_max_rad")),
         )
     ]  # fmt: skip
     for p in PUBLISHED:
@@ -300,15 +292,14 @@ def _validation(inputs: Inputs) -> list[Part]:
         )  # fmt: skip
     head = ("ground truth", "mean / mm", "sigma", "worst", "mean / deg", "sigma", "worst")
     content = [table("Linear and angular errors at reference poses", head, rows)]
-    content.append(
-        Part(
-            "problem" if _is_outside(figures) else "text",
-            f"{_number(figures.get('poses'), 1.0, 0)} reference poses. NEES / 3 with both "
-            f"covariances: {_number(figures.get('nees'), 1.0, 3)}; 95 % of right ones lie between "
-            f"{_number(figures.get('nees_low'), 1.0, 3)} and "
-            f"{_number(figures.get('nees_high'), 1.0, 3)}.",
-        )
-    )
+    nees = figures.get("normalised_error")
+    words, outside = f"NEES / 3 with both covariances: {_number(nees, 1.0, 3)}", False
+    band = [v for v in _entry(figures, "normalised_band", list) if is_number(v)]
+    if len(band) == 2 and is_number(nees):
+        words += f"; 95 % of right ones lie between {band[0]:.3f} and {band[1]:.3f}"
+        outside = not band[0] <= nees <= band[1]
+    count = _number(figures.get("poses"), 1.0, 0)
+    content.append(Part("problem" if outside else "text", f"{count} reference poses. {words}."))
     for name, words, size in (
         ("errors", "Linear and angular errors at each reference pose.", _VALIDATION_PX),
         ("scans", "Readings of the scanners on board, by each set of poses.", _SCANS_PX),
@@ -317,7 +308,7 @@ def _validation(inputs: Inputs) -> list[Part]:
         if picture is not None:
             content.append(image_part(words, picture, "png", *size))
     content += [*_incidence(document), *_mounts(document)]
-    refused = [r for r in _entry(document, "refused", list) if isinstance(r, dict)]
+    refused = _entries(document, "refused")
     if refused:
         content.append(
             table(
@@ -339,7 +330,7 @@ def _incidence(document: dict[str, Any]) -> list[Part]:
         (f"{_number(r.get('from_deg'), 1.0, 0)} to {_number(r.get('to_deg'), 1.0, 0)}",
          _number(r.get("readings"), 1.0, 0), _number(r.get("mean_m"), 1e3),
          _number(r.get("sigma_m"), 1e3))
-        for r in _entry(document, "incidence", list)[:_MOST_ROWS] if isinstance(r, dict)
+        for r in _entries(document, "incidence")[:_MOST_ROWS]
     ]  # fmt: skip
     caption = "Ranges on board less the walls' distances, by the angle of incidence"
     head = ("incidence / deg", "readings", "mean / mm", "sigma")
@@ -348,8 +339,7 @@ def _incidence(document: dict[str, Any]) -> list[Part]:
 
 def _mounts(document: dict[str, Any]) -> list[Part]:
     rows = []
-    for mount in _entry(document, "mounts", list)[:_MOST_ROWS]:
-        entry = mount if isinstance(mount, dict) else {}
+    for entry in _entries(document, "mounts")[:_MOST_ROWS]:
         given, refined, sigma = (_entry(entry, key, list) for key in ("given", "refined", "sigma"))
         if len(given) == len(refined) == len(sigma) == 3:
             moved = [_float(b) - _float(a) for a, b in zip(given, refined)]
@@ -427,8 +417,8 @@ def _rejected(inputs: Inputs) -> list[Part]:
         content.append(table(caption, ("from / s", "to / s", "sets", "status"), rows, text=(3,)))
     suspects = [
         str(s.get("name"))
-        for s in _entry(inputs.documents.get("laser.json", {}), "scanners", list)
-        if isinstance(s, dict) and s.get("suspect")
+        for s in _entries(inputs.documents.get("laser.json", {}), "scanners")
+        if s.get("suspect")
     ]
     if suspects:
         words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
@@ -437,7 +427,7 @@ def _rejected(inputs: Inputs) -> list[Part]:
     if fused is None:
         content.append(Part("note", "No account of a fusion (fused.json)."))
         return content
-    rejected = [r for r in _entry(fused, "rejected", list) if isinstance(r, dict)]
+    rejected = _entries(fused, "rejected")
     used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
     restarts = _entry(fused, "restarts_s", list)
     words = f"Fusion used {used or 'nothing'}; rejected {len(rejected)}; {len(restarts)} restarts."
@@ -470,6 +460,11 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
         content.append(table(caption, ("file", "setting", "value"), rows, text=(1, 2)))
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
+
+
+def _entries(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """The objects of a list in a file that others may have written."""
+    return [entry for entry in _entry(document, key, list) if isinstance(entry, dict)]
 
 
 def _entry(document: dict[str, Any], key: str, kind: type) -> Any:

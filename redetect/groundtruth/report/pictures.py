@@ -14,15 +14,15 @@ import numpy as np
 
 from redetect import plane
 from redetect.array_types import FloatArray
-from redetect.groundtruth.clocks.clock import ClockModel, PtpdLog
-from redetect.groundtruth.lasers.alignment import Alignment, StillScan
+from redetect.groundtruth.fusion.clock import ClockModel, PtpdLog
+from redetect.groundtruth.lasers.alignment import Alignment
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.markers.calibration import Rig, marker_corners
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
+from redetect.groundtruth.markers.session import Rig, marker_corners
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import apply, inverse
-from redetect.groundtruth.validation.validate import PUBLISHED, Figures, ReferenceErrors
+from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
@@ -321,11 +321,11 @@ _COLOURS = ("#2a78b5", "#d9822b", "#3a9150", "#8e5bb0", "#b03a48", "#6b6b6b")
 def draw_alignment(
     measured: tuple[Scanner, ...],
     alignment: Alignment,
-    scans: list[StillScan],
+    clouds: list[FloatArray],
     building: FloatArray,
     icp_rms_m: list[FloatArray],
 ) -> bytes:
-    """Draw the scans on the map by the measured poses and by those found; a PNG's bytes.
+    """Draw scanners' points on the map by the measured poses and by those found; a PNG's bytes.
 
     Beside them `icp_rms_m`, for each scanner the distances from the map (m) step by step of an ICP
     from its measured pose. The same input gives the same bytes.
@@ -333,14 +333,14 @@ def draw_alignment(
     with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]
         before = [scanner.pose for scanner in measured]
-        everything = np.concatenate([plane.apply(p, s.points) for p, s in zip(after, scans)])
+        everything = np.concatenate([plane.apply(p, cloud) for p, cloud in zip(after, clouds)])
         low, high = everything.min(axis=0) - 0.5, everything.max(axis=0) + 0.5
         *maps, steps = figure.subplots(1, 3)
         for axes, poses, title in zip(maps, (before, after), ("measured by hand", "aligned")):
             draw_walls(axes, building)
-            for k, (pose, scan) in enumerate(zip(poses, scans)):
+            for k, (pose, cloud) in enumerate(zip(poses, clouds)):
                 colour = _COLOURS[k % len(_COLOURS)]
-                points = plane.apply(pose, scan.points)
+                points = plane.apply(pose, cloud)
                 axes.scatter(points[:, 0], points[:, 1], s=7, color=colour, lw=0, zorder=2)
                 ahead = plane.apply(pose, np.array([[0.0, 0.0], [0.5, 0.0]]))
                 axes.plot(ahead[:, 0], ahead[:, 1], color=colour, lw=2.0, zorder=3)
@@ -363,13 +363,13 @@ _BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
 def draw_errors(
-    errors: ReferenceErrors, figures: Figures, building: FloatArray | None = None
+    errors: ReferenceErrors, score: PoseScore, building: FloatArray | None = None
 ) -> bytes:
     """Draw errors with bounds by their covariances; returns a PNG's bytes.
 
     The same input gives the same bytes.
 
-    `errors`: at least one. `figures`: of the errors. `building` (S, 4): walls to draw on the map
+    `errors`: at least one. `score`: of the errors. `building` (S, 4): walls to draw on the map
     (m).
     """
     with figure_file((13.5, 6.4), "png") as (figure, content):
@@ -377,26 +377,27 @@ def draw_errors(
         linear, angular = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
         names = [str(reference.index) for reference in errors.references]
         at = np.arange(len(names))
-        linear.bar(at, 1e3 * errors.linear_m, color=_BLUE, width=0.6, label="error")
+        x, y, theta = errors.error.T
+        linear.bar(at, 1e3 * np.hypot(x, y), color=_BLUE, width=0.6, label="error")
         # Of two independent directions: the root mean square, so that it compares with errors.
         expected = 1e3 * errors.sigma[:, 0]
         if np.isfinite(expected).any():
             linear.plot(at, expected, "_", color=_ORANGE, ms=11, mew=2, label="expected (rms)")
-        linear.axhline(1e3 * figures.linear_mean_m, color=_BLUE, lw=1.0, ls="--", label="mean")
+        linear.axhline(1e3 * score.position_mean_m, color=_BLUE, lw=1.0, ls="--", label="mean")
         published = PUBLISHED[0]
         label = f"mean of {published.name}: {1e3 * published.position_mean_m:g} mm"
-        if published.position_mean_m < 2.0 * figures.linear_worst_m:
+        if published.position_mean_m < 2.0 * score.position_max_m:
             height = 1e3 * published.position_mean_m
             linear.axhline(height, color=_GREY, lw=1.0, ls=":", label=label)
         else:
             linear.plot([], [], " ", label=f"{label}, above the plot")
         linear.set_ylabel("linear error / mm")
         linear.set_title(
-            f"linear: mean {1e3 * figures.linear_mean_m:.2f} mm, sigma "
-            f"{1e3 * figures.linear_sigma_m:.2f} mm, worst {1e3 * figures.linear_worst_m:.2f} mm",
+            f"linear: mean {1e3 * score.position_mean_m:.2f} mm, sigma "
+            f"{1e3 * score.position_sigma_m:.2f} mm, worst {1e3 * score.position_max_m:.2f} mm",
             fontsize=10,
         )
-        turns, sigma = np.degrees(errors.error[:, 2]), np.degrees(errors.sigma[:, 1])
+        turns, sigma = np.degrees(theta), np.degrees(errors.sigma[:, 1])
         angular.axhline(0.0, color=_GREY, lw=0.8)
         angular.errorbar(
             at, turns, yerr=np.where(np.isfinite(sigma), sigma, 0.0), fmt="o", color=_BLUE,
@@ -405,9 +406,9 @@ def draw_errors(
         angular.set_ylabel("angular error / deg")
         angular.set_xlabel("reference pose")
         angular.set_title(
-            f"angular: mean {math.degrees(figures.angular_mean_rad):+.3f} deg, sigma "
-            f"{math.degrees(figures.angular_sigma_rad):.3f} deg, worst "
-            f"{math.degrees(figures.angular_worst_rad):.3f} deg",
+            f"angular: mean {math.degrees(score.angle_mean_rad):+.3f} deg, sigma "
+            f"{math.degrees(score.angle_sigma_rad):.3f} deg, worst "
+            f"{math.degrees(score.angle_max_rad):.3f} deg",
             fontsize=10,
         )
         for axes in (linear, angular):
@@ -421,11 +422,11 @@ def draw_errors(
         where = figure.add_subplot(grid[:, 1])
         if building is not None:
             draw_walls(where, building)
-        poses, shown = np.array([r.pose for r in errors.references]), errors.error
+        poses = errors.reference_poses.poses
         span = float(np.ptp(poses[:, :2], axis=0).max()) if len(poses) > 1 else 1.0
-        factor = _round_factor(0.12 * max(span, 1.0) / max(figures.linear_worst_m, 1e-6))
+        factor = _round_factor(0.12 * max(span, 1.0) / max(score.position_max_m, 1e-6))
         where.quiver(
-            poses[:, 0], poses[:, 1], factor * shown[:, 0], factor * shown[:, 1], angles="xy",
+            poses[:, 0], poses[:, 1], factor * x, factor * y, angles="xy",
             scale_units="xy", scale=1.0, color=_BLUE, width=0.004, zorder=3,
         )  # fmt: skip
         ahead = poses[:, :2] + 0.2 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import parse_numbers, read_rows
+from redetect.groundtruth.files import parse_numbers, read_rows, read_table
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
@@ -171,49 +171,11 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
         If the file cannot be read, a row is malformed or a prefix is listed twice.
     """
     times: dict[str, float] = {}
-    for line, words in read_rows(path):
-        if len(words) != 2:
-            raise StreamError(path, line, f"{len(words)} words: expected a prefix and seconds")
-        prefix = words[0]
+    for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):
         if prefix in times:
             raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
-        times[prefix] = parse_numbers(path, line, words[1:])[0]
+        times[prefix] = seconds
     return times
-
-
-def read_rows_of_numbers(
-    path: str | os.PathLike[str], columns: int, expected: str, *, head: str = ""
-) -> FloatArray:
-    """Read rows of numbers between commas or blanks; blank lines and `#` comments are skipped.
-
-    Parameters
-    ----------
-    columns : int
-        Numbers in every row.
-    expected : str
-        What they are, for messages.
-    head : str
-        Names between commas that may be on the first line.
-
-    Returns
-    -------
-    (N, columns) float64
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read, is empty or a row is malformed; it names file and line.
-    """
-    rows: list[list[float]] = []
-    for line, words in read_rows(path):
-        if not rows and words == head.split(","):
-            continue
-        if len(words) != columns:
-            raise StreamError(path, line, f"{len(words)} numbers: expected {columns}: {expected}")
-        rows.append(parse_numbers(path, line, words))
-    if not rows:
-        raise StreamError(path, None, f"no rows in it: expected {expected}")
-    return np.array(rows)
 
 
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:

@@ -1,21 +1,275 @@
-"""The scanners on board against the building's walls: errors of ranges, and where they are mounted.
+"""What the scanners on board see at the reference poses, against the building's walls.
 
-Both use what the scanners saw while the robot stood still at its reference poses.
+The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
+fit to the walls starts there, and the two results are combined by their covariances, unless the
+walls leave a direction undetermined or the results disagree. If distances leave several poses, the
+walls decide. From all of them follow the errors of ranges, and where the scanners are mounted.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc
 
 from redetect.array_types import FloatArray
+from redetect.groundtruth.errors import GeometryError
+from redetect.groundtruth.fusion.clock import ClockModel
+from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
-from redetect.groundtruth.validation.reference_poses_scans import ReferencePose
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
 from redetect.plane import apply, compose, rotation
+
+ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
+
+# The robot is at rest for this long before and after the distances' time; it has moved if a quarter
+# of the beams change by more than this within that time. Along a corridor only the beams to its
+# ends change; a passer-by hides fewer.
+_STILL_S = 0.5
+_MOVED_M, _MOVED_SHARE = 0.03, 0.25
+# The first gate of the fit to the walls, how it narrows, to three times as much, and how well the
+# walls must determine each direction (m).
+_GATE_M = 0.2
+_NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
+_WEAK_SIGMA_M = 0.05
+# Distances and walls disagree if right ones would by as much in less than this share.
+_DISAGREEMENT_PROBABILITY = 1e-4
+# The walls decide among several poses if at least this share of the points is on a wall, and the
+# share at the next pose is smaller by at least this fraction.
+_LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Onboard:
+    """A scanner on board and its scans, on the robot's clock."""
+
+    scanner: Scanner  # Its pose is in the robot's frame
+    scans: Scans
+
+
+class StillScans(NamedTuple):
+    """What the scanners on board see while the robot is at rest."""
+
+    scanners: tuple[Scanner, ...]
+    scans: tuple[StillScan, ...]
+
+    @property
+    def mounts(self) -> FloatArray:
+        """(scanners, 3) poses of the scanners in the robot's frame."""
+        return np.stack([scanner.pose for scanner in self.scanners])
+
+    def robot_points(self) -> FloatArray:
+        """(N, 2) all points in the robot's frame (m)."""
+        return np.concatenate([apply(m, s.points) for m, s in zip(self.mounts, self.scans)])
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePose:
+    """A reference pose, and how it came about."""
+
+    distances: DistancePose
+    pose: FloatArray  # (3,): x, y (m), theta (rad)
+    covariance: FloatArray  # (3, 3)
+    # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
+    # `moved`: the robot was not at rest; `no scans`: too few readings are on walls; `not asked`.
+    scans: ScanStatus
+    note: str  # Remarks
+    points: int = 0  # Points of the scans on walls that count
+    rms_m: float = math.nan  # Of their distances from the walls; NaN without.
+    still: StillScans | None = None  # What the scanners on board saw, at rest
+
+    @property
+    def index(self) -> int:
+        """Its number in the file of distances."""
+        return self.distances.index
+
+    @property
+    def time_s(self) -> float:
+        """When it was measured, on the ground truth's clock."""
+        return self.distances.time_s
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A pose that is no reference, and why."""
+
+    index: int
+    time_s: float
+    status: str
+    reason: str
+
+
+def reference_poses(
+    distances: Sequence[DistancePose],
+    onboard: Sequence[Onboard] = (),
+    segments: FloatArray | None = None,
+    clock: ClockModel | None = None,
+) -> tuple[list[ReferencePose], list[Refused]]:
+    """Poses from distances, refined by scans where these help.
+
+    Parameters
+    ----------
+    distances : sequence of DistancePose
+        From `redetect.groundtruth.validation.reference_poses.poses_from_distances`.
+    onboard : sequence of Onboard
+        Scanners on board; without any, distances alone count.
+    segments : (S, 4) array, optional
+        The building's walls, needed with scanners.
+    clock : ClockModel, optional
+        Without it the robot's clock is assumed to be the ground truth's.
+
+    Returns
+    -------
+    refused : list of Refused
+        Those that distances leave ambiguous, undetermined or inconsistent.
+    """
+    references: list[ReferencePose] = []
+    refused: list[Refused] = []
+    for d in distances:
+        reference, reason = None, d.reason
+        if d.status in ("ok", "ambiguous") and onboard and segments is not None:
+            time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
+            reason = f"{d.reason}; the walls do not decide"
+            try:
+                reference = refine_pose(d, still_scans(onboard, time), segments)
+            except GeometryError as error:
+                if d.status == "ok":
+                    reference = _unrefined(d, "moved", str(error))
+        elif d.status == "ok":
+            reference = _unrefined(d, "not asked")
+        if reference is None:
+            refused.append(Refused(d.index, d.time_s, d.status, reason))
+        else:
+            references.append(reference)
+    return references, refused
+
+
+def _unrefined(
+    d: DistancePose,
+    scans: ScanStatus,
+    reason: str = "",
+    chosen: int = 0,
+    still: StillScans | None = None,
+) -> ReferencePose:
+    """The pose by distances alone."""
+    note = "; ".join(part for part in (d.reason, reason) if part)
+    pose, covariance = d.candidates[chosen], d.covariances[chosen]
+    return ReferencePose(d, pose, covariance, scans, note, still=still)
+
+
+def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
+    """Average the readings of the on-board scanners about a time.
+
+    `time_s`: on the robot's clock. Raises `GeometryError` if the robot moved then.
+    """
+    scans, changes = [], [np.zeros(0)]
+    for board in onboard:
+        ranges = board.scans.ranges_mm[np.abs(board.scans.times_s - time_s) <= _STILL_S]
+        scans.append(still_scan(board.scanner, ranges))
+        half = len(ranges) // 2
+        if half >= 2:
+            metres = np.where(board.scanner.has_return(ranges), 1e-3 * ranges, np.nan)
+            changes.append(np.abs(_median(metres[half:]) - _median(metres[:half])))
+    change = np.concatenate(changes)
+    change = change[np.isfinite(change)]
+    if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > _MOVED_M:
+        raise GeometryError(
+            f"moved: a quarter of the beams change by more than {typical:.3f} m: expected a robot "
+            f"at rest for {2.0 * _STILL_S:g} s"
+        )
+    return StillScans(tuple(board.scanner for board in onboard), tuple(scans))
+
+
+def _median(metres: FloatArray) -> FloatArray:
+    """(readings,) medians of each beam's returns; NaN where most scans had none."""
+    enough = np.mean(np.isfinite(metres), axis=0) >= 0.5
+    middle = np.full(metres.shape[1], np.nan)
+    middle[enough] = np.nanmedian(metres[:, enough], axis=0)
+    return middle
+
+
+def refine_pose(
+    distances: DistancePose, still: StillScans, segments: FloatArray
+) -> ReferencePose | None:
+    """Combine what distances and walls say of a pose.
+
+    Parameters
+    ----------
+    distances : DistancePose
+        Of status `ok`, or `ambiguous`: then the walls decide, or nothing does.
+    segments : (S, 4) array
+        The building's walls (m).
+
+    Returns
+    -------
+    ReferencePose or None
+        None if several poses fit and the walls do not decide.
+    """
+    chosen = 0
+    if distances.status == "ambiguous":
+        decided = _decided(distances, still, segments)
+        if decided is None:
+            return None
+        chosen = decided
+    prior, covariance = distances.candidates[chosen], distances.covariances[chosen]
+    try:
+        found = _by_walls(still, segments, prior)
+    except GeometryError as error:
+        return _unrefined(distances, "no scans", str(error), chosen)
+    if found.open_directions:
+        reason = "the walls leave a direction open"
+        return _unrefined(distances, "undetermined", reason, chosen, still)
+    of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
+    own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
+    apart = found.pose - prior
+    apart[2] = wrap_angle(apart[2])
+    misfit = float(apart @ np.linalg.solve(own + covariance, apart))
+    if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
+        reason = (
+            f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
+            "from the pose by distances, more than both allow"
+        )
+        return _unrefined(distances, "disagrees", reason, chosen, still)
+    gain = np.linalg.solve(own + covariance, covariance).T
+    pose = prior + gain @ apart
+    pose[2] = wrap_angle(pose[2])
+    # Joseph's form stays symmetric and positive.
+    rest = np.eye(3) - gain
+    combined = rest @ covariance @ rest.T + gain @ own @ gain.T
+    return ReferencePose(
+        distances, pose, combined, "used", distances.reason, found.used, found.rms_m, still
+    )
+
+
+def _by_walls(still: StillScans, segments: FloatArray, start: FloatArray) -> WallFit:
+    return fit_to_walls(
+        still.scans, still.mounts, segments, start, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
+    )
+
+
+def _decided(distances: DistancePose, still: StillScans, segments: FloatArray) -> int | None:
+    """Which candidate's points are on walls, if those of one only are."""
+    count = sum(len(scan.range_m) for scan in still.scans)
+    shares = []
+    for pose in distances.candidates:
+        try:
+            shares.append(_by_walls(still, segments, pose).used / count)
+        except GeometryError:
+            shares.append(0.0)
+    order = np.argsort(shares)[::-1]
+    best, next_best = shares[order[0]], shares[order[1]]
+    if best < _LEAST_SHARE or next_best > (1.0 - _LEAST_SHARE) * best:
+        return None
+    return int(order[0])
+
 
 #: Readings farther from the wall that their beam meets are of something else (m).
 _OF_A_WALL_M = 0.2
@@ -66,14 +320,12 @@ def range_errors(references: Sequence[ReferencePose], segments: FloatArray) -> R
     for reference in references:
         if reference.still is None or reference.scans != "used":
             continue
-        for scanner, points in zip(reference.still.scanners, reference.still.scanner_points):
-            pose = compose(reference.pose, scanner.pose)
-            reading = np.hypot(points[:, 0], points[:, 1])
-            directions = points @ rotation(pose[2]).T / reading[:, None]
-            far, incidence = first_walls(pose[:2], directions, segments)
-            of_a_wall = np.abs(reading - far) < _OF_A_WALL_M
+        for mount, scan in zip(reference.still.mounts, reference.still.scans):
+            pose = compose(reference.pose, mount)
+            far, incidence = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
+            of_a_wall = np.abs(scan.range_m - far) < _OF_A_WALL_M
             angles.append(incidence[of_a_wall])
-            errors.append((reading - far)[of_a_wall])
+            errors.append((scan.range_m - far)[of_a_wall])
     return RangeErrors(np.concatenate(angles), np.concatenate(errors))
 
 
@@ -95,7 +347,7 @@ def refine_mounts(
         return None
     priors = np.stack([r.distances.candidates[0] for r in used])
     roots = whitening(np.stack([r.distances.covariances[0] for r in used]))
-    mounts = np.stack([scanner.pose for scanner in stills[0].scanners])
+    mounts = stills[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
     along = segments[:, 2:] - segments[:, :2]
     normals = np.column_stack([-along[:, 1], along[:, 0]])
@@ -103,8 +355,8 @@ def refine_mounts(
     for gate in _GATES_M:
         rows, errors = [], []
         for r, still in enumerate(stills):
-            for m, cloud in enumerate(still.scanner_points):
-                world = apply(compose(poses[r], mounts[m]), cloud)
+            for m, scan in enumerate(still.scans):
+                world = apply(compose(poses[r], mounts[m]), scan.points)
                 target, index, squared = nearest_on_segments(world, segments)
                 near = squared <= gate * gate
                 normal, world = normals[index[near]], world[near]

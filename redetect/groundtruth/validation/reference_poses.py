@@ -6,6 +6,11 @@
 All minima are searched, from starts all round: distances to two points, or to points on a line, fit
 mirrored poses as well. A pose is accepted only if it is determined, no other fits nearly as well,
 and its distances agree within their noise, except for gross errors that can be identified.
+
+What was measured in the building by tape is held against the drawing: ``dimensions.csv`` has the
+head ``name,x1_m,y1_m,x2_m,y2_m,measured_m`` and a row for each distance between two points of the
+drawing; ``fiducial_distances.csv`` has the head ``a,b,distance_m`` and a row for each distance
+between two fiducials.
 """
 
 from __future__ import annotations
@@ -17,17 +22,18 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import JsonObject, read_rows
+from redetect.groundtruth.files import JsonObject, known_name, read_table
 from redetect.landmarks import wrap_angle
-from redetect.plane import rotation
+from redetect.plane import apply, fitted, rotation
 from redetect.storage.bounds import ABOVE_0
-from redetect.storage.messages import excerpt
 
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
+_ENDS = ("point", "fiducial")
 _FARTHEST_M = 1e6
 
 
@@ -46,8 +52,7 @@ class Distance:
 
     pose: int  # Number of the reference pose
     time_s: float  # When, on the ground truth's clock
-    # `point`, `fiducial`: The two ends
-    point: str
+    point: str  # The two ends
     fiducial: str
     distance_m: float
 
@@ -84,10 +89,13 @@ def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distanc
     StreamError
         If the file cannot be read, a row is malformed or names a point that is not known.
     """
-    rows: list[Distance] = []
-    for line, words in read_rows(path):
-        if rows or words != DISTANCES_HEAD.split(","):
-            rows.append(_distance(path, line, words, survey))
+    rows = []
+    for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
+        if pose < 0.0 or pose % 1.0 or not 0.0 <= distance_m < _FARTHEST_M:
+            raise StreamError(path, line, "expected a whole pose and a distance of 0 or more")
+        point = known_name(path, line, names[0], survey.robot_points)
+        fiducial = known_name(path, line, names[1], survey.fiducials)
+        rows.append(Distance(int(pose), time_s, point, fiducial, distance_m))
     return rows
 
 
@@ -101,23 +109,6 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
         if not np.all(np.abs(point) < _FARTHEST_M):
             raise entries.wrong(name, f"less than {_FARTHEST_M:g} m")
     return points
-
-
-def _distance(
-    path: str | os.PathLike[str], number: int, words: list[str], survey: Survey
-) -> Distance:
-    if len(words) != 5:
-        raise StreamError(path, number, f"{len(words)} words: expected {DISTANCES_HEAD}")
-    try:
-        pose, time, distance = int(words[0]), float(words[1]), float(words[4])
-    except ValueError:
-        raise StreamError(path, number, f"expected numbers in {DISTANCES_HEAD}") from None
-    if pose < 0 or not np.isfinite(time) or not 0.0 <= distance < _FARTHEST_M:
-        raise StreamError(path, number, "expected a pose and a distance of 0 or more, finite")
-    for name, known in ((words[2], survey.robot_points), (words[3], survey.fiducials)):
-        if name not in known:
-            raise StreamError(path, number, f"{excerpt(name)}: expected one of {', '.join(known)}")
-    return Distance(pose, time, words[2], words[3], distance)
 
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
@@ -358,3 +349,85 @@ def _wide_pairs(fiducials: FloatArray) -> list[tuple[int, int]]:
             apart[[k, m], :] = -1.0
             apart[:, [k, m]] = -1.0
     return pairs or [(0, 1)]
+
+
+DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
+FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
+
+
+class Dimension(NamedTuple):
+    """A distance that the drawing has and that was measured."""
+
+    name: str
+    drawn_m: float
+    measured_m: float
+
+
+class FiducialDistance(NamedTuple):
+    """A measured distance between two fiducials."""
+
+    a: str
+    b: str
+    distance_m: float
+
+
+class SurveyedFiducials(NamedTuple):
+    """Where F fiducials are by the distances between them."""
+
+    names: tuple[str, ...]
+    places: FloatArray  # (F, 2): moved rigidly onto those of the drawing (m)
+    drawn: FloatArray  # (F, 2): in the drawing (m)
+    sigma_m: FloatArray  # (F, 2): standard deviations of the places, by those of the distances
+    residuals_m: FloatArray  # (K,): measured distances minus those between the places
+
+
+def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
+    """Read a ``dimensions.csv``."""
+    found = []
+    for _, (name,), (x1, y1, x2, y2, measured) in read_table(path, DIMENSIONS_HEAD, ("name",)):
+        found.append(Dimension(name, math.hypot(x2 - x1, y2 - y1), measured))
+    return found
+
+
+def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> list[FiducialDistance]:
+    """Read a ``fiducial_distances.csv``, which may name the survey's fiducials only."""
+    found = []
+    for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):
+        a, b = (known_name(path, line, name, survey.fiducials) for name in names)
+        found.append(FiducialDistance(a, b, distance))
+    return found
+
+
+def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> SurveyedFiducials:
+    """Work the places of fiducials out from the distances between them, by least squares.
+
+    Distances leave a rigid motion open: the places are moved onto those of the drawing, and the
+    deviations are those of a free network (of least trace).
+
+    Raises
+    ------
+    GroundTruthError
+        If the distances leave more than that open.
+    """
+    names = tuple(survey.fiducials)
+    drawn = np.stack([survey.fiducials[name] for name in names])
+    ends = np.array([(names.index(d.a), names.index(d.b)) for d in distances]).reshape(-1, 2)
+    measured = np.array([d.distance_m for d in distances])
+
+    def residuals(flat: FloatArray) -> FloatArray:
+        apart = flat.reshape(-1, 2)[ends[:, 0]] - flat.reshape(-1, 2)[ends[:, 1]]
+        return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) - measured)
+
+    found = least_squares(residuals, drawn.ravel(), xtol=1e-12, ftol=1e-12)
+    if np.linalg.matrix_rank(found.jac, tol=1e-6) < 2 * len(names) - 3:
+        raise GroundTruthError(
+            f"{len(measured)} distances leave the places of {len(names)} fiducials open"
+        )
+    places = found.x.reshape(-1, 2)
+    motion = fitted(places, drawn)
+    variances = survey.sigma_m**2 * np.linalg.pinv(found.jac.T @ found.jac, rcond=1e-9)
+    each = np.arange(len(names))
+    blocks = variances.reshape(len(names), 2, len(names), 2)[each, :, each]
+    turned = rotation(motion[2]) @ blocks @ rotation(motion[2]).T
+    sigma = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
+    return SurveyedFiducials(names, apply(motion, places), drawn, sigma, -found.fun)

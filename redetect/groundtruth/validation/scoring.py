@@ -1,25 +1,34 @@
-"""Compares poses with the truth: absolute and relative errors, and their covariances."""
+"""Compares poses with the truth or reference poses: errors, and whether covariances are right.
+
+A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of freedom.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.files import read_table
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
     pose_differences,
-    read_rows_of_numbers,
 )
+from redetect.groundtruth.validation.onboard import ReferencePose, Refused
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.plane import between
 
 #: Covariances that files round to six decimals are singular below this.
 LEAST_CORRELATION = 1e-9
+#: The pose nearest in time to a reference pose is at most as far from it (s).
+_FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -28,17 +37,13 @@ class PoseScore:
 
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
-    # `position_mean_m`, `position_sigma_m`, `position_rmse_m`, `position_max_m`: Of the distances
-    # from the truth; sigma with N - 1.
-    position_mean_m: float
+    position_mean_m: float  # Of the distances from the truth; sigma with N - 1
     position_sigma_m: float
     position_rmse_m: float
     position_max_m: float
-    # `angle_mean_rad`, `angle_sigma_rad`, `angle_max_rad`: Of the signed differences of heading;
-    # the largest without sign.
-    angle_mean_rad: float
+    angle_mean_rad: float  # Of the signed differences of heading
     angle_sigma_rad: float
-    angle_max_rad: float
+    angle_max_rad: float  # Without sign
     angle_abs_mean_rad: float  # Mean of the differences without sign
     position_median_m: float
     normalised: int  # Poses whose covariance could be inverted
@@ -59,16 +64,8 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
     """
     error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
-    normalised, count = float("nan"), 0
-    if poses.covariances is not None:
-        covariances = poses.covariances
-        if truth.covariances is not None:
-            covariances = covariances + truth.covariances
-        usable = is_positive_definite(covariances, LEAST_CORRELATION)
-        count = int(usable.sum())
-        if count:
-            squared = squared_mahalanobis(error[usable], covariances[usable])
-            normalised = float(np.mean(squared) / 3.0)
+    normalised = normalised_errors(poses, truth)
+    normalised = normalised[np.isfinite(normalised)]
     return PoseScore(
         len(poses),
         unmatched,
@@ -81,9 +78,29 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
         float(np.abs(error[:, 2]).max()),
         float(np.abs(error[:, 2]).mean()),
         float(np.median(distance)),
-        count,
-        normalised,
+        len(normalised),
+        float(normalised.mean()) if len(normalised) else float("nan"),
     )
+
+
+def normalised_errors(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
+    """(N,) normalised errors of poses; NaN where a covariance cannot be inverted."""
+    found = np.full(len(poses), np.nan)
+    if poses.covariances is not None:
+        both = poses.covariances
+        if truth.covariances is not None:
+            both = both + truth.covariances
+        usable = is_positive_definite(poses.covariances, LEAST_CORRELATION)
+        usable &= is_positive_definite(both, LEAST_CORRELATION)
+        error = pose_differences(poses.poses, truth.poses)[usable]
+        found[usable] = squared_mahalanobis(error, both[usable]) / 3.0
+    return found
+
+
+def normalised_band(count: int) -> tuple[float, float]:
+    """Between which 95 % of the means of so many independent, right normalised errors lie."""
+    low, high = (float(v) / (3 * count) for v in chdtri(3 * count, (0.975, 0.025)))
+    return low, high
 
 
 def sigma_of(values: FloatArray) -> float:
@@ -95,9 +112,8 @@ def sigma_of(values: FloatArray) -> float:
 class Relations:
     """Poses of the robot at one time relative to another."""
 
-    # `from_s`, `to_s`: (N,): the two times (s); either may be the earlier one.
-    from_s: FloatArray
-    to_s: FloatArray
+    from_s: FloatArray  # (N,)
+    to_s: FloatArray  # (N,): may be the earlier one
     # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
     from_to: FloatArray
 
@@ -111,15 +127,12 @@ class RelativeScore:
 
     pairs: int  # Pairs of times compared with the truth
     unmatched: int  # Pairs that one side has no pose for, or that are too far apart
-    # `position_mean_m`, `position_sigma_m`, `position_median_m`, `position_rmse_m`,
-    # `position_max_m`: Of the lengths of the relative errors' translations; sigma with N - 1.
-    position_mean_m: float
+    position_mean_m: float  # Of the lengths of the errors' translations; sigma with N - 1
     position_sigma_m: float
     position_median_m: float
     position_rmse_m: float
     position_max_m: float
-    # `angle_rmse_rad`, `angle_abs_mean_rad`, `angle_max_rad`: Of the relative errors' rotations
-    angle_rmse_rad: float
+    angle_rmse_rad: float  # Of the errors' rotations
     angle_abs_mean_rad: float
     angle_max_rad: float
 
@@ -134,7 +147,10 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
     StreamError
         If the file cannot be read or a row is malformed; the message names file and line.
     """
-    table = read_rows_of_numbers(path, 8, "t_i, t_j, x, y, z, roll, pitch, yaw")
+    rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
+    if not rows:
+        raise StreamError(path, None, "no relations in it")
+    table = np.array([row.numbers for row in rows])
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 
 
@@ -217,3 +233,91 @@ def _at(
     result[order[found]] = interpolated.poses
     known[order[found]] = True
     return result, known
+
+
+@dataclass(frozen=True)
+class Published:
+    """Figures that RAWSEEDS printed for a ground truth (deliverable D2.1, part 2)."""
+
+    name: str
+    position_mean_m: float
+    position_sigma_m: float
+    angle_mean_deg: float
+    angle_sigma_deg: float
+
+
+#: Over 23 reference poses.
+PUBLISHED = (
+    Published("RAWSEEDS, laser", 0.020, 0.011, 0.15, 1.56),
+    Published("RAWSEEDS, cameras", 0.112, 0.090, -0.80, 2.16),
+)
+
+
+class ReferenceErrors(NamedTuple):
+    """How far a ground truth is from E reference poses."""
+
+    references: list[ReferencePose]  # Those at whose time there is ground truth
+    poses: PlanarPoses  # The ground truth there, the pose nearest in time
+    reference_poses: PlanarPoses  # The references as a stream
+
+    @property
+    def error(self) -> FloatArray:
+        """(E, 3) ground truth minus reference: x, y (m), theta (rad), the short way round."""
+        return pose_differences(self.poses.poses, self.reference_poses.poses)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(E, 2) standard deviations of position (m) and heading (rad) by both covariances.
+
+        Of the position, the root of the trace; NaN if the ground truth has none, or a singular one.
+        """
+        found = np.full((len(self.poses), 2), np.nan)
+        if self.poses.covariances is not None and self.reference_poses.covariances is not None:
+            both = self.poses.covariances + self.reference_poses.covariances
+            variances = np.stack([both[:, 0, 0] + both[:, 1, 1], both[:, 2, 2]], axis=-1)
+            usable = np.isfinite(normalised_errors(self.poses, self.reference_poses))
+            found[usable] = np.sqrt(variances[usable])
+        return found
+
+
+def stream_of(references: Sequence[ReferencePose]) -> PlanarPoses:
+    """Reference poses, in order of time, as a stream with covariances."""
+    return PlanarPoses(
+        np.array([r.time_s for r in references]),
+        np.array([r.pose for r in references]).reshape(-1, 3),
+        np.array([r.covariance for r in references]).reshape(-1, 3, 3),
+    )
+
+
+def reference_errors(
+    references: Sequence[ReferencePose], poses: PlanarPoses
+) -> tuple[ReferenceErrors, list[Refused]]:
+    """Errors of a ground truth at reference poses.
+
+    Parameters
+    ----------
+    references : sequence of ReferencePose
+        In order of time.
+    poses : PlanarPoses
+        The ground truth. The pose nearest in time is used, as the robot is at rest: the covariance
+        of an interpolated pose would depend on the unknown correlation of their errors; but not
+        one more than half a second away.
+
+    Returns
+    -------
+    without : list of Refused
+        References at whose time there is no ground truth.
+    """
+    times = np.array([r.time_s for r in references])
+    after = np.clip(np.searchsorted(poses.times_s, times), 0, len(poses) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = times - poses.times_s[before] <= np.abs(poses.times_s[after] - times)
+    nearest = np.where(earlier, before, after)
+    known = np.abs(poses.times_s[nearest] - times) <= _FARTHEST_S
+    without = [
+        Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")
+        for r, there in zip(references, known)
+        if not there
+    ]
+    there = [r for r, found in zip(references, known) if found]
+    return ReferenceErrors(there, poses.only(nearest[known]), stream_of(there)), without

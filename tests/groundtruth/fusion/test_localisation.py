@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.clocks.sync import synchronise
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.fuse import fuse, leave_out
+from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, moved_poses, write_planar_poses
 from redetect.landmarks import wrap_angle

@@ -164,9 +164,9 @@ def test_files_that_are_no_drawing_are_refused(tmp_path: Path, data: bytes) -> N
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no rows"),
-        ("x1_m,y1_m,x2_m,y2_m\n", "no rows"),
-        ("1,2,3\n", ":1: 3 numbers"),
+        ("", "expected walls"),
+        ("x1_m,y1_m,x2_m,y2_m\n", "expected walls"),
+        ("1,2,3\n", ":1: 3 words"),
         ("1,2,3,4\n1,2,3,nan\n", ":2: "),
         ("1,2,3,4\nx1_m,y1_m,x2_m,y2_m\n", ":2: "),
         ("1,2,3,1e7\n", "farther away"),

@@ -7,22 +7,20 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.sets import (
-    ScannerTables,
+from redetect.groundtruth.lasers.acquisition import (
+    fixed_scanners,
     learn_background,
-    scanner_tables,
     sets_of_scans,
 )
+from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.lasers.tracking_kernels import FixedScanners
 from tests.groundtruth.lasers.scene import empty_scans, four_scanners
 
 FloatArray = NDArray[np.float64]
 
 
-def tables_of(scanners: tuple[Scanner, ...]) -> ScannerTables:
-    empties = empty_scans(scanners, 7)
-    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
-    return scanner_tables(scanners, backgrounds)
+def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
+    return fixed_scanners(scanners, empty_scans(scanners, 7))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +29,7 @@ def scanners() -> tuple[Scanner, ...]:
 
 
 @pytest.fixture(scope="module")
-def tables(scanners: tuple[Scanner, ...]) -> ScannerTables:
+def tables(scanners: tuple[Scanner, ...]) -> FixedScanners:
     return tables_of(scanners)
 
 
@@ -48,7 +46,7 @@ def test_background_is_learned() -> None:
 
 
 def test_background_raises_no_false_alarm(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     fresh = empty_scans(scanners, 99, 300)
     for k, scans in enumerate(fresh):

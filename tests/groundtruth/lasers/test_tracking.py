@@ -14,21 +14,15 @@ from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
-    AGREES_M,
+    ScanSets,
     acquire,
-    explain,
+    fixed_scanners,
     refine,
     robot_body,
+    sets_of_scans,
 )
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
-from redetect.groundtruth.lasers.sets import (
-    ScannerTables,
-    ScanSets,
-    learn_background,
-    scanner_tables,
-    sets_of_scans,
-)
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -40,7 +34,13 @@ from redetect.groundtruth.lasers.tracking import (
     track_robot,
     track_without_suspects,
 )
-from redetect.groundtruth.lasers.tracking_kernels import Beams, Seen, explain_set, new_points
+from redetect.groundtruth.lasers.tracking_kernels import (
+    FixedScanners,
+    ScanSet,
+    Seen,
+    explain_set,
+    new_points,
+)
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
@@ -62,10 +62,8 @@ from tests.groundtruth.lasers.scene import (
 FloatArray = NDArray[np.float64]
 
 
-def tables_of(scanners: tuple[Scanner, ...]) -> ScannerTables:
-    empties = empty_scans(scanners, 7)
-    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
-    return scanner_tables(scanners, backgrounds)
+def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
+    return fixed_scanners(scanners, empty_scans(scanners, 7))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +72,7 @@ def scanners() -> tuple[Scanner, ...]:
 
 
 @pytest.fixture(scope="module")
-def tables(scanners: tuple[Scanner, ...]) -> ScannerTables:
+def tables(scanners: tuple[Scanner, ...]) -> FixedScanners:
     return tables_of(scanners)
 
 
@@ -89,11 +87,8 @@ def one_set(
     return sets_of_scans(scans, 0.01)
 
 
-def seen_in(sets: ScanSets, tables: ScannerTables, pose: FloatArray, index: int = 0) -> Seen:
-    return new_points(
-        sets.ranges_mm, sets.rows[index], tables.as_beams(), pose[:2], 2.0, np.zeros(5),
-        sets.ages_s[index],
-    )  # fmt: skip
+def seen_in(sets: ScanSets, tables: FixedScanners, pose: FloatArray, index: int = 0) -> Seen:
+    return new_points(sets[index], tables, pose[:2], 2.0, np.zeros(5))
 
 
 def test_points_are_moved_on_with_the_robot() -> None:
@@ -108,11 +103,12 @@ def test_points_are_moved_on_with_the_robot() -> None:
     ray = place - origin
     length = np.hypot(*ray)
     ranges = np.array([[round(1e3 * length)]], dtype=np.uint16)
-    points, _, _, range_m = new_points(
-        ranges, np.zeros(1, dtype=np.int64),
-        Beams(np.full((1, 1), 1e9), (ray / length)[None, None], origin[None]), pose[:2], 1.0,
-        np.array([*motion, *pose[:2]]), np.array([age]),
-    )  # fmt: skip
+    scan = ScanSet(ranges, np.zeros(1, dtype=np.int64), np.array([age]))
+    fixed = FixedScanners(
+        np.full((1, 1), 1e9), (ray / length)[None, None], origin[None], np.ones(1), np.eye(3)
+    )
+    about = np.array([*motion, *pose[:2]])
+    points, _, _, range_m = new_points(scan, fixed, pose[:2], 1.0, about)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     expected = pose[:2] + np.array([c * mark[0] - s * mark[1], s * mark[0] + c * mark[1]])
     assert points[0] == pytest.approx(expected, abs=6e-4)  # readings are in millimetres
@@ -122,7 +118,7 @@ def test_points_are_moved_on_with_the_robot() -> None:
 # --- one set
 
 
-def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: ScannerTables) -> Seen:
+def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: FixedScanners) -> Seen:
     """Readings without noise nor rounding."""
     from tests.groundtruth.lasers.scene import cast
 
@@ -131,7 +127,7 @@ def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: ScannerTables
         walls = cast(one.pose, one.angles_rad, ROOM)
         ranges = cast(one.pose, one.angles_rad, sides(FRONTED, pose))
         hit = ranges < walls
-        beams = tables.beams[k][hit]
+        beams = tables.direction[k][hit]
         parts[0].append(one.pose[:2] + ranges[hit, None] * beams)
         parts[1].append(np.full(int(hit.sum()), k))
         parts[2].append(beams)
@@ -141,7 +137,7 @@ def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: ScannerTables
 
 
 def test_exact_readings_give_the_exact_pose(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     pose = np.array([4.0, 2.9, 0.5])
     body = robot_body(FRONTED)
@@ -158,7 +154,7 @@ def test_exact_readings_give_the_exact_pose(
 
 
 def test_derivatives_by_the_scanners_poses(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     """Moving a scanner moves the pose as the kernel says: finite differences."""
     pose, body, settings = np.array([4.0, 2.9, 0.5]), robot_body(FRONTED), LaserSettings()
@@ -184,7 +180,7 @@ def test_derivatives_by_the_scanners_poses(
             assert refined.by_scanner[:, 3 * k + axis] == pytest.approx(numeric, abs=2e-3)
 
 
-def test_covariance_of_a_set_is_right(scanners: tuple[Scanner, ...], tables: ScannerTables) -> None:
+def test_covariance_of_a_set_is_right(scanners: tuple[Scanner, ...], tables: FixedScanners) -> None:
     rng, body, settings = np.random.default_rng(3), robot_body(FRONTED), LaserSettings()
     squared = []
     for _ in range(300):
@@ -202,24 +198,18 @@ def test_covariance_of_a_set_is_right(scanners: tuple[Scanner, ...], tables: Sca
 
 
 def test_beams_that_agree_see_through_and_are_hidden(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     pose, body = np.array([4.0, 2.9, 0.5]), robot_body(FRONTED)
     sets = one_set(scanners, pose, FRONTED, None)
-    expected, agree, through, hidden, none, beside = explain(sets, 0, tables, body, pose)
+    expected, agree, through, hidden, none, beside = explain_set(sets[0], tables, body, pose)
     assert agree == expected > 25
     assert through == hidden == none == beside == 0
-    away = explain(sets, 0, tables, body, pose + np.array([0.0, 1.2, 0.0]))
+    away = explain_set(sets[0], tables, body, pose + np.array([0.0, 1.2, 0.0]))
     assert away[1] < 0.2 * away[0]
     assert away[2] > 0.5 * away[0]
-    without = sets.rows[0].copy()
-    without[:] = -1
-    assert not any(
-        explain_set(
-            sets.ranges_mm, without, tables.as_beams(), body.faces, body.middle, body.radius_m,
-            pose, AGREES_M,
-        )
-    )  # fmt: skip
+    without = sets[0]._replace(rows=np.full(len(scanners), -1))
+    assert not any(explain_set(without, tables, body, pose))
 
 
 def test_one_scanner_before_a_flat_side_leaves_a_direction_open() -> None:
@@ -240,12 +230,12 @@ def test_one_scanner_before_a_flat_side_leaves_a_direction_open() -> None:
 # --- finding it
 
 
-def test_the_robot_is_found_anywhere(scanners: tuple[Scanner, ...], tables: ScannerTables) -> None:
+def test_the_robot_is_found_anywhere(scanners: tuple[Scanner, ...], tables: FixedScanners) -> None:
     rng, body, settings = np.random.default_rng(5), robot_body(FRONTED), LaserSettings()
     found = 0
     for _ in range(20):
         pose = np.array([*rng.uniform([1.5, 1.2], [6.5, 4.6]), rng.uniform(-np.pi, np.pi)])
-        result = acquire(one_set(scanners, pose, FRONTED, rng), 0, tables, body, settings)
+        result = acquire(one_set(scanners, pose, FRONTED, rng)[0], tables, body, settings)
         if result is None:
             continue
         found += 1
@@ -255,13 +245,13 @@ def test_the_robot_is_found_anywhere(scanners: tuple[Scanner, ...], tables: Scan
     assert found >= 18
 
 
-def test_people_are_no_robot(scanners: tuple[Scanner, ...], tables: ScannerTables) -> None:
+def test_people_are_no_robot(scanners: tuple[Scanner, ...], tables: FixedScanners) -> None:
     angles = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
     legs = np.stack([0.12 * np.cos(angles), 0.12 * np.sin(angles)], axis=-1)
     rng = np.random.default_rng(6)
     for place in ([3.0, 2.0, 0.0], [5.0, 4.0, 0.3]):
         sets = one_set(scanners, np.array(place), legs, rng)
-        assert acquire(sets, 0, tables, robot_body(FRONTED), LaserSettings()) is None
+        assert acquire(sets[0], tables, robot_body(FRONTED), LaserSettings()) is None
 
 
 # --- tracks
@@ -282,7 +272,7 @@ def errors(times: FloatArray, poses: FloatArray) -> FloatArray:
     return error
 
 
-def test_a_track_through_a_loss(recorded: ScanSets, tables: ScannerTables) -> None:
+def test_a_track_through_a_loss(recorded: ScanSets, tables: FixedScanners) -> None:
     track = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     t = track.times_s
     gap = (t > 2.02) & (t < 2.98)
@@ -302,7 +292,7 @@ def test_a_track_through_a_loss(recorded: ScanSets, tables: ScannerTables) -> No
     assert np.abs(track.motion[good] @ [0.0, 0.0, 1.0] - 0.5).mean() < 0.1
 
 
-def test_combined_poses(recorded: ScanSets, tables: ScannerTables) -> None:
+def test_combined_poses(recorded: ScanSets, tables: FixedScanners) -> None:
     track = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     one, six = combined_poses(track, 1), combined_poses(track, 6)
     good = np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
@@ -319,9 +309,9 @@ def test_combined_poses(recorded: ScanSets, tables: ScannerTables) -> None:
 
 
 def test_what_all_readings_share_is_not_averaged_away(
-    scanners: tuple[Scanner, ...], recorded: ScanSets, tables: ScannerTables
+    scanners: tuple[Scanner, ...], recorded: ScanSets, tables: FixedScanners
 ) -> None:
-    shared = replace(tables, covariance=np.diag(np.tile([1e-4, 1e-4, 1e-6], 4)))
+    shared = tables._replace(covariance=np.diag(np.tile([1e-4, 1e-4, 1e-6], 4)))
     exactly = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     track = track_robot(recorded, shared, Robot(FRONTED, 1.0, 1.0))
     for sets in (1, 6):
@@ -333,7 +323,7 @@ def test_what_all_readings_share_is_not_averaged_away(
 
 
 def test_the_front_of_a_plain_box_shows_when_it_drives(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     sets = sets_of_scans(record(scanners, circle, (0.0, 3.0), PLAIN, 12))
     track = track_robot(sets, tables, Robot(PLAIN, 1.0, 1.0))
@@ -355,13 +345,7 @@ def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
     shift = np.array([0.04, -0.03, 0.01])
     wrong = (*scanners[:2], replace(scanners[2], pose=scanners[2].pose + shift), scanners[3])
     track = track_robot(recorded, tables_of(scanners), Robot(FRONTED, 1.0, 1.0))
-    moved = scanner_tables(
-        wrong,
-        [
-            learn_background(e.ranges_mm, s.max_range_m)
-            for s, e in zip(scanners, empty_scans(scanners, 7))
-        ],
-    )
+    moved = fixed_scanners(wrong, empty_scans(scanners, 7))
     off = track_robot(recorded, moved, Robot(FRONTED, 1.0, 1.0))
     size = np.hypot(off.corrections[:, 0], off.corrections[:, 1])
     assert int(np.argmax(size)) == 2
@@ -379,7 +363,7 @@ def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
 
 
 def test_a_passer_by_is_marked_and_the_effect_bounded(
-    scanners: tuple[Scanner, ...], tables: ScannerTables
+    scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     angles = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
     legs = np.stack([0.08 * np.cos(angles), 0.08 * np.sin(angles)], axis=-1)
@@ -442,5 +426,5 @@ def test_settings_are_checked() -> None:
     with pytest.raises(GroundTruthError, match="gate_m"):
         LaserSettings(gate_m=float("nan"))
     with pytest.raises(GroundTruthError, match="no scanners"):
-        scanner_tables([], [])
+        fixed_scanners([], [])
     assert invert(np.zeros(3)) == pytest.approx(np.zeros(3))

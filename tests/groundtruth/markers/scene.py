@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
-from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
@@ -147,16 +148,20 @@ def pose_problem(
     seen, view = points_of(
         pairs, lenses, world_from_camera, world_from_robot, rig, sigma_px=sigma_px, noise=noise
     )
-    return PoseProblem(
-        lenses,
-        world_from_camera,
-        rig.robot_from_marker,
-        np.zeros((6 * cameras,) * 2) if camera_covariance is None else camera_covariance,
-        rig.covariance if marker_covariance is None else marker_covariance,
-        seen,
-        view,
-        floor,
-    )
+    if marker_covariance is not None:
+        rig = replace(rig, covariance=marker_covariance)
+    network = network_of(world_from_camera, camera_covariance, scale_px)
+    return PoseProblem(network, rig, seen, view, floor)
+
+
+def network_of(
+    poses: FloatArray, covariance: FloatArray | None = None, scale_px: float = 900.0
+) -> Network:
+    """Cameras at poses, exactly known unless they have a covariance."""
+    names = tuple("abcdefgh"[: len(poses)])
+    exact = np.zeros((6 * len(poses), 6 * len(poses)))
+    lenses = (lens(scale_px),) * len(poses)
+    return Network(names, lenses, names, poses, exact if covariance is None else covariance)
 
 
 def robot_pose(generator: np.random.Generator, extent_m: float = 1.0) -> FloatArray:

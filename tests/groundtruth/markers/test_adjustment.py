@@ -70,26 +70,23 @@ def watched_robot(
         steps = generator.normal(0.0, off, (len(poses), 6)) * free[:, None]
         return np.asarray(poses @ exp_se3(steps))
 
-    free_camera = np.array([False, free_cameras, free_cameras, free_cameras])
-    free_body = np.array([free_bodies] * times)
-    free_part = np.array([False] + [free_parts] * (len(rig.ids) - 1))
+    of_parts = [False] + [free_parts] * (len(rig.ids) - 1)
+    free = np.array([False, *[free_cameras] * 3, *of_parts, *[free_bodies] * times])
+    parts, body = 4, 4 + len(rig.ids)
     priors: list[PosePrior] = []
     if free_cameras:
         known = world_from_camera[2] @ exp_se3(generator.normal(0.0, 1e-3, 6))
-        priors.append(PosePrior("camera", 2, known, 1e-6 * np.diag([1, 2, 3, 1, 1, 1.0])))
+        priors.append(PosePrior(2, known, 1e-6 * np.diag([1, 2, 3, 1, 1, 1.0])))
     if free_parts:
         known = rig.robot_from_marker[3] @ exp_se3(generator.normal(0.0, 1e-3, 6))
-        priors.append(PosePrior("part", 3, known, 1e-6 * np.eye(6)))
+        priors.append(PosePrior(parts + 3, known, 1e-6 * np.eye(6)))
     if free_bodies:
-        priors.append(PosePrior("body", 4, bodies[4], 1e-6 * np.eye(6)))
+        priors.append(PosePrior(body + 4, bodies[4], 1e-6 * np.eye(6)))
     return Bundle(
         cameras,
-        disturbed(world_from_camera, free_camera),
-        disturbed(np.stack(bodies), free_body),
-        disturbed(rig.robot_from_marker, free_part),
-        free_camera,
-        free_body,
-        free_part,
+        len(rig.ids),
+        disturbed(np.concatenate([world_from_camera, rig.robot_from_marker, bodies]), free),
+        free,
         seen.only(order),
         np.concatenate(views)[order],
         tuple(priors),
@@ -188,13 +185,13 @@ def test_what_is_not_determined_is_refused() -> None:
     with pytest.raises(GeometryError, match="do not determine all poses"):
         adjust_bundle(bundle.only(unseen))
     # The whole may be moved about: nothing says where it is.
-    floating = replace(bundle, free_camera=np.ones(4, bool), free_part=np.ones(6, bool))
+    floating = replace(bundle, free=np.ones_like(bundle.free))
     with pytest.raises(GeometryError, match="do not determine all poses"):
         adjust_bundle(floating)
     few = bundle.only(np.isin(np.arange(len(bundle.seen)), np.arange(8)))
     with pytest.raises(GeometryError, match="16 residuals for 90 unknowns: too little was seen"):
         adjust_bundle(few)
-    behind = replace(bundle, world_from_body=bundle.world_from_body.copy())
+    behind = replace(bundle, poses=bundle.poses.copy())
     behind.world_from_body[0, :3, 3] += [0.0, 0.0, 50.0]
     with pytest.raises(GeometryError, match="behind its camera or outside its lens"):
         adjust_bundle(behind)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import write_camera
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import (
+from redetect.groundtruth.markers.session import (
     Network,
     Rig,
     read_network,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,7 +11,6 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.adjustment import (
-    ChainPoints,
     project_chain,
     project_chain_with_jacobians,
 )
@@ -32,7 +33,14 @@ from redetect.groundtruth.trajectories.transforms import (
     planar_jacobian,
     roll_pitch,
 )
-from tests.groundtruth.markers.scene import box_rig, hall_cameras, lens, pose_problem, robot_pose
+from tests.groundtruth.markers.scene import (
+    box_rig,
+    hall_cameras,
+    lens,
+    network_of,
+    pose_problem,
+    robot_pose,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -49,16 +57,16 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
     problem = pose_problem(robot_pose(generator), cameras=3)
     seen = problem.seen
     poses = {
-        "camera": problem.world_from_camera,
+        "camera": problem.network.world_from_camera,
         "body": robot_pose(generator)[None],
-        "part": problem.robot_from_marker,
+        "part": problem.rig.robot_from_marker,
     }
 
     def project(by: dict[str, FloatArray]) -> FloatArray:
-        return project_chain(problem.cameras, by["camera"], by["body"], by["part"], seen)
+        return project_chain(problem.network.cameras, by["camera"], by["body"], by["part"], seen)
 
     projection = project_chain_with_jacobians(
-        problem.cameras, poses["camera"], poses["body"], poses["part"], seen
+        problem.network.cameras, poses["camera"], poses["body"], poses["part"], seen
     )
     np.testing.assert_allclose(projection.pixels, project(poses), atol=1e-9)
     step = 1e-6
@@ -158,7 +166,7 @@ def test_what_is_no_pose_is_refused() -> None:
     with pytest.raises(GeometryError, match="lens sees nothing"):
         solve_camera(folding, square, np.full((4, 2), 1e5))
     problem = pose_problem(robot_pose(np.random.default_rng(6)), cameras=2)
-    behind = problem.world_from_camera[0] @ exp_se3(np.array([0, 0, -3.0, 0, 0, 0]))
+    behind = problem.network.world_from_camera[0] @ exp_se3(np.array([0, 0, -3.0, 0, 0, 0]))
     with pytest.raises(GeometryError, match="behind its camera"):
         refine_pose(problem, behind)
 
@@ -188,13 +196,15 @@ def normalised_errors(
         moved_rig = rig.robot_from_marker @ exp_se3(
             (marker_factor @ generator.normal(size=36)).reshape(6, 6)
         )
-        moved_cameras = true.world_from_camera @ exp_se3(
+        moved_cameras = true.network.world_from_camera @ exp_se3(
             generator.normal(size=(cameras, 6)) * sigmas
         )
-        believed = type(true)(
-            true.cameras, moved_cameras, moved_rig, camera_covariance, marker_covariance,
-            true.seen, true.view, stance,
-        )  # fmt: skip
+        believed = replace(
+            true,
+            network=network_of(moved_cameras, camera_covariance),
+            rig=replace(rig, robot_from_marker=moved_rig, covariance=marker_covariance),
+            floor=stance,
+        )
         result = refine_pose(believed, truth)
         error = log_se3(inverse(truth) @ result.world_from_robot)
         squares.append(error @ np.linalg.solve(result.covariance, error))
@@ -231,11 +241,8 @@ def test_without_the_calibrations_uncertainty_the_error_is_underestimated() -> N
     for _ in range(50):
         truth = robot_pose(generator)
         true = pose_problem(truth, cameras=2, noise=generator)
-        moved = true.robot_from_marker @ exp_se3(generator.normal(0, 5e-3, (6, 6)))
-        believed = type(true)(
-            true.cameras, true.world_from_camera, moved, true.camera_covariance,
-            true.marker_covariance, true.seen, true.view,
-        )  # fmt: skip
+        moved = true.rig.robot_from_marker @ exp_se3(generator.normal(0, 5e-3, (6, 6)))
+        believed = replace(true, rig=replace(true.rig, robot_from_marker=moved))
         result = refine_pose(believed, truth)
         error = log_se3(inverse(truth) @ result.world_from_robot)
         squares.append(error @ np.linalg.solve(result.covariance, error))
@@ -263,12 +270,7 @@ def test_a_robust_loss_gives_a_bad_view_little_say(loss: str) -> None:
     problem = pose_problem(truth, cameras=4, noise=generator)
     seen = problem.seen
     shifted = seen.pixels + 3.0 * (problem.view == 0)[:, None]
-    spoilt = type(problem)(
-        problem.cameras, problem.world_from_camera, problem.robot_from_marker,
-        problem.camera_covariance, problem.marker_covariance,
-        ChainPoints(seen.camera, seen.body, seen.part, seen.points, shifted, seen.covariances),
-        problem.view,
-    )  # fmt: skip
+    spoilt = replace(problem, seen=replace(seen, pixels=shifted))
 
     def error(name: str) -> float:
         result = refine_pose(spoilt, truth, loss=name)  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Rig
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     chained_poses,
@@ -24,7 +23,7 @@ from redetect.groundtruth.markers.rig_estimation import (
     rig_by_known_markers,
     rig_by_reference_poses,
 )
-from redetect.groundtruth.markers.session import MarkerFrame
+from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.settings import RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
@@ -42,6 +41,7 @@ from tests.groundtruth.markers.scene import (
     lens,
     looking_at,
     marker_rows,
+    network_of,
     points_of,
     visible,
 )
@@ -90,10 +90,9 @@ def estimated(
 ) -> RigEstimate:
     return estimate_rig(
         groups,
-        (lens(scale_px),),
-        np.eye(4)[None],
-        dict(zip(rig.ids, rig.widths_m.tolist())),
+        network_of(np.eye(4)[None], scale_px=scale_px),
         rig.dictionary,
+        dict(zip(rig.ids, rig.widths_m.tolist())),
         RigSettings(corner_floor_px=0.0),
         reference=reference,
     )
@@ -276,10 +275,9 @@ def test_cameras_of_a_network_see_the_rig_together() -> None:
     groups = [tuple(f for f in frames if f.time_s == t) for t in times]
     estimate = estimate_rig(
         groups,
-        (lens(),) * 4,
-        hall_cameras(4),
-        dict(zip(rig.ids, rig.widths_m.tolist())),
+        network_of(hall_cameras(4)),
         rig.dictionary,
+        dict(zip(rig.ids, rig.widths_m.tolist())),
         RigSettings(corner_floor_px=0.0),
     )
     assert (0, 2) in estimate.pairs  # front and back: no single camera sees both
@@ -342,12 +340,10 @@ def test_the_frame_follows_from_reference_poses() -> None:
     believed = hall_cameras(4) @ exp_se3(sigmas * generator.normal(size=(4, 6)))
     estimate = estimate_rig(
         [tuple(f for f in frames if f.time_s == t) for t in times],
-        (lens(),) * 4,
-        believed,
-        dict(zip(rig.ids, rig.widths_m.tolist())),
+        network_of(believed, np.diag(np.tile(sigmas**2, 4))),
         rig.dictionary,
+        dict(zip(rig.ids, rig.widths_m.tolist())),
         RigSettings(corner_floor_px=0.0),
-        camera_covariance=np.diag(np.tile(sigmas**2, 4)),
     )
     measured = planar + generator.normal(0, 0.002, planar.shape)
     covariances = np.tile(np.eye(3) * 0.002**2, (12, 1, 1))

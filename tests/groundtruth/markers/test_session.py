@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.calibration import Network
+from redetect.groundtruth.markers.refinement import chain_points
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
-    chain_points,
+    Network,
     find_runs,
     group_by_time,
     read_marker_frames,
@@ -90,11 +90,11 @@ def test_corners_without_a_covariance_are_refused_by_image_and_marker() -> None:
     marker = replace(first.markers[0], corners=(corners[0], corners[1], bad, corners[3]))
     views = rig_views([replace(first, markers=(marker,))], rig)
     with pytest.raises(GroundTruthError, match=f"image 0000, marker {marker.id}: the covariance"):
-        chain_points(views, rig.widths_m.tolist(), 0.01)
+        chain_points(views, rig, 0.01)
     zero = MarkerCorner(corners[2].u, corners[2].v, 0.0, 0.0, 0.0)
     exact = replace(first.markers[0], corners=(corners[0], corners[1], zero, corners[3]))
     views = rig_views([replace(first, markers=(exact,))], rig)
-    points = chain_points(views, rig.widths_m.tolist(), 0.01)  # the floor is all that is left
+    points = chain_points(views, rig, 0.01)  # the floor is all that is left
     np.testing.assert_allclose(points.covariances[2], 1e-4 * np.eye(2))
 
 

@@ -167,7 +167,8 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
     (session / "validation").mkdir()
     hostile = {
         "version": HOSTILE, "settings": {HOSTILE: {HOSTILE: HOSTILE}}, "poses": HOSTILE,
-        "figures": {"linear_mean_m": HOSTILE, "nees": [1], "poses": True},
+        "figures": {"position_mean_m": HOSTILE, "normalised_error": [1], "poses": True,
+                    "normalised_band": [2, HOSTILE]},
         "refused": [{"index": HOSTILE, "status": HOSTILE, "reason": HOSTILE}, HOSTILE],
         "rejected": [{"stream": HOSTILE, "time_s": 1e999, "squared_innovation": HOSTILE}, 5],
         "used": {HOSTILE: HOSTILE}, "restarts_s": HOSTILE,
@@ -373,7 +374,7 @@ def test_the_worst_of_each_stretch_is_drawn() -> None:
 
 @pytest.mark.parametrize(("nees", "marked"), [(1.05, False), (2.5, True)])
 def test_a_normalised_error_outside_its_band_is_marked(nees: float, marked: bool) -> None:
-    figures = {"nees": nees, "nees_low": 0.8, "nees_high": 1.2, "poses": 23}
+    figures = {"normalised_error": nees, "normalised_band": [0.8, 1.2], "poses": 23}
     inputs = Inputs("s", documents={"validation.json": {"figures": figures}})
     assert ('class="problem">23 reference poses' in report_page(inputs, "1").decode()) == marked
 

@@ -156,5 +156,5 @@ def test_times_are_read_by_prefix(tmp_path: Path) -> None:
     with pytest.raises(StreamError, match="a second time"):
         read_times(path)
     path.write_text("a 1 2\n")
-    with pytest.raises(StreamError, match="expected a prefix and seconds"):
+    with pytest.raises(StreamError, match="expected prefix,seconds"):
         read_times(path)

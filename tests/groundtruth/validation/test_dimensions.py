@@ -11,15 +11,15 @@ import pytest
 from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.validation.dimensions import (
+from redetect.groundtruth.validation.reference_poses import (
     DIMENSIONS_HEAD,
     FIDUCIAL_DISTANCES_HEAD,
     FiducialDistance,
+    Survey,
     read_dimensions,
     read_fiducial_distances,
     survey_fiducials,
 )
-from redetect.groundtruth.validation.reference_poses import Survey
 
 PLACES = {"SW": (0.0, 0.0), "SE": (10.0, 0.0), "NE": (10.0, 7.5), "NW": (0.0, 7.5), "S": (5.2, 0)}
 SURVEY = Survey({name: np.array(xy) for name, xy in PLACES.items()}, {}, 0.005)

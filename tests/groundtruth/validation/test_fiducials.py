@@ -80,14 +80,14 @@ def test_malformed_surveys_are_refused(
     ("text", "line", "message"),
     [
         (HEAD + "0,1,left,SW\n", 2, "4 words"),
-        (HEAD + "0,1,left,SW,x\n", 2, "expected numbers"),
-        (HEAD + "0.5,1,left,SW,1\n", 2, "expected numbers"),
+        (HEAD + "0,1,left,SW,x\n", 2, "'x': expected a finite number"),
+        (HEAD + "0.5,1,left,SW,1\n", 2, "a whole pose"),
         (HEAD + "-1,1,left,SW,1\n", 2, "0 or more"),
         (HEAD + "0,nan,left,SW,1\n", 2, "finite"),
         (HEAD + "0,1,left,SW,-1\n", 2, "0 or more"),
-        (HEAD + "0,1,left,SW,nan\n", 2, "0 or more"),
+        (HEAD + "0,1,left,SW,nan\n", 2, "finite"),
         (HEAD + "0,1,top,SW,1\n", 2, "'top': expected one of left, right"),
-        ("0,1,left,SW,1\n" + HEAD, 2, "expected numbers"),
+        ("0,1,left,SW,1\n" + HEAD, 2, "'pose': expected a finite number"),
         ("0,1,left,NE,1\n", 1, "'NE': expected one of SW, column"),
     ],
 )

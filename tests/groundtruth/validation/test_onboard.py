@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from redetect.groundtruth.validation.onboard import first_walls, range_errors, refine_mounts
+from redetect.groundtruth.validation.onboard import (
+    ReferencePose,
+    first_walls,
+    range_errors,
+    reference_poses,
+    refine_mounts,
+)
 from redetect.groundtruth.validation.reference_poses import Distance, poses_from_distances
-from redetect.groundtruth.validation.reference_poses_scans import ReferencePose, reference_poses
 from redetect.plane import compose
 from tests.groundtruth.validation.test_validate_references import (
     ROOM,

@@ -158,9 +158,9 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
         score_relations(poses, far)
     path = tmp_path / "a.relations"
     for text, message in (
-        ("1 2 0 0 0 0 0\n", ":1: 7 numbers: expected 8"),
+        ("1 2 0 0 0 0 0\n", ":1: 7 words: expected t_i"),
         ("0 1 0 0 0 0 0 0\n1 2 0 x 0 0 0 0\n", ":2: 'x'"),
-        ("# nothing\n", "no rows in it"),
+        ("# nothing\n", "no relations in it"),
     ):
         path.write_text(text)
         with pytest.raises(StreamError, match=message):

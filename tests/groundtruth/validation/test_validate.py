@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.groundtruth.validation.onboard import reference_poses
 from redetect.groundtruth.validation.reference_poses import Distance, Survey, poses_from_distances
-from redetect.groundtruth.validation.reference_poses_scans import reference_poses
-from redetect.groundtruth.validation.validate import figures_of, pose_errors
+from redetect.groundtruth.validation.scoring import (
+    normalised_band,
+    normalised_errors,
+    reference_errors,
+    score_poses,
+)
 from tools.simulator.laser.writers import (
     write_building,
     write_distances,
@@ -99,17 +103,17 @@ def test_known_errors_come_back() -> None:
     assert not refused
     assert {reference.scans for reference in references} == {"not asked"}
     wrong = STANDS + np.array([0.03, -0.04, 0.1])
-    errors, without = pose_errors(references, ground_truth(wrong))
+    errors, without = reference_errors(references, ground_truth(wrong))
     assert not without
     # The second heading is past pi.
     np.testing.assert_allclose(errors.error, np.tile([0.03, -0.04, 0.1], (4, 1)), atol=1e-7)
-    assert np.isnan(errors.nees).all()
-    figures = figures_of(errors)
-    assert figures.linear_mean_m == pytest.approx(0.05, abs=1e-7)
-    assert figures.linear_sigma_m == pytest.approx(0.0, abs=1e-7)
-    assert figures.angular_mean_rad == pytest.approx(0.1, abs=1e-7)
+    assert np.isnan(normalised_errors(errors.poses, errors.reference_poses)).all()
+    figures = score_poses(errors.poses, errors.reference_poses)
+    assert figures.position_mean_m == pytest.approx(0.05, abs=1e-7)
+    assert figures.position_sigma_m == pytest.approx(0.0, abs=1e-7)
+    assert figures.angle_mean_rad == pytest.approx(0.1, abs=1e-7)
     assert figures.normalised == 0
-    assert math.isnan(figures.nees)
+    assert math.isnan(figures.normalised_error)
 
 
 def test_both_covariances_are_in_the_normalised_error() -> None:
@@ -120,11 +124,12 @@ def test_both_covariances_are_in_the_normalised_error() -> None:
         noisy = STANDS + rng.normal(size=STANDS.shape) * np.sqrt(np.diag(covariance))
         solved = poses_from_distances(SURVEY, distances_at(STANDS, rng))
         references, _ = reference_poses(solved)
-        figures = figures_of(pose_errors(references, ground_truth(noisy, covariance))[0])
+        errors, _ = reference_errors(references, ground_truth(noisy, covariance))
+        figures = score_poses(errors.poses, errors.reference_poses)
         assert figures.normalised == 4
         low, high = chi2.ppf([0.025, 0.975], 12) / 12
-        assert (figures.nees_low, figures.nees_high) == pytest.approx((low, high))
-        total, count = total + 12 * figures.nees, count + 12
+        assert normalised_band(4) == pytest.approx((low, high))
+        total, count = total + 12 * figures.normalised_error, count + 12
     low, high = chi2.ppf([0.001, 0.999], count)
     assert low < total < high
 
@@ -133,11 +138,9 @@ def test_a_reference_without_ground_truth_is_named() -> None:
     references, _ = reference_poses(poses_from_distances(SURVEY, distances_at(STANDS)))
     poses = ground_truth(STANDS)
     part = PlanarPoses(poses.times_s[:4], poses.poses[:4])
-    errors, without = pose_errors(references, part)
+    errors, without = reference_errors(references, part)
     assert [reference.index for reference in errors.references] == [0, 1]
     assert [entry.index for entry in without] == [2, 3]
-    with pytest.raises(GroundTruthError, match="no reference pose"):
-        figures_of(pose_errors(references[2:], part)[0])
 
 
 def test_the_nearest_pose_counts_as_it_is() -> None:
@@ -147,7 +150,7 @@ def test_the_nearest_pose_counts_as_it_is() -> None:
     rows = np.repeat(STANDS, 2, axis=0)[[0, 1, 2, 3, 4, 5, 6]].copy()
     rows[:, 0] += [0.5, 0.001, 0.5, 0.5, 0.002, 0.5, 0.003]
     covariances = np.arange(1.0, 8.0)[:, None, None] * 1e-6 * np.eye(3)
-    errors, without = pose_errors(references, PlanarPoses(times, rows, covariances))
+    errors, without = reference_errors(references, PlanarPoses(times, rows, covariances))
     assert [entry.index for entry in without] == [1]  # both are more than half a second away
     assert [reference.index for reference in errors.references] == [0, 2, 3]
     np.testing.assert_allclose(errors.error[:, 0], [0.001, 0.002, 0.003], atol=1e-7)
@@ -173,8 +176,8 @@ def test_the_command_writes_the_folder(session: Path, capsys: pytest.CaptureFixt
     assert set(content["files"]) >= {"distances.csv", "top.scans.npz", "clock.json", "poses.csv"}
     expected = np.hypot(*(noisy - STANDS)[:, :2].T)
     figures = content["figures"]
-    assert figures["linear_mean_m"] == pytest.approx(expected.mean(), abs=5e-4)
-    assert figures["linear_worst_m"] == pytest.approx(expected.max(), abs=5e-4)
+    assert figures["position_mean_m"] == pytest.approx(expected.mean(), abs=5e-4)
+    assert figures["position_max_m"] == pytest.approx(expected.max(), abs=5e-4)
     assert figures["normalised"] == 4
     reference = read_planar_poses(output / "reference.csv")
     np.testing.assert_allclose(reference.poses[:, :2], STANDS[:, :2], atol=1e-3)

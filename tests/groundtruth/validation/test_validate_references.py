@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.validation.onboard import Onboard, refine_pose, still_scans
 from redetect.groundtruth.validation.reference_poses import (
     Distance,
     DistancePose,
@@ -21,7 +23,6 @@ from redetect.groundtruth.validation.reference_poses import (
     distance_residuals,
     poses_from_distances,
 )
-from redetect.groundtruth.validation.reference_poses_scans import Onboard, refine_pose, still_points
 from redetect.landmarks import wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -223,7 +224,7 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
     for _ in range(20):
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
         prior = solved(measured(truth, survey, rng), survey)
-        refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
+        refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
         assert refined is not None
         assert refined.scans == "used", refined.note
         error = refined.pose - truth
@@ -244,12 +245,12 @@ def test_walls_decide_between_mirror_images() -> None:
     truth = np.array([4.0, 1.9, 0.7])
     prior = solved(measured(truth, survey, rng), survey)
     assert prior.status == "ambiguous"
-    refined = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 5.0), ROOM)
+    refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
     assert refined is not None
     assert refined.scans == "used"
     np.testing.assert_allclose(refined.pose, truth, atol=0.005)
     # Walls that no reading lies on decide nothing.
-    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    points = still_scans(onboard(truth, ROOM, rng), 5.0)
     assert refine_pose(prior, points, ROOM + 300.0) is None
 
 
@@ -259,7 +260,7 @@ def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
     survey = survey_of()
     truth = np.array([4.0, 1.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
-    refined = refine_pose(prior, still_points(onboard(truth, corridor, rng), 5.0), corridor)
+    refined = refine_pose(prior, still_scans(onboard(truth, corridor, rng), 5.0), corridor)
     assert refined is not None
     assert refined.scans == "undetermined"
     np.testing.assert_array_equal(refined.pose, prior.candidates[0])
@@ -270,14 +271,14 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     survey = survey_of()
     truth = np.array([4.0, 2.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
-    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    points = still_scans(onboard(truth, ROOM, rng), 5.0)
     refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
     assert refined is not None
     assert refined.scans == "disagrees"
     assert "more than both allow" in refined.note
     np.testing.assert_array_equal(refined.pose, prior.candidates[0])
     # No readings at all about the time.
-    nothing = refine_pose(prior, still_points(onboard(truth, ROOM, rng), 99.0), ROOM)
+    nothing = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 99.0), ROOM)
     assert nothing is not None
     assert nothing.scans == "no scans"
 
@@ -287,17 +288,11 @@ def test_an_unsure_mount_makes_the_pose_unsure() -> None:
     survey = survey_of(sigma_m=0.05)
     truth = np.array([4.0, 2.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
-    points = still_points(onboard(truth, ROOM, rng), 5.0)
+    points = still_scans(onboard(truth, ROOM, rng), 5.0)
     sure = refine_pose(prior, points, ROOM)
     sigma = np.diag([0.01, 0.01, 0.005]) ** 2
-    loose = type(points)(
-        points.scanner_points,
-        tuple(
-            Scanner(s.name, s.pose, sigma, s.first_angle_rad, s.angle_step_rad, s.readings,
-                    s.max_range_m, s.sigma_m)
-            for s in points.scanners
-        ),
-    )  # fmt: skip
+    mounted = tuple(replace(one, covariance=sigma) for one in points.scanners)
+    loose = points._replace(scanners=mounted)
     unsure = refine_pose(prior, loose, ROOM)
     assert sure is not None
     assert unsure is not None
@@ -311,4 +306,4 @@ def test_a_robot_that_moves_is_noticed() -> None:
     rng = np.random.default_rng(9)
     truth = np.array([4.0, 2.5, 0.2])
     with pytest.raises(GeometryError, match=r"^moved: a quarter"):
-        still_points(onboard(truth, ROOM, rng, drift_m=0.2), 5.0)
+        still_scans(onboard(truth, ROOM, rng, drift_m=0.2), 5.0)

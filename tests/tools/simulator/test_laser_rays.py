@@ -265,7 +265,7 @@ def test_the_clock_is_a_line_with_a_jump_and_its_ticks_are_regular() -> None:
 
 @pytest.mark.parametrize("offset_s", [-1.25, -0.002, 0.0, 0.75])
 def test_reports_of_ptpd_are_read_back(tmp_path: Any, offset_s: float) -> None:
-    from redetect.groundtruth.clocks.clock import read_ptpd
+    from redetect.groundtruth.fusion.clock import read_ptpd
 
     clock = RobotClock(1000.0, offset_s, 2e-5)
     times = np.arange(1000.0, 1200.0, 2.0)

@@ -20,8 +20,12 @@ from redetect.groundtruth.lasers.scanners import (
     read_scans,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, read_planar_poses
-from redetect.groundtruth.validation.dimensions import read_dimensions, read_fiducial_distances
-from redetect.groundtruth.validation.reference_poses import read_distances, read_survey
+from redetect.groundtruth.validation.reference_poses import (
+    read_dimensions,
+    read_distances,
+    read_fiducial_distances,
+    read_survey,
+)
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose
 from tools.simulator.__main__ import main

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from camera import parse_camera, read_camera
 from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
 from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
-from redetect.groundtruth.markers.calibration import read_network, read_rig
+from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
 from redetect.groundtruth.trajectories.transforms import (
     apply,

@@ -17,8 +17,12 @@ from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     write_planar_poses,
 )
-from redetect.groundtruth.validation.dimensions import DIMENSIONS_HEAD, FIDUCIAL_DISTANCES_HEAD
-from redetect.groundtruth.validation.reference_poses import Distance, Survey
+from redetect.groundtruth.validation.reference_poses import (
+    DIMENSIONS_HEAD,
+    FIDUCIAL_DISTANCES_HEAD,
+    Distance,
+    Survey,
+)
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from tools.arrays import BoolArray, FloatArray

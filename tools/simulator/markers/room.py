@@ -13,7 +13,7 @@ import numpy as np
 from camera import Camera
 from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
-from redetect.groundtruth.markers.calibration import Rig
+from redetect.groundtruth.markers.session import Rig
 from redetect.groundtruth.trajectories.transforms import planar_transform, transform
 from tools.arrays import FloatArray
 from tools.simulator.markers.surface import (

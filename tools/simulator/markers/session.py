@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from camera import Camera, format_camera, write_camera
-from redetect.groundtruth.markers.calibration import Network, Rig, write_network, write_rig
+from redetect.groundtruth.markers.session import Network, Rig, write_network, write_rig
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse, planar_transform
 from tools.arrays import ByteArray, Float32Array, FloatArray

@@ -24,14 +24,16 @@ import numpy as np
 from scipy.optimize import Bounds, direct, minimize
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.clocks.clock import (
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.clock import (
     ClockModel,
     ClockSegment,
     Status,
     knots_of,
     on_one_line,
 )
-from redetect.groundtruth.clocks.headings import (
+from redetect.groundtruth.fusion.fuse import likeliest_noise
+from redetect.groundtruth.fusion.headings import (
     HeadingPair,
     Wandering,
     continuous_headings,
@@ -40,8 +42,6 @@ from redetect.groundtruth.clocks.headings import (
     pair_headings,
     without_turns,
 )
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import likeliest_noise
 from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
@@ -56,7 +56,7 @@ _MOST_COARSE_SAMPLES = 400
 _OUTLIER_SIGMAS = 6.0
 _COARSE_SIGMA_RAD = 0.02
 # A segment determines the offset, or the drift, if its deviation is below this share of the search
-# bound: the deviation of a uniform distribution between the bounds is .58 of the bound.
+# bound.
 _LEAST_DETERMINED = 0.1
 _MOST_JUMPS = 3
 _JUMP_SIGMAS = 3.5
@@ -160,19 +160,16 @@ def _segment(
             pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
         )
         offset, drift = _refine(pair, wandering, (offset, drift), bounds)
-    covariance = _covariance(pair, wandering, offset, drift)
+    sigma_offset_s, sigma_rate = _sigmas(pair, wandering, offset, drift, bounds).tolist()
+    alone_s = float(_sigmas(pair, wandering, offset, drift, bounds, unknowns=1)[0])
+    if not alone_s < _LEAST_DETERMINED * bounds.largest_offset_s:
+        return [_undetermined(segment, turned, "turns too little to determine the offset")]
     note = ""
-    if not math.sqrt(covariance[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
-        alone = _covariance(pair, wandering, offset, drift, with_drift=False)
-        if not math.sqrt(alone[0, 0]) < _LEAST_DETERMINED * bounds.largest_offset_s:
-            return [_undetermined(segment, turned, "turns too little to determine the offset")]
-    if not math.sqrt(covariance[1, 1]) < _LEAST_DETERMINED * bounds.largest_drift:
+    if not sigma_rate < _LEAST_DETERMINED * bounds.largest_drift:
         note = "too short to determine the drift: assumed to be 0"
-        drift = 0.0
-        offset, drift = _refine(pair, wandering, (offset, drift), bounds, with_drift=False)
-        covariance = _covariance(pair, wandering, offset, drift, with_drift=False)
+        offset, drift = _refine(pair, wandering, (offset, 0.0), bounds, unknowns=1)
         # Only at the reference time is the offset independent of the unknown drift.
-        covariance[1, 1] = bounds.largest_drift**2 / 3.0
+        sigma_offset_s, sigma_rate = alone_s, bounds.largest_drift / math.sqrt(3.0)
     elif jumps_left > 0:
         place = find_jump(pair, offset, drift)
         if place is not None:
@@ -202,8 +199,8 @@ def _segment(
             offset_s=offset,
             rate=1.0 + drift,
             angle_rad=float(wrap_angle(np.array(level))),
-            sigma_offset_s=math.sqrt(covariance[0, 0]),
-            sigma_rate=math.sqrt(covariance[1, 1]),
+            sigma_offset_s=sigma_offset_s,
+            sigma_rate=sigma_rate,
             sigma_angle_rad=level_sigma,
             turned_rad=turned,
             status=status,
@@ -254,14 +251,8 @@ def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:
     box = Bounds([-1.0, -1.0], [1.0, 1.0])
     scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
     found = direct(lambda x: _sum_of_squares(coarse, *(x * scale)), box, maxfun=1500, maxiter=1000)
-    best = minimize(
-        lambda x: _sum_of_squares(pair, *(x * scale)),
-        found.x,
-        method="Nelder-Mead",
-        bounds=box,
-        options={"xatol": 1e-6, "fatol": 1e-14, "initial_simplex": _simplex(found.x)},
-    )
-    offset, drift = best.x * scale
+    best = _minimum(lambda x: _sum_of_squares(pair, *(x * scale)), found.x, 1e-6, 1e-14)
+    offset, drift = best * scale
     return float(offset), float(drift)
 
 
@@ -284,51 +275,46 @@ def _refine(
     wandering: Wandering,
     start: tuple[float, float],
     bounds: SyncSettings,
-    *,
-    with_drift: bool = True,
+    unknowns: int = 2,
 ) -> tuple[float, float]:
-    """Least whitened squares near a result of the global search; without drift, it stays."""
+    """Least whitened squares near a result of the global search; of one unknown, the offset."""
     scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
     best = np.clip(np.array(start) / scale, -1.0, 1.0)
-    free = slice(0, 2 if with_drift else 1)
 
     def squared(x: FloatArray) -> float:
-        tried = best.copy()
-        tried[free] = x
-        return wandering.squared(without_turns(pair.differences(*(tried * scale))))
+        tried = np.concatenate([x, best[unknowns:]]) * scale
+        return wandering.squared(without_turns(pair.differences(*tried)))
 
-    best[free] = minimize(
-        squared,
-        best[free],
-        method="Nelder-Mead",
-        bounds=Bounds(-1.0, 1.0),
-        options={"xatol": 1e-7, "fatol": 1e-9, "initial_simplex": _simplex(best[free])},
-    ).x
+    best[:unknowns] = _minimum(squared, best[:unknowns], 1e-7, 1e-9)
     offset, drift = best * scale
     return float(offset), float(drift)
 
 
-def _covariance(
+def _minimum(
+    cost: Callable[[FloatArray], float], start: FloatArray, xatol: float, fatol: float
+) -> FloatArray:
+    """Minimum of a cost within -1 to 1, near a start."""
+    options = {"xatol": xatol, "fatol": fatol, "initial_simplex": _simplex(start)}
+    box = Bounds(-1.0, 1.0)
+    found = minimize(cost, start, method="Nelder-Mead", bounds=box, options=options)
+    return np.asarray(found.x)
+
+
+def _sigmas(
     pair: HeadingPair,
     wandering: Wandering,
     offset_s: float,
     drift: float,
-    *,
-    with_drift: bool = True,
+    bounds: SyncSettings,
+    unknowns: int = 2,
 ) -> FloatArray:
-    """Covariance of offset and drift from the information in the segment's turns."""
-    jacobian = pair.sensitivities(offset_s, drift)
-    information = jacobian.T @ wandering.whiten(jacobian)
-    if not with_drift:
-        variance = 1.0 / information[0, 0] if information[0, 0] > 0.0 else math.inf
-        return np.diag([variance, math.inf])
-    scale = np.sqrt(np.diag(information))
-    if not np.all(scale > 0.0):
-        return np.diag([math.inf, math.inf])
-    correlation = information / scale[:, None] / scale
-    if np.linalg.eigvalsh(correlation)[0] < 1e-9:
-        return np.diag([math.inf, math.inf])
-    return np.asarray(np.linalg.inv(correlation) / scale[:, None] / scale)
+    """(2,) deviations of offset and drift by the information in the segment's turns."""
+    # In deviations before anything was measured, which differ much: even between the bounds.
+    prior = np.array([bounds.largest_offset_s, bounds.largest_drift]) / math.sqrt(3.0)
+    jacobian = (pair.sensitivities(offset_s, drift) * prior)[:, :unknowns]
+    information = jacobian.T @ wandering.whiten(jacobian) + np.eye(unknowns)
+    prior[:unknowns] *= np.sqrt(np.diag(np.linalg.inv(information)))
+    return prior
 
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
@@ -425,7 +411,7 @@ def _refined(
         return movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
 
     def surprise(x: FloatArray) -> float:
-        return problem_at(x).surprise(noise)
+        return problem_at(x).account(noise).surprise
 
     best = np.zeros(2)
     try:

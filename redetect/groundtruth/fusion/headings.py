@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar, nnls
 
@@ -24,12 +25,10 @@ def continuous_headings(poses: PlanarPoses) -> FloatArray:
     return np.asarray(np.unwrap(poses.poses[:, 2]))
 
 
-def heading_noise(times_s: FloatArray, headings_rad: FloatArray) -> float:
-    """How rough headings are: standard deviation of a sample beside its neighbours (rad).
+def heading_noise(headings_rad: FloatArray) -> float:
+    """How rough continuous headings (N,) are: standard deviation beside their neighbours (rad).
 
     Third differences cancel whatever turns smoothly; their median does not mind single jumps.
-
-    `times_s`, `headings_rad` (N,): at least 5 samples, headings continuous.
     """
     third = np.diff(headings_rad, 3)
     # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
@@ -45,15 +44,11 @@ def sampling_interval(times_s: FloatArray) -> float:
 class HeadingIntegral:
     """Headings as a function of time, straight between samples, of which exact means are taken."""
 
-    times_s: FloatArray  # (N,): ascending
+    times_s: FloatArray  # (N,): ascending strictly
     headings_rad: FloatArray  # (N,): continuous
 
     def means(self, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
-        """Mean headings between pairs of times.
-
-        `from_s`, `to_s` (M,): ends of the windows, `to_s` later; outside the samples the first or
-        last heading holds.
-        """
+        """Mean headings between pairs of times (M,), the second of which is later."""
         return np.asarray((self._integral(to_s) - self._integral(from_s)) / (to_s - from_s))
 
     def covers(self, from_s: FloatArray, to_s: FloatArray, largest_gap_s: float) -> BoolArray:
@@ -64,22 +59,8 @@ class HeadingIntegral:
         return np.asarray(covered)
 
     @cached_property
-    def _areas(self) -> FloatArray:
-        between = 0.5 * (self.headings_rad[1:] + self.headings_rad[:-1]) * np.diff(self.times_s)
-        return np.concatenate([[0.0], np.cumsum(between)])
-
-    def _integral(self, times_s: FloatArray) -> FloatArray:
-        """Integral of the heading from the first sample to each time."""
-        inside = np.clip(times_s, self.times_s[0], self.times_s[-1])
-        k = np.clip(
-            np.searchsorted(self.times_s, inside, side="right") - 1, 0, len(self._areas) - 1
-        )
-        heading = np.interp(times_s, self.times_s, self.headings_rad)
-        return np.asarray(
-            self._areas[k]
-            + 0.5 * (heading + self.headings_rad[k]) * (inside - self.times_s[k])
-            + heading * (times_s - inside)
-        )
+    def _integral(self) -> BSpline:
+        return make_interp_spline(self.times_s, self.headings_rad, k=1).antiderivative()
 
 
 def windowed_means(
@@ -227,7 +208,7 @@ def _odometry_is_interpolated(
     ]
     if slow[0] != slow[1]:
         return slow[0]
-    return heading_noise(*odometry) <= heading_noise(*groundtruth)
+    return heading_noise(odometry[1]) <= heading_noise(groundtruth[1])
 
 
 def _way_driven(poses: PlanarPoses, times_s: FloatArray) -> FloatArray:

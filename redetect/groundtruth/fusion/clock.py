@@ -38,15 +38,13 @@ Status = Literal["ok", "no turns", "jump", "at a bound"]
 class ClockSegment:
     """The two clocks over one segment of the ground truth."""
 
-    # `from_s`, `to_s`: The segment, on the ground truth's clock
-    from_s: float
+    from_s: float  # When the segment begins and ends, on the ground truth's clock
     to_s: float
     reference_s: float  # Where in it the offset holds, on the ground truth's clock
     offset_s: float = 0.0  # Robot time minus ground truth time there
     rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
     angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
-    # `sigma_offset_s`, `sigma_rate`, `sigma_angle_rad`: Standard deviations; infinite where the
-    # segment does not determine the value.
+    # Standard deviations; infinite where the segment does not determine the value
     sigma_offset_s: float = math.inf
     sigma_rate: float = math.inf
     sigma_angle_rad: float = math.inf
@@ -56,8 +54,7 @@ class ClockSegment:
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
-    # `own_offset_s`, `own_sigma_s`: Offset and standard deviation by the segment alone, where one
-    # line through all segments replaced them
+    # By the segment alone, where one line through all segments replaced offset and deviation
     own_offset_s: float | None = None
     own_sigma_s: float | None = None
 

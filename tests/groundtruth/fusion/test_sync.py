@@ -13,21 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.clocks.clock import (
+from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.clock import (
     ClockModel,
     ClockSegment,
     read_clock,
     read_ptpd,
 )
-from redetect.groundtruth.clocks.headings import (
+from redetect.groundtruth.fusion.headings import (
     HeadingIntegral,
     Wandering,
     estimate_wandering,
     heading_noise,
 )
-from redetect.groundtruth.clocks.sync import synchronise
-from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -36,7 +36,7 @@ from redetect.groundtruth.trajectories.streams import (
     write_planar_poses,
 )
 from redetect.landmarks import wrap_angle
-from tests.groundtruth.clocks.simulated import Clocks, headings_only, joined, simulate
+from tests.groundtruth.fusion.simulated import Clocks, headings_only, joined, simulate
 
 SEGMENT = ClockSegment(
     10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, 1e-3, turned_rad=5.0, status="ok"
@@ -200,7 +200,7 @@ def test_means_of_straight_pieces_are_exact() -> None:
 def test_noise_of_headings_is_told_from_turning() -> None:
     rng = np.random.default_rng(2)
     times = np.arange(0, 100, 0.02)
-    noise = heading_noise(times, 3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
+    noise = heading_noise(3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
     assert noise == pytest.approx(0.01, rel=0.05)
 
 

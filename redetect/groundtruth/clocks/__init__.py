@@ -1,1 +1,0 @@
-"""The robot's clock against the ground truth's."""
