@@ -72,7 +72,7 @@ class CircleSettings:
     #: Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
     #: Without this and `refine` nothing is fitted.
     verify: bool = True
-    #: Least evidence (log-odds, see `detect.discs.fit.disc_evidence`).
+    #: Least evidence (log-odds, see `detect.discs.evidence`).
     evidence: Annotated[float, FINITE] = 0.6
     #: Standard deviation of the optics' blur along u, pixels. Blurred edges are evidence against a
     #: disc unless the camera blurs everything: the data set's own does, by about 6.

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detect.discs.evidence_kernels import LEAST_EXPLAINED, evidence_of
+from detect.discs.evidence import LEAST_EXPLAINED, evidence_of
 from detect.discs.least_squares import (
     BACKGROUND,
     SECTORS,

@@ -2,7 +2,7 @@
 
 Discs are searched at radii that grow by a constant factor, first at every second one, then beside
 the best of these; a parabola through the logarithms of the best three radii gives the peak.
-Evidence is a log-odds (`detect.discs.evidence_kernels`), in which the radius of each fit has a
+Evidence is a log-odds (`detect.discs.evidence`), in which the radius of each fit has a
 part, so that its sum over the discs is a likelihood of the radius.
 """
 

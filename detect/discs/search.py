@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.candidates import best_apart, middles, strong_and_alone
 from detect.discs.descent import Hope
-from detect.discs.evidence_kernels import (
+from detect.discs.evidence import (
     CLEAR_EVIDENCE,
     LEAST_MIDDLE_STEP,
     LEAST_RIM_PX,

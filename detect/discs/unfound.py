@@ -30,7 +30,7 @@ from detect.circles import (
     second_look,
 )
 from detect.discs.candidates import strong_and_alone
-from detect.discs.evidence_kernels import LEAST_EXPLAINED, RADIUS_RANGE
+from detect.discs.evidence import LEAST_EXPLAINED, RADIUS_RANGE
 from detect.discs.quality import Centres, Limits, centres_of
 from detect.discs.radius import FACTOR, find_radius
 from detect.discs.search import FATES, LEAST_STEPS, share_of_steps

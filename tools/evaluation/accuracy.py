@@ -14,12 +14,13 @@ import numpy as np
 
 from camera import Camera, read_camera
 from detect.circles import disc_shape, refined_covariance
-from detect.discs.fit import blur_ratio_of, fit_discs
+from detect.discs.fit import blur_ratio_of
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import cached_disc_table
 from redetect.landmarks import squared_mahalanobis
 from tools.arrays import ByteArray, FloatArray
+from tools.evaluation.single_fits import fit_discs
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
 

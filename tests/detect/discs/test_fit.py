@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import disc_shape, refined_covariance, tilt_jacobian
 from detect.discs.candidates import middles, strong_and_alone
-from detect.discs.fit import disc_evidence, fit_discs, fit_settings
+from detect.discs.fit import fit_settings
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.quality import Centres
 from detect.discs.search import nearest_pixel
@@ -17,6 +17,7 @@ from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
 from tests.reference.discs import Pixels, fitted_disc, pixels_within_reach
+from tools.evaluation.single_fits import disc_evidence, fit_discs
 
 #: `PaintedFloor` blurs by as many pixels along v as along u.
 PAINTED_RATIO = 1.0
@@ -47,7 +48,7 @@ def test_parameters_come_back(
     pixel = nearest(published_camera, place) + (offset if place[1] > -3.0 else (0, 0))
     fit = fit_discs(
         floor.image(0.5), table.floor_xy, pixel[None], 0.1, 0.6, blur_ratio=PAINTED_RATIO,
-        blur_guess=np.array([0.8 * blur]),
+        blur_px=0.8 * blur,
     )  # fmt: skip
     assert fit.fitted[0]
     per_px = np.linalg.norm(published_camera.floor_jacobian(pixel.astype(float)), 2)
@@ -55,11 +56,11 @@ def test_parameters_come_back(
     tiny = blur > 2.0 and place[1] < -5.0
     within = 0.4 if tiny else 0.1 if blur > 2.0 else 0.05
     assert np.hypot(*(fit.floor_xy[0] - place)) < within * per_px
-    assert fit.radius_m[0] == pytest.approx(0.1, rel=0.02 if blur < 2.0 else 0.1)
+    assert fit.results["radius"][0] == pytest.approx(0.1, rel=0.02 if blur < 2.0 else 0.1)
     if blur < 2.0:
-        assert fit.contrast[0] == pytest.approx(150.0, rel=0.1)
-    assert fit.explained[0] > (0.9 if tiny else 0.97)
-    assert fit.sectors_good[0] == 1.0
+        assert fit.results["contrast"][0] == pytest.approx(150.0, rel=0.1)
+    assert fit.results["explained"][0] > (0.9 if tiny else 0.97)
+    assert fit.results["sectors_good"][0] == 1.0
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -77,7 +78,7 @@ def test_fewer_pixels_tell_nearly_the_same(
     )
     per_px = np.linalg.norm(published_camera.floor_jacobian(pixel[0].astype(float)), 2)
     assert np.hypot(*(look.floor_xy[0] - full.floor_xy[0])) < 0.25 * per_px
-    assert look.explained[0] == pytest.approx(full.explained[0], abs=0.08)
+    assert look.results["explained"][0] == pytest.approx(full.results["explained"][0], abs=0.08)
     assert np.isfinite(disc_evidence(full, 0.1)[0])
 
 
@@ -115,7 +116,7 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: D
     fit = fit_discs(image, table.floor_xy, pixel, 0.25, 1.0, blur_ratio=PAINTED_RATIO)
     assert fit.fitted[0]
     assert np.hypot(*(fit.floor_xy[0] - place)) < 2e-4
-    assert fit.radius_m[0] == pytest.approx(0.25, rel=2e-3)
+    assert fit.results["radius"][0] == pytest.approx(0.25, rel=2e-3)
 
 
 def test_strongest_alone_the_best_first(table: DiscTable) -> None:
@@ -222,7 +223,7 @@ def test_fits_are_the_least_squares_of_the_reference(
     sigma = np.sqrt(np.diag(fit.covariance[0])) / 0.1
     off = (fit.floor_xy[0] / 0.1 - floor[v, u]) - expected[:2]
     assert np.all(np.abs(off) < 0.3 * sigma)
-    assert fit.radius_m[0] / 0.1 == pytest.approx(expected[2], abs=0.3 * sigma.max())
+    assert fit.results["radius"][0] / 0.1 == pytest.approx(expected[2], abs=0.3 * sigma.max())
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])

@@ -1,4 +1,12 @@
-"""Compiled: the evidence that a fitted disc is one (see `detect.discs.fit.disc_evidence`)."""
+"""The evidence that a fitted disc is one: a log-odds score.
+
+What speaks for a disc: that it explains the grey values, has the right radius, an even outline and
+a sharp edge. No single one must: glare or texture leave much unexplained about a sharp circle of
+the right size, defocus blurs the edge of a disc that explains everything. So they are weighed by a
+logistic regression. Its weights were fitted to some 18,000 discs, and to what else has a high
+quality, in photographs and renders: as they are, and with glare, shade, defocus, motion blur, noise
+and low contrast added. They are constants: that fitting is not part of the project.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +38,11 @@ def evidence_of(
     relative_blur: float,
     optics_px: float,
 ) -> float:
-    """Log-odds that a fit is one of a disc; minus infinity where it cannot be one."""
+    """Log-odds that a fit (`detect.discs.fit.RESULT`) is one of a disc.
+
+    Minus infinity where it cannot be one. As far as the blur of the camera's optics, pixels, goes
+    beyond one pixel, it does not speak against a disc.
+    """
     blur = min(max(relative_blur, 0.02), 2.5)
     # What is seen sharply must fit closely; a blurred outline may seem larger, smaller or uneven.
     uneven = outline_deviation / (0.03 + 0.2 * blur)
