@@ -45,7 +45,7 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.24
-#: Least log-odds of a glance: where so many edges vote for the place as the last says, less.
+#: Least log-odds of a glance; those of candidates with at least this score.
 _LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.3, -0.7, 3.0
 #: Least share of the rim that is on a circle.
 _LEAST_RIM = 0.3
@@ -81,8 +81,8 @@ class SecondLooks(NamedTuple):
     floor_xy : (N, 2) float64
         Metres.
     seen_from, doubt : (N, 2) float64
-        Whence the rim was followed, and how far that is apart which is come to from elsewhere,
-        metres.
+        Where the rim was followed from, and the difference to the centre of the rim that is found
+        from the other start, metres.
     step : (N,) float64
         Of the grey value at the rim, inside minus outside.
     quality : (N,) float64
