@@ -23,7 +23,7 @@ from camera.kernels import camera_numbers, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.placing import place_all_by_part
+from detect.discs.placing import place_all
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
@@ -152,7 +152,7 @@ def _with_fit(
     more = second_look(image, camera, table, settings, first)
     discs = SecondLooks(*(values[more.log_odds >= 0.0] for values in more))
     if len(discs.step):
-        placed = place_all_by_part(first.scene, found.radius, discs, working_space())
+        placed = place_all(first.scene, found.radius, discs, working_space())
         more_xy, more_covariance = fitted_positions(placed)
         last = [camera.width - 1, camera.height - 1]
         more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)

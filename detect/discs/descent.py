@@ -101,9 +101,8 @@ class Descent(NamedTuple):
 
 
 @kernel(forceinline=True)
-def blur_of(shape: int, disc: Disc, ratio: float) -> Blur:
-    """A disc's blur along the axes of a patch of that shape."""
-    blur = math.exp(disc.log_blur)
+def blur_of(shape: int, blur: float, ratio: float) -> Blur:
+    """A blur (along u, pixels) along the axes of a patch of that shape."""
     return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
 
 
@@ -198,7 +197,7 @@ def descend(
     background_products(patch, n, products)
     _add_ridge(0, BACKGROUND, gathered.fitted, work)
     while True:
-        blur = blur_of(gathered.shape, disc, settings.blur_ratio)
+        blur = blur_of(gathered.shape, math.exp(disc.log_blur), settings.blur_ratio)
         if gathered.shape == EDGE:
             edge_shares(patch, n, disc, blur)
         else:

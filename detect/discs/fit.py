@@ -127,7 +127,7 @@ def fit_disc(
     # The last step is taken as the linear model has it, and so are its residuals.
     disc = moved(descent.best, descent.contrast, math.log(most_blur), work)
     residual, near, near_total = residuals(patch, gathered.n, work.values, work.bare)
-    blur = blur_of(gathered.shape, disc, settings.blur_ratio)
+    blur = blur_of(gathered.shape, math.exp(disc.log_blur), settings.blur_ratio)
     result.x = floor_xy[candidate.v, candidate.u, 0] + disc.x * radius
     result.y = floor_xy[candidate.v, candidate.u, 1] + disc.y * radius
     result.radius = disc.radius * radius

@@ -213,11 +213,11 @@ class Outline(NamedTuple):
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
-    """Which sector pixels are in; `SECTORS` for those in the middle, and those not fitted."""
+def find_sectors(patch: Any, n: int, disc: Disc, nearest: float, farthest: float) -> None:
+    """Which sector pixels are in; `SECTORS` for those not fitted, nearer or farther (radii)."""
     design = patch.design
     x0, y0 = F32(disc.x), F32(disc.y)
-    middle = F32((_MIDDLE * disc.radius) ** 2)
+    near, far = F32((nearest * disc.radius) ** 2), F32((farthest * disc.radius) ** 2)
     for i in range(n):
         x = design[PLANE_X, i] - x0
         y = design[PLANE_Y, i] - y0
@@ -225,7 +225,8 @@ def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
         k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
         k = np.int32(7) - k if x < F32(0.0) else k
         k = np.int32(15) - k if y < F32(0.0) else k
-        counts = (design[ONE, i] > F32(0.0)) & (x * x + y * y >= middle)
+        r_2 = x * x + y * y
+        counts = (design[ONE, i] > F32(0.0)) & (r_2 >= near) & (r_2 <= far)
         patch.sector[i] = k if counts else np.int32(SECTORS)
 
 
@@ -239,7 +240,7 @@ def outline_statistics(
     distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sums` is
     (17, 8) working space.
     """
-    _find_sectors(patch, n, disc)
+    find_sectors(patch, n, disc, _MIDDLE, math.inf)
     c = F32(contrast)
     sums.fill(0.0)
     for i in range(n):

@@ -78,9 +78,6 @@ _DENSE_WINDOW = 2048
 #: Share of the distance between pixels that are taken by which they shift from row to row: one that
 #: never repeats soon.
 _SHIFT = 0.381966
-#: Sectors of a disc that is partly hidden; pixels between these distances (radii) are fitted then.
-DIRECTIONS = 32
-NEAREST_IN_VIEW, FARTHEST_IN_VIEW = 0.45, 1.4
 
 
 class FitSettings(NamedTuple):
@@ -125,9 +122,6 @@ class Candidate(NamedTuple):
     """Nominal, metres."""
     blur: float
     """About how blurred it is (along u), pixels."""
-    hidden: int
-    """Directions from the middle (of `detect.discs.rim`) in which it is not seen, a bit each: if
-    there are any, only pixels about the edge in the others are fitted."""
 
 
 class View(NamedTuple):
@@ -237,8 +231,6 @@ def gather(
     if view.u_per_radius == 0.0:
         return Gathered(view.shape, 0, 0)
     count = _choose(floor_xy, candidate, settings, start, view, look, patch)
-    if candidate.hidden:
-        count = _in_view(floor_xy, candidate, start, count, patch)
     _describe(image, floor_xy, candidate, view.shape, count, patch)
     return Gathered(view.shape, padded(count), count)
 
@@ -310,25 +302,6 @@ def _choose(
                 count += 1
             turn = turn - 1 if turn > 0 else between
     return count
-
-
-@kernel()
-def _in_view(
-    floor_xy: NDArray[np.float32], candidate: Candidate, start: Disc, count: int, patch: Any
-) -> int:
-    """Keep those of the pixels chosen in whose directions the edge is in view."""
-    floor = floor_xy.reshape(-1, 2)
-    x0 = floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x
-    y0 = floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y
-    kept = 0
-    for i in range(count):
-        x, y = floor[patch.pixel[i], 0] - x0, floor[patch.pixel[i], 1] - y0
-        r = math.hypot(x, y) / (candidate.radius * start.radius)
-        k = math.floor(math.atan2(y, x) * (DIRECTIONS / (2.0 * math.pi)) + 0.5) % DIRECTIONS
-        if NEAREST_IN_VIEW <= r <= FARTHEST_IN_VIEW and not (candidate.hidden >> k) & 1:
-            patch.pixel[kept], patch.weight[kept] = patch.pixel[i], patch.weight[i]
-            kept += 1
-    return kept
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

@@ -1,117 +1,488 @@
-"""Where a disc is of which only a part is seen: by the part of its rim that is in view.
+"""Where a disc is that the fit of a whole disc explains in part: by its edge, sector by sector.
 
-Something before a disc, or a stain on it, pulls at the fit of the whole disc. The rim
-(`detect.discs.rim`) says in which directions the disc ends where it should. To the pixels about
-the edge in these directions the same model is fitted again; where that explains them, it places the
-disc, to a fraction of what single points of the rim do. Where it does not, as beside a shadow's
-edge, which leaves the rim in its place and changes the grey values about it, the points place it.
+Whatever hides, stains or lights a part of a disc pulls at the fit of the whole disc. Here the same
+blurred disc is fitted to the pixels about its edge alone, and in each of 16 sectors s it has grey
+levels of its own inside and outside:
+
+    grey = outside_s + contrast_s * W(x, y, radius, log blur)
+
+so light may change round the disc as it likes. In every sector the levels are eliminated; what
+remains are normal equations of the four parameters that all sectors share. A sector counts less if
+the model does not explain it, and if it shows the edge elsewhere than the others do: something
+else's edge. These weights are Tukey's, found anew in every step (A. E. Beaton and J. W. Tukey,
+Technometrics 16, 1974).
+
+The errors of neighbouring pixels are not independent where something touches the rim, those of
+different sectors nearly are. So the covariance is that of clustered data (K.-Y. Liang and S. L.
+Zeger, Biometrika 73, 1986): of the steps that each sector by itself would still make.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
-from detect.discs.descent import Hope
+from detect.discs.descent import LEAST_BLUR, MOST_BLUR, Hope, blur_of
 from detect.discs.fit import RESULT, fit_disc
-from detect.discs.model import Disc
-from detect.discs.patch import FULL, Candidate, FitSettings
-from detect.discs.rim import PLACING_SIGMA, Rim, follow_rim, median
+from detect.discs.least_squares import SECTORS, find_sectors
+from detect.discs.model import (
+    BY_BLUR,
+    BY_RADIUS,
+    BY_X,
+    BY_Y,
+    GREY,
+    PIXEL_VARIANCE,
+    SHARE,
+    Blur,
+    Disc,
+    chord_shares,
+    edge_shares,
+)
+from detect.discs.patch import CHORDS_ALONG_V, EDGE, FULL, Candidate, FitSettings, floor_steps, gather
+from detect.discs.rim import Rim, follow_rim, median
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.search import Scene
     from detect.discs.second_look import SecondLooks
 
+FloatArray = NDArray[np.float64]
+
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
 WELL_EXPLAINED = 0.97
-#: The fit to what is in view is at most this far from the rim, radii.
-_MOST_OFF_RIM = 0.15
-#: Share of the squared difference of fit and rim, or of two rims, that is added to the covariance.
+#: Standard deviation of the radius about that which discs of the image seem to have, relative: of a
+#: short arc, place and radius trade off.
+_RADIUS_SIGMA = 0.02
+#: Pixels this near to the edge are fitted, in pixels or in deviations of the blur.
+_REACH_PX, _REACH_BLURS = 3.0, 2.5
+#: and none of the disc's middle, nor far from it, radii.
+_NEAREST, _FARTHEST = 0.5, 1.5
+#: Blur where nothing is known of it, pixels.
+_BLUR_PX = 1.0
+#: Steps of the fit; the first ones leave no sector out, for the start may be off.
+_STEPS, _EARLY = 8, 2
+#: Least pixels of a sector, spread of the shares in it, and contrast relative to the median.
+_LEAST_PIXELS, _LEAST_SPREAD, _LEAST_CONTRAST = 6.0, 0.15, 0.4
+#: Standard deviation of the ramp of the light across the edge, relative, per radius.
+_RAMP_SIGMA = 0.5
+#: Least number of sectors, and the weight from which one counts.
+_LEAST_SECTORS, _COUNTS = 5, 0.1
+#: An edge this many deviations off the others has no weight; the least deviation, pixels.
+_FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
+#: Before that, one this many deviations off has half the weight.
+_FAR_EARLY = 2.0
+#: Longest step, nominal radii (and log blur).
+_LONGEST, _LONGEST_BLUR = 0.2, 0.7
+#: A shorter step is the last, nominal radii.
+_ARRIVED = 1e-3
+#: The fit ends at most this far from where it starts, radii.
+_MOST_OFF = 0.3
+#: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
+#: Sectors that are left out at a time for the covariance, for their neighbours err alike; by how
+#: much the sectors that are left differ more than that says; and the share of what independent
+#: noise alone would give that is added.
+_STRETCH, _INFLATION, _NOISE_SHARE = 3, 1.25, 0.5
+#: The fit of a whole disc places it if it explains this much of the variance,
+_EXPLAINS_ALL = 0.985
+#: also if the blur is so much longer along one axis, and explains as much as `WELL_EXPLAINED`.
+_MOVED = 1.5
 #: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
-#: Blur from which fits start: that of a whole disc's fit is also of what hides a part, pixels.
-_BLUR_PX = 1.0
-#: A rim whose step varies by less than this over the directions, relative to its mean, is even.
-_EVEN = 0.18
-#: Nothing moves where the blur is less than this, pixels.
-_SHARP_PX = 1.2
-#: A fit that explains less of the variance than this is of a disc that something hides.
-_LITTLE = 0.7
+
+#: Of the normal equations of a sector: its two levels, what all sectors share, the grey values.
+_OUTSIDE, _RAMP, _CONTRAST, _BLUR_1, _BLUR_2, _RADIUS, _X, _Y, _GREY = range(9)
+_TERMS = 9
+
+
+class Start(NamedTuple):
+    """Where a fit starts; lengths in metres."""
+
+    x: float
+    y: float
+    radius: float
+    blur_px: float
+
+
+class Edge(NamedTuple):
+    """What all sectors share: a disc, relative to its candidate, nominal radii; and its blur."""
+
+    x: float
+    y: float
+    radius: float
+    blur: Blur
+
+
+class Sectors(NamedTuple):
+    """What each sector says."""
+
+    products: FloatArray
+    """(SECTORS, 9, 9) normal equations of levels, ramp and what all share, swept at the former."""
+    contrast: FloatArray
+    """(SECTORS,) grey levels; 0 where there is no edge to be seen."""
+    variance: FloatArray
+    """(SECTORS,) of the residuals."""
+    off_px: FloatArray
+    """(SECTORS,) how far outside the circle the edge is."""
+    weight: FloatArray
+    """(SECTORS,) per variance."""
+
+
+class Placed(NamedTuple):
+    """What became of a disc's sectors."""
+
+    agree: bool
+    """On one disc near the start."""
+    blur_ratio: float
+    """The blur along v over that along u, in pixels."""
 
 
 @kernel()
-def place_by_part(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> None:
-    """Place a disc by the part of its rim that is in view.
+def sweep(matrix: FloatArray, k: int) -> None:
+    """Sweep a symmetric matrix at its k-th pivot (J. H. Goodnight, Amer. Statistician 33, 1979).
+
+    Once it is swept at some unknowns, a matrix of normal equations holds the inverse of their
+    block, negative, the regressions of all others on them, and what these leave of the products.
+    """
+    pivot = matrix[k, k]
+    for i in range(len(matrix)):
+        for j in range(len(matrix)):
+            if i != k and j != k:
+                matrix[i, j] -= matrix[i, k] * matrix[k, j] / pivot
+    for i in range(len(matrix)):
+        matrix[i, k] /= pivot
+        matrix[k, i] /= pivot
+    matrix[k, k] = -1.0 / pivot
+
+
+@kernel()
+def place_by_sectors(
+    scene: Scene, radius: float, start: Start, work: Any, result: Any
+) -> Placed:
+    """Place a disc by those sectors of its edge that agree on one.
 
     Parameters
     ----------
     scene : Scene
     radius : float
         That discs of the image seem to have (`apparent_radius`), metres.
-    rim : Rim
-        Followed from about its own middle.
+    start : Start
     work : WORK
         Working space.
     result : RESULT
-        The fit of the whole disc, or zeros: its centre and covariance are replaced.
+        Its centre and covariance are replaced where sectors agree.
     """
-    of_part = np.zeros(1, RESULT)
-    part = of_part[0]
-    if (
-        rim.hidden != 0
-        and _fit_in_view(scene, radius, rim, work, part)
-        and part.explained >= WELL_EXPLAINED
-    ):
-        result.x, result.y = part.x, part.y
-        result.cov_xx, result.cov_xy, result.cov_yy = part.cov_xx, part.cov_xy, part.cov_yy
-        # What fit and points of the rim disagree by is a sample of what either may be wrong by.
-        _add_square(result, _DISAGREEMENT, part.x - rim.x, part.y - rim.y)
-        _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
-    elif _is_even(rim, result):
+    patch, given = work.patch, scene.settings
+    settings = FitSettings(
+        given.noise, 0.0, _REACH_PX, _REACH_BLURS, _RADIUS_SIGMA, given.blur_px, given.blur_sigma,
+        given.blur_ratio,
+    )  # fmt: skip
+    candidate, begin = _candidate_at(scene, radius, start)
+    gathered = gather(scene.image, scene.floor_xy, candidate, settings, begin, False, patch)
+    per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
+    level = float(scene.image[candidate.v, candidate.u])
+    expected = Edge(0.0, 0.0, 1.0, blur_of(gathered.shape, given.blur_px, given.blur_ratio))
+    blur = blur_of(gathered.shape, start.blur_px, given.blur_ratio)
+    edge, normal = Edge(begin.x, begin.y, begin.radius, blur), np.zeros((_TERMS, _TERMS))
+    sectors = Sectors(
+        np.zeros((SECTORS, _TERMS, _TERMS)), np.zeros(SECTORS), np.zeros(SECTORS),
+        np.zeros(SECTORS), np.zeros(SECTORS),
+    )  # fmt: skip
+    for step in range(_STEPS):
+        disc = Disc(edge.x, edge.y, edge.radius, 0.0)
+        if gathered.shape == EDGE:
+            edge_shares(patch, gathered.n, disc, edge.blur)
+        else:
+            chord_shares(patch, gathered.n, disc, edge.blur)
+        find_sectors(patch, gathered.n, disc, _NEAREST, _FARTHEST)
+        _add_products(patch, gathered.n, edge, level, sectors.products)
+        _see(sectors, per_pixel, settings.noise)
+        if _weigh(sectors, step < _EARLY, settings.noise) < _LEAST_SECTORS:
+            return Placed(False, given.blur_ratio)
+        _solve(sectors, edge, expected, settings, normal)
+        before, edge = edge, _moved(edge, normal)
+        if step > _EARLY and math.hypot(edge.x - before.x, edge.y - before.y) < _ARRIVED:
+            break
+    ratio = edge.blur.second / edge.blur.first
+    ratio = 1.0 / ratio if gathered.shape == CHORDS_ALONG_V else ratio
+    if math.hypot(edge.x - begin.x, edge.y - begin.y) > _MOST_OFF:
+        return Placed(False, ratio)
+    # As seen from the last but one edge, to which the sectors belong.
+    floor_xy = scene.floor_xy[candidate.v, candidate.u]
+    result.x, result.y = floor_xy[0] + radius * edge.x, floor_xy[1] + radius * edge.y
+    xx, xy, yy = _covariance(sectors, before, expected, settings, normal)
+    area = radius * radius
+    result.cov_xx, result.cov_xy, result.cov_yy = area * xx, area * xy, area * yy
+    return Placed(True, ratio)
+
+
+@kernel()
+def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate, Disc]:
+    """The pixel nearest to a start, and the disc relative to it."""
+    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, start.x, start.y)
+    height, width = scene.image.shape
+    u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
+    x, y = start.x - scene.floor_xy[v, u, 0], start.y - scene.floor_xy[v, u, 1]
+    disc = Disc(x / radius, y / radius, start.radius / radius, math.log(start.blur_px))
+    return Candidate(u, v, radius, start.blur_px), disc
+
+
+@kernel()
+def _add_products(patch: Any, n: int, edge: Edge, level: float, products: FloatArray) -> None:
+    """Sums of products of derivatives and grey values in each sector; those are above `level`."""
+    design = patch.design
+    variance_1 = edge.blur.first**2 + PIXEL_VARIANCE
+    variance_2 = edge.blur.second**2 + PIXEL_VARIANCE
+    row = np.empty(_TERMS)
+    products[:] = 0.0
+    for i in range(n):
+        if patch.sector[i] == SECTORS:
+            continue
+        x, y = patch.x[i] - edge.x, patch.y[i] - edge.y
+        grey = design[GREY, i]
+        # Light that changes across the edge changes what either side gives back of it.
+        row[_OUTSIDE], row[_RAMP] = 1.0, (math.hypot(x, y) - edge.radius) * (level + grey)
+        # Which part of the blur across the edge is along the first axis.
+        by_1 = variance_1 * (patch.x1[i] * x + patch.y1[i] * y) ** 2
+        by_2 = variance_2 * (patch.x2[i] * x + patch.y2[i] * y) ** 2
+        by_blur, part = design[BY_BLUR, i], by_1 / (by_1 + by_2 + 1e-12)
+        row[_BLUR_1], row[_BLUR_2] = part * by_blur, (1.0 - part) * by_blur
+        row[_CONTRAST], row[_RADIUS] = design[SHARE, i], design[BY_RADIUS, i]
+        row[_X], row[_Y], row[_GREY] = design[BY_X, i], design[BY_Y, i], grey
+        of_sector = products[patch.sector[i]]
+        for a in range(_TERMS):
+            for b in range(a + 1):
+                of_sector[a, b] += row[a] * row[b]
+    for s in range(SECTORS):
+        for a in range(_TERMS):
+            for b in range(a):
+                products[s, b, a] = products[s, a, b]
+
+
+@kernel()
+def _see(sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: float) -> None:
+    """Eliminate levels and ramp of each sector; its contrast, residuals, and where its edge is."""
+    for s in range(SECTORS):
+        of_sector = sectors.products[s]
+        sectors.contrast[s] = 0.0
+        pixels = of_sector[_OUTSIDE, _OUTSIDE]
+        if pixels < _LEAST_PIXELS:
+            continue
+        of_sector[_RAMP, _RAMP] += (noise / _RAMP_SIGMA) ** 2
+        sweep(of_sector, _OUTSIDE)
+        if of_sector[_CONTRAST, _CONTRAST] < _LEAST_SPREAD:
+            continue
+        sweep(of_sector, _RAMP)
+        sweep(of_sector, _CONTRAST)
+        contrast = of_sector[_CONTRAST, _GREY]
+        sectors.contrast[s] = contrast
+        sectors.variance[s] = of_sector[_GREY, _GREY] / (pixels - 3.0)
+        angle = 2.0 * math.pi * (s + 0.5) / SECTORS
+        per_u = per_pixel[0] * math.cos(angle) + per_pixel[1] * math.sin(angle)
+        per_v = per_pixel[2] * math.cos(angle) + per_pixel[3] * math.sin(angle)
+        off = of_sector[_RADIUS, _GREY] / (contrast * of_sector[_RADIUS, _RADIUS])
+        sectors.off_px[s] = off / math.hypot(per_u, per_v)
+
+
+@kernel()
+def _weigh(sectors: Sectors, early: bool, noise: float) -> int:
+    """Weigh the sectors; returns how many count."""
+    contrast, variance, off_px = sectors.contrast, sectors.variance, sectors.off_px
+    chosen, some = np.zeros(SECTORS, np.bool_), np.empty(SECTORS)
+    total = 0.0
+    for s in range(SECTORS):
+        total += contrast[s]
+        sectors.weight[s] = 0.0
+    sign = 1.0 if total > 0.0 else -1.0
+    for s in range(SECTORS):
+        chosen[s] = sign * contrast[s] > 0.0
+        some[s] = sign * contrast[s]
+    least = _LEAST_CONTRAST * _median_of(some, chosen)
+    for s in range(SECTORS):
+        chosen[s] = chosen[s] and sign * contrast[s] >= least
+    usual = max(_median_of(variance, chosen), noise * noise)
+    middle = _median_of(off_px, chosen)
+    for s in range(SECTORS):
+        some[s] = abs(off_px[s] - middle)
+    spread = max(1.4826 * _median_of(some, chosen), _LEAST_OFF_PX)
+    count = 0
+    for s in range(SECTORS):
+        if chosen[s]:
+            far = off_px[s] / spread
+            if early:
+                weight = 1.0 / (1.0 + (far / _FAR_EARLY) ** 2)
+            else:
+                weight = max(1.0 - (far / _FAR_OFF) ** 2, 0.0) ** 2
+            weight *= usual / max(variance[s], usual)
+            count += weight > _COUNTS
+            sectors.weight[s] = weight / usual
+    return count
+
+
+@kernel()
+def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
+    """Median of the chosen values, 0 if there are none."""
+    some, count = np.empty(len(values)), 0
+    for k in range(len(values)):
+        if chosen[k]:
+            some[count] = values[k]
+            count += 1
+    return median(some[:count]) if count > 0 else 0.0
+
+
+@kernel()
+def _solve(
+    sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
+) -> None:
+    """Solve the normal equations of all sectors for the step of the edge.
+
+    Afterwards `normal` holds it in the column of the grey values, and the inverse, negative.
+    """
+    normal[:] = 0.0
+    for s in range(SECTORS):
+        by, contrast, weight = sectors.products[s], sectors.contrast[s], sectors.weight[s]
+        if weight > 0.0:
+            for a in range(_BLUR_1, _GREY):
+                normal[a, _GREY] += weight * contrast * by[a, _GREY]
+                for b in range(_BLUR_1, _GREY):
+                    normal[a, b] += weight * contrast * contrast * by[a, b]
+    off = expected.radius - edge.radius
+    _add_prior(normal, _RADIUS, settings.radius_sigma, off)
+    off = math.log(expected.blur.first / edge.blur.first)
+    _add_prior(normal, _BLUR_1, settings.blur_sigma, off)
+    off = math.log(expected.blur.second / edge.blur.second)
+    _add_prior(normal, _BLUR_2, settings.blur_sigma, off)
+    for a in range(_BLUR_1, _GREY):
+        normal[_GREY, a] = normal[a, _GREY]
+    for a in range(_BLUR_1, _GREY):
+        sweep(normal, a)
+
+
+@kernel()
+def _add_prior(normal: FloatArray, k: int, sigma: float, off: float) -> None:
+    normal[k, k] += 1.0 / sigma**2
+    normal[k, _GREY] += off / sigma**2
+
+
+@kernel()
+def _moved(edge: Edge, normal: FloatArray) -> Edge:
+    """The edge after a step."""
+    return Edge(
+        edge.x + _within(normal[_X, _GREY], _LONGEST),
+        edge.y + _within(normal[_Y, _GREY], _LONGEST),
+        edge.radius + _within(normal[_RADIUS, _GREY], _LONGEST),
+        Blur(
+            _scaled(edge.blur.first, normal[_BLUR_1, _GREY]),
+            _scaled(edge.blur.second, normal[_BLUR_2, _GREY]),
+        ),
+    )
+
+
+@kernel()
+def _within(step: float, longest: float) -> float:
+    return min(max(step, -longest), longest)
+
+
+@kernel()
+def _scaled(blur: float, step: float) -> float:
+    return min(max(blur * math.exp(_within(step, _LONGEST_BLUR)), LEAST_BLUR), MOST_BLUR)
+
+
+@kernel()
+def _covariance(
+    sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
+) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors in turn.
+
+    `normal` is as `_solve` leaves it.
+    """
+    noise_xx, noise_xy, noise_yy = normal[_X, _X], normal[_X, _Y], normal[_Y, _Y]
+    weight, others = sectors.weight.copy(), np.empty((SECTORS, 2))
+    mean_x = mean_y = 0.0
+    count = 0
+    for s in range(SECTORS):
+        for k in range(_STRETCH):
+            sectors.weight[(s + k) % SECTORS] = 0.0
+        _solve(sectors, edge, expected, settings, normal)
+        for k in range(_STRETCH):
+            sectors.weight[(s + k) % SECTORS] = weight[(s + k) % SECTORS]
+        others[s, 0], others[s, 1] = normal[_X, _GREY], normal[_Y, _GREY]
+        mean_x, mean_y = mean_x + others[s, 0] / SECTORS, mean_y + others[s, 1] / SECTORS
+        count += weight[s] > 0.0
+    xx = xy = yy = 0.0
+    for s in range(SECTORS):
+        x, y = others[s, 0] - mean_x, others[s, 1] - mean_y
+        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+    scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
+    return (
+        scale * xx - _NOISE_SHARE * noise_xx,
+        scale * xy - _NOISE_SHARE * noise_xy,
+        scale * yy - _NOISE_SHARE * noise_yy,
+    )
+
+
+@kernel()
+def place_fitted(scene: Scene, radius: float, work: Any, result: Any) -> None:
+    """Place a disc that was fitted as a whole, unless that explains all that is there.
+
+    Movement blurs an image along one axis, mostly: what the sectors say of the blur along either,
+    the whole disc is fitted with once more.
+    """
+    if result.explained >= _EXPLAINS_ALL:
+        return
+    start = Start(result.x, result.y, result.radius, result.blur)
+    placed = place_by_sectors(scene, radius, start, work, result)
+    given = scene.settings
+    longer = placed.blur_ratio / given.blur_ratio
+    if max(longer, 1.0 / longer) < _MOVED:
+        return
+    again = np.zeros(1, RESULT)
+    settings = FitSettings(
+        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, given.radius_sigma,
+        given.blur_px, given.blur_sigma, placed.blur_ratio,
+    )  # fmt: skip
+    candidate, disc = _candidate_at(scene, radius, start)
+    hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
+    image, floor_xy = scene.image, scene.floor_xy
+    if fit_disc(image, floor_xy, candidate, settings, disc, FULL, hope, work, again[0]):
+        if again[0].explained >= WELL_EXPLAINED:
+            result.x, result.y = again[0].x, again[0].y
+            result.cov_xx, result.cov_xy = again[0].cov_xx, again[0].cov_xy
+            result.cov_yy = again[0].cov_yy
+
+
+@kernel()
+def place_by_rim(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> None:
+    """Place a disc of which the rim is known: by its sectors, or else by the rim's points."""
+    start = Start(rim.x, rim.y, rim.radius, _BLUR_PX)
+    if not place_by_sectors(scene, radius, start, work, result).agree:
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
-        _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
+    _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
 
 
 @kernel()
-def _is_even(rim: Rim, result: Any) -> bool:
-    """Whether the points of a rim are found at its place all round where it is not hidden.
-
-    Where movement blurs it, it steps less on two sides, and is found beside its place; then the fit
-    explains most, though, and says that it is blurred.
-    """
-    return bool(rim.unevenness < _EVEN or result.explained < _LITTLE or result.blur < _SHARP_PX)
-
-
-@kernel(forceinline=True)
-def _add_square(result: Any, share: float, x: float, y: float) -> None:
-    """Add a share of the square of (x, y), metres, to the covariance of a result."""
-    result.cov_xx += share * x * x
-    result.cov_xy += share * x * y
-    result.cov_yy += share * y * y
-
-
-@kernel()
-def place_all_by_part(
-    scene: Scene,
-    radius: float,
-    looks: SecondLooks,
-    space: NDArray[Any],
-) -> Any:
+def place_all(scene: Scene, radius: float, looks: SecondLooks, space: NDArray[Any]) -> Any:
     """(N,) `RESULT` of the discs of N second looks."""
     results = np.zeros(len(looks.step), RESULT)
     for k in range(len(results)):
         x, y = looks.seen_from[k, 0], looks.seen_from[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, looks.step[k])
-        place_by_part(scene, radius, rim, space[0], results[k])
+        place_by_rim(scene, radius, rim, space[0], results[k])
         _add_square(results[k], _DISAGREEMENT, looks.doubt[k, 0], looks.doubt[k, 1])
     return results
+
+
+@kernel()
+def _add_square(result: Any, share: float, x: float, y: float) -> None:
+    """Add a share of the square of (x, y), metres, to the covariance of a result."""
+    result.cov_xx += share * x * x
+    result.cov_xy += share * x * y
+    result.cov_yy += share * y * y
 
 
 @kernel()
@@ -124,30 +495,3 @@ def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
     if len(radii) < _LEAST_WHOLE:
         return nominal
     return median(radii)
-
-
-@kernel(inline="always")
-def _fit_in_view(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
-    """Whether a fit to the pixels in view comes to a disc near the rim, of about its size."""
-    floor_xy, given = scene.floor_xy, scene.settings
-    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, rim.x, rim.y)
-    height, width = scene.image.shape
-    u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
-    start = Disc(
-        (rim.x - floor_xy[v, u, 0]) / radius,
-        (rim.y - floor_xy[v, u, 1]) / radius,
-        rim.radius / radius,
-        math.log(_BLUR_PX),
-    )
-    settings = FitSettings(
-        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, PLACING_SIGMA,
-        given.blur_px, given.blur_sigma, given.blur_ratio,
-    )  # fmt: skip
-    hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
-    candidate = Candidate(u, v, radius, _BLUR_PX, rim.hidden)
-    if not fit_disc(scene.image, floor_xy, candidate, settings, start, FULL, hope, work, result):
-        return False
-    off = math.hypot(result.x - rim.x, result.y - rim.y)
-    most = _MOST_OFF_RIM * radius
-    near = off < most and abs(result.radius - rim.radius) < most
-    return bool(near and result.contrast * rim.step > 0.0)

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
-from detect.discs.patch import DIRECTIONS as DIRECTIONS
 from redetect.compiled import kernel
 
+#: Directions from the middle of a candidate.
+DIRECTIONS = 32
 #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 STEPS = 32
 #: Where the search along a direction begins and ends, in nominal radii.
@@ -111,8 +112,6 @@ class Rim(NamedTuple):
     doubt_x: float
     """Towards another circle that the rim may be: its square adds to any covariance, metres."""
     doubt_y: float
-    hidden: int
-    """Directions in or beside which the rim is not on the circle, a bit each."""
 
 
 @kernel()
@@ -422,7 +421,7 @@ def follow_rim(
     chosen = np.zeros(DIRECTIONS)
     best, best_count, doubt = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(log_px)
-    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0, 0)
+    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
     if best_count < LEAST_POINTS:
         return nothing
     height, width = image.shape
@@ -447,10 +446,8 @@ def follow_rim(
             mean_2 += step[k] ** 2
     mean /= best_count
     mean_2 = max(mean_2 / best_count - mean * mean, 0.0)
-    runs = hidden_bits = 0
+    runs = 0
     for k in range(DIRECTIONS):
-        around = min(chosen[(k - 1) % DIRECTIONS], chosen[k], chosen[(k + 1) % DIRECTIONS])
-        hidden_bits |= (around == 0.0) << k
         # A stretch begins after a direction that agrees, and has two that do not.
         last, following = (k - 1) % DIRECTIONS, (k + 1) % DIRECTIONS
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
@@ -465,7 +462,6 @@ def follow_rim(
         x + radius * best.x, y + radius * best.y, radius_found,
         area * (share * best.cov_xx + by_xx), area * (share * best.cov_xy + by_xy),
         area * (share * best.cov_yy + by_yy), radius_px, radius * doubt[0], radius * doubt[1],
-        hidden_bits,
     )  # fmt: skip
 
 

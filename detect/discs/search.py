@@ -22,7 +22,12 @@ from detect.discs.evidence import (
 from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
-from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_part
+from detect.discs.placing import (
+    WELL_EXPLAINED,
+    apparent_radius,
+    place_by_rim,
+    place_fitted,
+)
 from detect.discs.quality import Centres
 from detect.discs.rim import follow_rim
 from redetect.compiled import kernel
@@ -196,7 +201,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         if search.verify and not worth_a_look(scene, u, v, quality, contrast):
             fate[k] = _FEW_STEPS
             continue
-        candidate = Candidate(u, v, search.radius, first_blur, 0)
+        candidate = Candidate(u, v, search.radius, first_blur)
         start = Disc(0.0, 0.0, 1.0, math.log(first_blur))
         hope = _hope(search, quality)
         if fit_disc(image, floor_xy, candidate, settings, start, LOOK, hope, work, result):
@@ -218,7 +223,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         blur = max(result.blur, first_blur)
         is_disc = False
         for _ in range(1 + _MOST_REFITS):
-            candidate = Candidate(u, v, search.radius, blur, 0)
+            candidate = Candidate(u, v, search.radius, blur)
             start = Disc(
                 (result.x - floor_xy[v, u, 0]) / search.radius,
                 (result.y - floor_xy[v, u, 1]) / search.radius,
@@ -250,14 +255,17 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         place[k, 0], place[k, 1] = (result.x, result.y) if search.refine else (x, y)
     radius = _apparent_radius(results, evidence, search)
     for k in range(count):
-        if fate[k] == _BESIDE and rim_step[k] != 0.0:
-            result = results[k]
+        result = results[k]
+        if fate[k] != _BESIDE or not (search.verify and search.refine):
+            continue
+        if rim_step[k] != 0.0:
             rim = follow_rim(
                 image, scene.camera_numbers, rim_xy[k, 0], rim_xy[k, 1], radius, rim_step[k]
             )
-            place_by_part(scene, radius, rim, work, result)
-            if search.refine:
-                place[k, 0], place[k, 1] = result.x, result.y
+            place_by_rim(scene, radius, rim, work, result)
+        else:
+            place_fitted(scene, radius, work, result)
+        place[k, 0], place[k, 1] = result.x, result.y
     best = best_apart(place, score, search.separation)
     fate[best] = _RARE
     if search.verify:

@@ -51,7 +51,7 @@ def _fit_all(
     work = np.zeros(1, WORK)
     start = Disc(0.0, 0.0, 1.0, math.log(blur_px))
     for i in range(len(pixels)):
-        candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_px, 0)
+        candidate = Candidate(pixels[i, 0], pixels[i, 1], radius, blur_px)
         fitted[i] = fit_disc(
             image, floor_xy, candidate, settings, start, effort, PATIENT, work[0], results[i]
         )

@@ -204,7 +204,7 @@ def test_fits_are_the_least_squares_of_the_reference(
     fit = fit_discs(image, table.floor_xy, np.array([[u, v]]), 0.1, noise, blur_ratio=0.5)
     assert fit.fitted[0]
     settings = fit_settings(noise, 0.5)
-    candidate = Candidate(int(u), int(v), 0.1, settings.blur_px, 0)
+    candidate = Candidate(int(u), int(v), 0.1, settings.blur_px)
     flat = view_of(table.floor_xy, candidate, 1.0, 0.5).shape != EDGE
     assert flat == (place[1] < -3.0)
     rows, columns = np.divmod(

@@ -56,7 +56,7 @@ def gathered(
 @pytest.mark.parametrize(("u", "v"), [(400, 160), (200, 130), (500, 110), (3, 150), (765, 165)])
 def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -> None:
     image = np.random.default_rng(3).integers(0, 256, table.floor_xy.shape[:2], np.uint8)
-    candidate = Candidate(u, v, RADIUS, 0.8, 0)
+    candidate = Candidate(u, v, RADIUS, 0.8)
     found, patch = gathered(table, image, candidate)
     n = found.fitted
     index = patch["pixel"][:n].astype(int)
@@ -82,7 +82,7 @@ def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -
 def test_patches_lie_about_the_start_of_the_fit(table: DiscTable) -> None:
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
     start = Disc(0.1, -0.2, 1.2, 0.0)
-    found, patch = gathered(table, image, Candidate(400, 200, RADIUS, 0.8, 0), start=start)
+    found, patch = gathered(table, image, Candidate(400, 200, RADIUS, 0.8), start=start)
     place = table.floor_xy.reshape(-1, 2)[patch["pixel"][: found.fitted].astype(int)]
     off = place - table.floor_xy[200, 400] - RADIUS * np.array([start.x, start.y])
     r = np.linalg.norm(off, axis=-1) / (RADIUS * start.radius)
@@ -95,7 +95,7 @@ def test_patches_lie_about_the_start_of_the_fit(table: DiscTable) -> None:
 def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
     """The steeper axis comes first where the disc is seen flat."""
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
-    found, patch = gathered(table, image, Candidate(400, v, RADIUS, 0.8, 0))
+    found, patch = gathered(table, image, Candidate(400, v, RADIUS, 0.8))
     rows, columns = np.divmod(patch["pixel"][: found.fitted].astype(int), table.floor_xy.shape[1])
     floor = table.floor_xy.astype(float)
     by_u = (floor[rows, columns + 1] - floor[rows, columns - 1]) / (2.0 * RADIUS)
@@ -114,7 +114,7 @@ def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
 
 def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: DiscTable) -> None:
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
-    candidate = Candidate(400, 250, RADIUS, 0.8, 0)
+    candidate = Candidate(400, 250, RADIUS, 0.8)
     found, patch = gathered(table, image, candidate)
     index = patch["pixel"][: found.fitted].astype(int)
     weight = patch["weight"][: found.fitted]
@@ -133,7 +133,7 @@ def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: Dis
 @pytest.mark.parametrize("v", [250, 200, 150])
 def test_looks_take_some_pixels_evenly(table: DiscTable, v: int) -> None:
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
-    candidate = Candidate(400, v, RADIUS, 0.6, 0)
+    candidate = Candidate(400, v, RADIUS, 0.6)
     found, patch = gathered(table, image, candidate, look=True)
     every = pixels_within_reach(table.floor_xy, candidate, fit_settings(1.0, 0.5))
     index = patch["pixel"][: found.fitted].astype(int)
