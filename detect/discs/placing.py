@@ -86,10 +86,10 @@ _DISAGREEMENT = 0.5
 #: Sectors that are left out at a time for the covariance, for their neighbours err alike; by how
 #: much the sectors that are left differ more than that says; and the share of what independent
 #: noise alone would give that is added.
-_STRETCH, _INFLATION, _NOISE_SHARE = 3, 1.25, 0.5
-#: The fit of a whole disc places it if it explains this much of the variance,
-_EXPLAINS_ALL = 0.985
-#: also if the blur is so much longer along one axis, and explains as much as `WELL_EXPLAINED`.
+_STRETCH, _INFLATION, _NOISE_SHARE = 3, 1.5, 0.5
+#: Fits of a whole disc that explain this much of the variance leave nothing to be asked.
+_EXPLAINS_ALL = 0.995
+#: It is fitted again if the blur is this much longer along one axis.
 _MOVED = 1.5
 #: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
@@ -427,32 +427,40 @@ def _covariance(
 
 @kernel()
 def place_fitted(scene: Scene, radius: float, work: Any, result: Any) -> None:
-    """Place a disc that was fitted as a whole, unless that explains all that is there.
+    """Place a disc that was fitted as a whole by its sectors, where these are more certain.
 
-    Movement blurs an image along one axis, mostly: what the sectors say of the blur along either,
-    the whole disc is fitted with once more.
+    Movement blurs an image along one axis, mostly: with what the sectors say of the blur along
+    either, the whole disc is fitted once more.
     """
     if result.explained >= _EXPLAINS_ALL:
         return
     start = Start(result.x, result.y, result.radius, result.blur)
-    placed = place_by_sectors(scene, radius, start, work, result)
+    others = np.zeros(2, RESULT)
+    by_sectors, again = others[0], others[1]
+    placed = place_by_sectors(scene, radius, start, work, by_sectors)
     given = scene.settings
     longer = placed.blur_ratio / given.blur_ratio
-    if max(longer, 1.0 / longer) < _MOVED:
-        return
-    again = np.zeros(1, RESULT)
-    settings = FitSettings(
-        given.noise, given.reach_radii, given.reach_px, given.reach_blurs, given.radius_sigma,
-        given.blur_px, given.blur_sigma, placed.blur_ratio,
-    )  # fmt: skip
-    candidate, disc = _candidate_at(scene, radius, start)
-    hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
-    image, floor_xy = scene.image, scene.floor_xy
-    if fit_disc(image, floor_xy, candidate, settings, disc, FULL, hope, work, again[0]):
-        if again[0].explained >= WELL_EXPLAINED:
-            result.x, result.y = again[0].x, again[0].y
-            result.cov_xx, result.cov_xy = again[0].cov_xx, again[0].cov_xy
-            result.cov_yy = again[0].cov_yy
+    if max(longer, 1.0 / longer) >= _MOVED:
+        settings = FitSettings(
+            given.noise, given.reach_radii, given.reach_px, given.reach_blurs, given.radius_sigma,
+            given.blur_px, given.blur_sigma, placed.blur_ratio,
+        )  # fmt: skip
+        candidate, disc = _candidate_at(scene, radius, start)
+        hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
+        image, floor_xy = scene.image, scene.floor_xy
+        if fit_disc(image, floor_xy, candidate, settings, disc, FULL, hope, work, again):
+            _place_if_better(again, result)
+    if placed.agree:
+        _place_if_better(by_sectors, result)
+
+
+@kernel()
+def _place_if_better(other: Any, result: Any) -> None:
+    """Take over a place whose covariance is smaller."""
+    area = result.cov_xx * result.cov_yy - result.cov_xy**2
+    if other.cov_xx * other.cov_yy - other.cov_xy**2 < area:
+        result.x, result.y = other.x, other.y
+        result.cov_xx, result.cov_xy, result.cov_yy = other.cov_xx, other.cov_xy, other.cov_yy
 
 
 @kernel()
