@@ -19,7 +19,6 @@ import numpy as np
 from detect.discs.evidence import LEAST_EXPLAINED, evidence_of
 from detect.discs.least_squares import (
     BACKGROUND,
-    SECTORS,
     UNKNOWNS,
     background_products,
     blur_width,
@@ -42,7 +41,7 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
+from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, SECTORS, FitSettings, Gathered
 from redetect.compiled import kernel
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.

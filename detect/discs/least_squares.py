@@ -35,12 +35,12 @@ from detect.discs.model import (
     Blur,
     Disc,
 )
+from detect.discs.patch import SECTORS
 from redetect.compiled import kernel
 
 #: Terms of the background, and unknowns of a step.
 BACKGROUND, UNKNOWNS = 5, 10
 
-SECTORS = 16
 #: Pixels without which the middle of a disc, this part of its radius, says nothing.
 _LEAST_MIDDLE = 2.0
 _MIDDLE = 0.3
@@ -213,11 +213,11 @@ class Outline(NamedTuple):
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def find_sectors(patch: Any, n: int, disc: Disc, nearest: float, farthest: float) -> None:
-    """Which sector pixels are in; `SECTORS` for those not fitted, nearer or farther (radii)."""
+def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
+    """Which sector pixels are in; `SECTORS` for those in the middle, and those not fitted."""
     design = patch.design
     x0, y0 = F32(disc.x), F32(disc.y)
-    near, far = F32((nearest * disc.radius) ** 2), F32((farthest * disc.radius) ** 2)
+    middle = F32((_MIDDLE * disc.radius) ** 2)
     for i in range(n):
         x = design[PLANE_X, i] - x0
         y = design[PLANE_Y, i] - y0
@@ -225,8 +225,7 @@ def find_sectors(patch: Any, n: int, disc: Disc, nearest: float, farthest: float
         k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
         k = np.int32(7) - k if x < F32(0.0) else k
         k = np.int32(15) - k if y < F32(0.0) else k
-        r_2 = x * x + y * y
-        counts = (design[ONE, i] > F32(0.0)) & (r_2 >= near) & (r_2 <= far)
+        counts = (design[ONE, i] > F32(0.0)) & (x * x + y * y >= middle)
         patch.sector[i] = k if counts else np.int32(SECTORS)
 
 
@@ -240,7 +239,7 @@ def outline_statistics(
     distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sums` is
     (17, 8) working space.
     """
-    find_sectors(patch, n, disc, _MIDDLE, math.inf)
+    _find_sectors(patch, n, disc)
     c = F32(contrast)
     sums.fill(0.0)
     for i in range(n):

@@ -60,6 +60,9 @@ PATCH = np.dtype(
     ]
 )  # fmt: skip
 
+#: Sectors of a disc and what is about it.
+SECTORS = 16
+
 #: By which formula discs are seen, and along which axis their chords run: see `detect.discs.model`.
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 
@@ -233,6 +236,64 @@ def gather(
     count = _choose(floor_xy, candidate, settings, start, view, look, patch)
     _describe(image, floor_xy, candidate, view.shape, count, patch)
     return Gathered(view.shape, padded(count), count)
+
+
+@kernel()
+def gather_by_sector(
+    image: NDArray[np.uint8],
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    settings: FitSettings,
+    start: Disc,
+    between: tuple[float, float],
+    patch: Any,
+    ends: NDArray[np.int64],
+) -> Gathered:
+    """As `gather`, of the pixels between two distances, radii, and sector by sector.
+
+    `ends` (SECTORS + 1,) is a result: where in the patch each sector begins, and the last ends.
+    """
+    ends[:] = 0
+    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
+    if view.u_per_radius == 0.0:
+        return Gathered(view.shape, 0, 0)
+    count = _choose(floor_xy, candidate, settings, start, view, False, patch)
+    count = _sort_by_sector(floor_xy, candidate, start, between, count, patch, ends)
+    _describe(image, floor_xy, candidate, view.shape, count, patch)
+    return Gathered(view.shape, padded(count), count)
+
+
+@kernel()
+def _sort_by_sector(
+    floor_xy: NDArray[np.float32],
+    candidate: Candidate,
+    start: Disc,
+    between: tuple[float, float],
+    count: int,
+    patch: Any,
+    ends: NDArray[np.int64],
+) -> int:
+    """Sort pixels by sector, and leave out those that are not between the distances."""
+    floor, pixel = floor_xy.reshape(-1, 2), patch.pixel[:count].copy()
+    x0 = floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x
+    y0 = floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y
+    per_radius, per_sector = 1.0 / (candidate.radius * start.radius), SECTORS / (2.0 * math.pi)
+    for i in range(count):
+        x, y = floor[pixel[i], 0] - x0, floor[pixel[i], 1] - y0
+        r = math.sqrt(x * x + y * y) * per_radius
+        patch.sector[i] = SECTORS
+        if between[0] <= r <= between[1]:
+            patch.sector[i] = math.floor(math.atan2(y, x) * per_sector) % SECTORS
+            ends[patch.sector[i] + 1] += 1
+    for s in range(SECTORS):
+        ends[s + 1] += ends[s]
+    following = ends.copy()
+    for i in range(count):
+        s = patch.sector[i]
+        if s < SECTORS:
+            patch.pixel[following[s]] = pixel[i]
+            following[s] += 1
+    return int(ends[SECTORS])
 
 
 @kernel(forceinline=True)

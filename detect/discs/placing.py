@@ -28,12 +28,13 @@ from numpy.typing import NDArray
 from camera.kernels import project_floor_point
 from detect.discs.descent import LEAST_BLUR, MOST_BLUR, Hope, blur_of
 from detect.discs.fit import RESULT, fit_disc
-from detect.discs.least_squares import SECTORS, find_sectors
 from detect.discs.model import (
     BY_BLUR,
     BY_RADIUS,
     BY_X,
     BY_Y,
+    F32,
+    FASTMATH,
     GREY,
     PIXEL_VARIANCE,
     SHARE,
@@ -42,7 +43,16 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.patch import CHORDS_ALONG_V, EDGE, FULL, Candidate, FitSettings, floor_steps, gather
+from detect.discs.patch import (
+    CHORDS_ALONG_V,
+    EDGE,
+    FULL,
+    SECTORS,
+    Candidate,
+    FitSettings,
+    floor_steps,
+    gather_by_sector,
+)
 from detect.discs.rim import Rim, follow_rim, median
 from redetect.compiled import kernel
 
@@ -64,7 +74,7 @@ _NEAREST, _FARTHEST = 0.5, 1.5
 #: Blur where nothing is known of it, pixels.
 _BLUR_PX = 1.0
 #: Steps of the fit; the first ones leave no sector out, for the start may be off.
-_STEPS, _EARLY = 8, 2
+_STEPS, _EARLY = 8, 1
 #: Least pixels of a sector, spread of the shares in it, and contrast relative to the median.
 _LEAST_PIXELS, _LEAST_SPREAD, _LEAST_CONTRAST = 6.0, 0.15, 0.4
 #: Standard deviation of the ramp of the light across the edge, relative, per radius.
@@ -78,17 +88,16 @@ _FAR_EARLY = 2.0
 #: Longest step, nominal radii (and log blur).
 _LONGEST, _LONGEST_BLUR = 0.2, 0.7
 #: A shorter step is the last, nominal radii.
-_ARRIVED = 1e-3
+_ARRIVED = 5e-3
 #: The fit ends at most this far from where it starts, radii.
 _MOST_OFF = 0.3
 #: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
-#: Sectors that are left out at a time for the covariance, for their neighbours err alike; by how
-#: much the sectors that are left differ more than that says; and the share of what independent
-#: noise alone would give that is added.
-_STRETCH, _INFLATION, _NOISE_SHARE = 3, 1.5, 0.5
+#: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
+#: the variance is larger than what that gives.
+_STRETCH, _INFLATION = 3, 1.4
 #: Fits of a whole disc that explain this much of the variance leave nothing to be asked.
-_EXPLAINS_ALL = 0.995
+_EXPLAINS_ALL = 0.985
 #: It is fitted again if the blur is this much longer along one axis.
 _MOVED = 1.5
 #: Least number of whole discs that give the apparent radius.
@@ -121,7 +130,7 @@ class Sectors(NamedTuple):
     """What each sector says."""
 
     products: FloatArray
-    """(SECTORS, 9, 9) normal equations of levels, ramp and what all share, swept at the former."""
+    """(SECTORS, 9, 9) normal equations: lower halves; levels and ramp are eliminated."""
     contrast: FloatArray
     """(SECTORS,) grey levels; 0 where there is no edge to be seen."""
     variance: FloatArray
@@ -142,27 +151,20 @@ class Placed(NamedTuple):
 
 
 @kernel()
-def sweep(matrix: FloatArray, k: int) -> None:
-    """Sweep a symmetric matrix at its k-th pivot (J. H. Goodnight, Amer. Statistician 33, 1979).
+def eliminate(matrix: FloatArray, k: int) -> None:
+    """Eliminate unknown k from the later ones of normal equations, of which the lower half is used.
 
-    Once it is swept at some unknowns, a matrix of normal equations holds the inverse of their
-    block, negative, the regressions of all others on them, and what these leave of the products.
+    What is left of the products is that of what the eliminated unknowns leave of all others.
     """
-    pivot = matrix[k, k]
-    for i in range(len(matrix)):
-        for j in range(len(matrix)):
-            if i != k and j != k:
-                matrix[i, j] -= matrix[i, k] * matrix[k, j] / pivot
-    for i in range(len(matrix)):
-        matrix[i, k] /= pivot
-        matrix[k, i] /= pivot
-    matrix[k, k] = -1.0 / pivot
+    per_pivot = 1.0 / matrix[k, k]
+    for i in range(k + 1, len(matrix)):
+        share = matrix[i, k] * per_pivot
+        for j in range(k + 1, i + 1):
+            matrix[i, j] -= share * matrix[j, k]
 
 
 @kernel()
-def place_by_sectors(
-    scene: Scene, radius: float, start: Start, work: Any, result: Any
-) -> Placed:
+def place_by_sectors(scene: Scene, radius: float, start: Start, work: Any, result: Any) -> Placed:
     """Place a disc by those sectors of its edge that agree on one.
 
     Parameters
@@ -182,7 +184,11 @@ def place_by_sectors(
         given.blur_ratio,
     )  # fmt: skip
     candidate, begin = _candidate_at(scene, radius, start)
-    gathered = gather(scene.image, scene.floor_xy, candidate, settings, begin, False, patch)
+    ends = np.empty(SECTORS + 1, np.int64)
+    gathered = gather_by_sector(
+        scene.image, scene.floor_xy, candidate, settings, begin, (_NEAREST, _FARTHEST), patch, ends
+    )
+    rows = np.empty((_TERMS, gathered.n), np.float32)
     per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
     level = float(scene.image[candidate.v, candidate.u])
     expected = Edge(0.0, 0.0, 1.0, blur_of(gathered.shape, given.blur_px, given.blur_ratio))
@@ -198,23 +204,23 @@ def place_by_sectors(
             edge_shares(patch, gathered.n, disc, edge.blur)
         else:
             chord_shares(patch, gathered.n, disc, edge.blur)
-        find_sectors(patch, gathered.n, disc, _NEAREST, _FARTHEST)
-        _add_products(patch, gathered.n, edge, level, sectors.products)
+        _write_rows(patch, gathered.n, edge, level, rows)
+        _multiply(rows, ends, sectors.products)
         _see(sectors, per_pixel, settings.noise)
         if _weigh(sectors, step < _EARLY, settings.noise) < _LEAST_SECTORS:
             return Placed(False, given.blur_ratio)
-        _solve(sectors, edge, expected, settings, normal)
-        before, edge = edge, _moved(edge, normal)
-        if step > _EARLY and math.hypot(edge.x - before.x, edge.y - before.y) < _ARRIVED:
+        _add_up(sectors, edge, expected, settings, normal)
+        if step == _STEPS - 1 or (step > _EARLY and _is_short(normal.copy())):
             break
+        edge = _moved(edge, normal)
     ratio = edge.blur.second / edge.blur.first
     ratio = 1.0 / ratio if gathered.shape == CHORDS_ALONG_V else ratio
-    if math.hypot(edge.x - begin.x, edge.y - begin.y) > _MOST_OFF:
+    (x, y), (xx, xy, yy) = _centre_and_covariance(sectors, normal)
+    x, y = edge.x + x, edge.y + y
+    if math.hypot(x - begin.x, y - begin.y) > _MOST_OFF:
         return Placed(False, ratio)
-    # As seen from the last but one edge, to which the sectors belong.
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
-    result.x, result.y = floor_xy[0] + radius * edge.x, floor_xy[1] + radius * edge.y
-    xx, xy, yy = _covariance(sectors, before, expected, settings, normal)
+    result.x, result.y = floor_xy[0] + radius * x, floor_xy[1] + radius * y
     area = radius * radius
     result.cov_xx, result.cov_xy, result.cov_yy = area * xx, area * xy, area * yy
     return Placed(True, ratio)
@@ -231,36 +237,42 @@ def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate,
     return Candidate(u, v, radius, start.blur_px), disc
 
 
-@kernel()
-def _add_products(patch: Any, n: int, edge: Edge, level: float, products: FloatArray) -> None:
-    """Sums of products of derivatives and grey values in each sector; those are above `level`."""
+@kernel(fastmath=FASTMATH)
+def _write_rows(patch: Any, n: int, edge: Edge, level: float, rows: NDArray[np.float32]) -> None:
+    """The derivatives by all unknowns, and the grey values (above `level`), for n pixels."""
     design = patch.design
-    variance_1 = edge.blur.first**2 + PIXEL_VARIANCE
-    variance_2 = edge.blur.second**2 + PIXEL_VARIANCE
-    row = np.empty(_TERMS)
-    products[:] = 0.0
+    variance_1 = F32(edge.blur.first**2 + PIXEL_VARIANCE)
+    variance_2 = F32(edge.blur.second**2 + PIXEL_VARIANCE)
+    x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
     for i in range(n):
-        if patch.sector[i] == SECTORS:
-            continue
-        x, y = patch.x[i] - edge.x, patch.y[i] - edge.y
-        grey = design[GREY, i]
+        x, y = patch.x[i] - x0, patch.y[i] - y0
+        rows[_OUTSIDE, i] = F32(1.0)
         # Light that changes across the edge changes what either side gives back of it.
-        row[_OUTSIDE], row[_RAMP] = 1.0, (math.hypot(x, y) - edge.radius) * (level + grey)
+        rows[_RAMP, i] = (math.sqrt(x * x + y * y) - r0) * (design[GREY, i] - black)
+        rows[_CONTRAST, i] = design[SHARE, i]
         # Which part of the blur across the edge is along the first axis.
-        by_1 = variance_1 * (patch.x1[i] * x + patch.y1[i] * y) ** 2
-        by_2 = variance_2 * (patch.x2[i] * x + patch.y2[i] * y) ** 2
-        by_blur, part = design[BY_BLUR, i], by_1 / (by_1 + by_2 + 1e-12)
-        row[_BLUR_1], row[_BLUR_2] = part * by_blur, (1.0 - part) * by_blur
-        row[_CONTRAST], row[_RADIUS] = design[SHARE, i], design[BY_RADIUS, i]
-        row[_X], row[_Y], row[_GREY] = design[BY_X, i], design[BY_Y, i], grey
-        of_sector = products[patch.sector[i]]
-        for a in range(_TERMS):
-            for b in range(a + 1):
-                of_sector[a, b] += row[a] * row[b]
+        g_1 = patch.x1[i] * x + patch.y1[i] * y
+        g_2 = patch.x2[i] * x + patch.y2[i] * y
+        by_1, by_2 = variance_1 * g_1 * g_1, variance_2 * g_2 * g_2
+        part = by_1 / (by_1 + by_2 + F32(1e-12))
+        rows[_BLUR_1, i] = part * design[BY_BLUR, i]
+        rows[_BLUR_2, i] = (F32(1.0) - part) * design[BY_BLUR, i]
+        rows[_RADIUS, i] = design[BY_RADIUS, i]
+        rows[_X, i] = design[BY_X, i]
+        rows[_Y, i] = design[BY_Y, i]
+        rows[_GREY, i] = design[GREY, i]
+
+
+@kernel(fastmath=FASTMATH)
+def _multiply(rows: NDArray[np.float32], ends: NDArray[np.int64], products: FloatArray) -> None:
+    """Sums of products of rows in each sector, lower halves."""
     for s in range(SECTORS):
         for a in range(_TERMS):
-            for b in range(a):
-                products[s, b, a] = products[s, a, b]
+            for b in range(a + 1):
+                total = F32(0.0)
+                for i in range(ends[s], ends[s + 1]):
+                    total += rows[a, i] * rows[b, i]
+                products[s, a, b] = total
 
 
 @kernel()
@@ -273,18 +285,18 @@ def _see(sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: 
         if pixels < _LEAST_PIXELS:
             continue
         of_sector[_RAMP, _RAMP] += (noise / _RAMP_SIGMA) ** 2
-        sweep(of_sector, _OUTSIDE)
+        eliminate(of_sector, _OUTSIDE)
         if of_sector[_CONTRAST, _CONTRAST] < _LEAST_SPREAD:
             continue
-        sweep(of_sector, _RAMP)
-        sweep(of_sector, _CONTRAST)
-        contrast = of_sector[_CONTRAST, _GREY]
+        eliminate(of_sector, _RAMP)
+        contrast = of_sector[_GREY, _CONTRAST] / of_sector[_CONTRAST, _CONTRAST]
+        eliminate(of_sector, _CONTRAST)
         sectors.contrast[s] = contrast
         sectors.variance[s] = of_sector[_GREY, _GREY] / (pixels - 3.0)
         angle = 2.0 * math.pi * (s + 0.5) / SECTORS
         per_u = per_pixel[0] * math.cos(angle) + per_pixel[1] * math.sin(angle)
         per_v = per_pixel[2] * math.cos(angle) + per_pixel[3] * math.sin(angle)
-        off = of_sector[_RADIUS, _GREY] / (contrast * of_sector[_RADIUS, _RADIUS])
+        off = of_sector[_GREY, _RADIUS] / (contrast * of_sector[_RADIUS, _RADIUS])
         sectors.off_px[s] = off / math.hypot(per_u, per_v)
 
 
@@ -335,50 +347,71 @@ def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
 
 
 @kernel()
-def _solve(
+def _add_up(
     sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
 ) -> None:
-    """Solve the normal equations of all sectors for the step of the edge.
-
-    Afterwards `normal` holds it in the column of the grey values, and the inverse, negative.
-    """
+    """The normal equations of the step of the edge, of all sectors and what is expected of it."""
     normal[:] = 0.0
     for s in range(SECTORS):
-        by, contrast, weight = sectors.products[s], sectors.contrast[s], sectors.weight[s]
-        if weight > 0.0:
-            for a in range(_BLUR_1, _GREY):
-                normal[a, _GREY] += weight * contrast * by[a, _GREY]
-                for b in range(_BLUR_1, _GREY):
-                    normal[a, b] += weight * contrast * contrast * by[a, b]
-    off = expected.radius - edge.radius
-    _add_prior(normal, _RADIUS, settings.radius_sigma, off)
-    off = math.log(expected.blur.first / edge.blur.first)
-    _add_prior(normal, _BLUR_1, settings.blur_sigma, off)
-    off = math.log(expected.blur.second / edge.blur.second)
-    _add_prior(normal, _BLUR_2, settings.blur_sigma, off)
-    for a in range(_BLUR_1, _GREY):
-        normal[_GREY, a] = normal[a, _GREY]
-    for a in range(_BLUR_1, _GREY):
-        sweep(normal, a)
+        _add_sector(sectors, s, 1.0, normal)
+    _expect(normal, _RADIUS, settings.radius_sigma, expected.radius - edge.radius)
+    for k, blur, usual in (
+        (_BLUR_1, edge.blur.first, expected.blur.first),
+        (_BLUR_2, edge.blur.second, expected.blur.second),
+    ):
+        _expect(normal, k, settings.blur_sigma, math.log(usual / blur))
 
 
 @kernel()
-def _add_prior(normal: FloatArray, k: int, sigma: float, off: float) -> None:
+def _add_sector(sectors: Sectors, s: int, sign: float, normal: FloatArray) -> None:
+    """Add a sector's normal equations; derivatives are by the shares, so times the contrast."""
+    by, contrast = sectors.products[s], sectors.contrast[s]
+    weight = sign * sectors.weight[s]
+    if weight != 0.0:
+        for a in range(_BLUR_1, _GREY):
+            normal[_GREY, a] += weight * contrast * by[_GREY, a]
+            for b in range(_BLUR_1, a + 1):
+                normal[a, b] += weight * contrast * contrast * by[a, b]
+
+
+@kernel()
+def _expect(normal: FloatArray, k: int, sigma: float, off: float) -> None:
     normal[k, k] += 1.0 / sigma**2
-    normal[k, _GREY] += off / sigma**2
+    normal[_GREY, k] += off / sigma**2
+
+
+@kernel()
+def _centre(normal: FloatArray) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """The step of the centre, and the inverse (xx, xy, yy); everything else is eliminated."""
+    for k in range(_BLUR_1, _X):
+        eliminate(normal, k)
+    xx, xy, yy = normal[_X, _X], normal[_Y, _X], normal[_Y, _Y]
+    x, y, per_area = normal[_GREY, _X], normal[_GREY, _Y], 1.0 / (xx * yy - xy * xy)
+    step = per_area * (yy * x - xy * y), per_area * (xx * y - xy * x)
+    return step, (per_area * yy, -per_area * xy, per_area * xx)
+
+
+@kernel()
+def _is_short(normal: FloatArray) -> bool:
+    (x, y), _ = _centre(normal)
+    return math.hypot(x, y) < _ARRIVED
 
 
 @kernel()
 def _moved(edge: Edge, normal: FloatArray) -> Edge:
-    """The edge after a step."""
+    """The edge after the step that solves the normal equations."""
+    step = np.zeros(_TERMS)
+    (step[_X], step[_Y]), _ = _centre(normal)
+    for k in range(_RADIUS, _BLUR_1 - 1, -1):
+        rest = normal[_GREY, k]
+        for i in range(k + 1, _GREY):
+            rest -= normal[i, k] * step[i]
+        step[k] = rest / normal[k, k]
     return Edge(
-        edge.x + _within(normal[_X, _GREY], _LONGEST),
-        edge.y + _within(normal[_Y, _GREY], _LONGEST),
-        edge.radius + _within(normal[_RADIUS, _GREY], _LONGEST),
-        Blur(
-            _scaled(edge.blur.first, normal[_BLUR_1, _GREY]),
-            _scaled(edge.blur.second, normal[_BLUR_2, _GREY]),
-        ),
+        edge.x + _within(step[_X], _LONGEST),
+        edge.y + _within(step[_Y], _LONGEST),
+        edge.radius + _within(step[_RADIUS], _LONGEST),
+        Blur(_scaled(edge.blur.first, step[_BLUR_1]), _scaled(edge.blur.second, step[_BLUR_2])),
     )
 
 
@@ -393,36 +426,27 @@ def _scaled(blur: float, step: float) -> float:
 
 
 @kernel()
-def _covariance(
-    sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
-) -> tuple[float, float, float]:
-    """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors in turn.
-
-    `normal` is as `_solve` leaves it.
-    """
-    noise_xx, noise_xy, noise_yy = normal[_X, _X], normal[_X, _Y], normal[_Y, _Y]
-    weight, others = sectors.weight.copy(), np.empty((SECTORS, 2))
+def _centre_and_covariance(
+    sectors: Sectors, normal: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Step of the centre, and covariance (xx, xy, yy) by leaving out neighbouring sectors."""
+    others, some = np.empty((SECTORS, 2)), np.empty((_TERMS, _TERMS))
     mean_x = mean_y = 0.0
     count = 0
     for s in range(SECTORS):
+        some[:] = normal
         for k in range(_STRETCH):
-            sectors.weight[(s + k) % SECTORS] = 0.0
-        _solve(sectors, edge, expected, settings, normal)
-        for k in range(_STRETCH):
-            sectors.weight[(s + k) % SECTORS] = weight[(s + k) % SECTORS]
-        others[s, 0], others[s, 1] = normal[_X, _GREY], normal[_Y, _GREY]
+            _add_sector(sectors, (s + k) % SECTORS, -1.0, some)
+        (others[s, 0], others[s, 1]), _ = _centre(some)
         mean_x, mean_y = mean_x + others[s, 0] / SECTORS, mean_y + others[s, 1] / SECTORS
-        count += weight[s] > 0.0
+        count += sectors.weight[s] > 0.0
     xx = xy = yy = 0.0
     for s in range(SECTORS):
         x, y = others[s, 0] - mean_x, others[s, 1] - mean_y
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+    centre, (noise_xx, noise_xy, noise_yy) = _centre(normal)
     scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
-    return (
-        scale * xx - _NOISE_SHARE * noise_xx,
-        scale * xy - _NOISE_SHARE * noise_xy,
-        scale * yy - _NOISE_SHARE * noise_yy,
-    )
+    return centre, (scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy)
 
 
 @kernel()
@@ -464,13 +488,18 @@ def _place_if_better(other: Any, result: Any) -> None:
 
 
 @kernel()
-def place_by_rim(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> None:
-    """Place a disc of which the rim is known: by its sectors, or else by the rim's points."""
+def place_by_rim(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
+    """Place a disc of which the rim is known: by its sectors, or where they differ by the points.
+
+    Returns whether the sectors agree.
+    """
     start = Start(rim.x, rim.y, rim.radius, _BLUR_PX)
-    if not place_by_sectors(scene, radius, start, work, result).agree:
+    agree = place_by_sectors(scene, radius, start, work, result).agree
+    if not agree:
         result.x, result.y = rim.x, rim.y
         result.cov_xx, result.cov_xy, result.cov_yy = rim.cov_xx, rim.cov_xy, rim.cov_yy
     _add_square(result, 1.0, rim.doubt_x, rim.doubt_y)
+    return agree
 
 
 @kernel()
@@ -480,8 +509,8 @@ def place_all(scene: Scene, radius: float, looks: SecondLooks, space: NDArray[An
     for k in range(len(results)):
         x, y = looks.seen_from[k, 0], looks.seen_from[k, 1]
         rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, looks.step[k])
-        place_by_rim(scene, radius, rim, space[0], results[k])
-        _add_square(results[k], _DISAGREEMENT, looks.doubt[k, 0], looks.doubt[k, 1])
+        if not place_by_rim(scene, radius, rim, space[0], results[k]):
+            _add_square(results[k], _DISAGREEMENT, looks.doubt[k, 0], looks.doubt[k, 1])
     return results
 
 
