@@ -179,16 +179,31 @@ def fit_outline(
     return found, unknowns[2:], variance * inverse[2:, 2:]
 
 
+@kernel()
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
-    mean = np.median(tilt, axis=0)
-    information = np.linalg.inv(covariance)
+    count = len(tilt)
+    mean, of_mean = np.empty(2), np.empty((2, 2))
+    one, information = np.empty(count), np.empty((count, 2, 2))
+    for i in range(2):
+        for k in range(count):
+            one[k] = tilt[k, i]
+        mean[i] = median(one)
+    for k in range(count):
+        invert_positive(covariance[k], information[k])
     for _ in range(_ITERATIONS):
-        off = tilt - mean
-        squared = np.einsum("ni,nij,nj->n", off, information, off)
-        weighed = ((_FREEDOM + 2.0) / (_FREEDOM + squared))[:, None, None] * information
-        of_mean = np.linalg.inv(weighed.sum(axis=0))
-        mean = of_mean @ np.einsum("nij,nj->i", weighed, tilt)
+        total, right = np.zeros((2, 2)), np.zeros(2)
+        for k in range(count):
+            a, b, c = information[k, 0, 0], information[k, 0, 1], information[k, 1, 1]
+            x, y = tilt[k, 0] - mean[0], tilt[k, 1] - mean[1]
+            weight = (_FREEDOM + 2.0) / (_FREEDOM + a * x * x + 2.0 * b * x * y + c * y * y)
+            for i in range(2):
+                for j in range(2):
+                    total[i, j] += weight * information[k, i, j]
+                    right[i] += weight * information[k, i, j] * tilt[k, j]
+        invert_positive(total, of_mean)
+        for i in range(2):
+            mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
     return mean, of_mean
 
 
