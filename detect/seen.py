@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
+from camera.calibration.model import rotation_of
 from redetect.landmarks import Frame, Step
 
 FloatArray = NDArray[np.float64]
@@ -56,14 +57,8 @@ def level_seen(
 
 def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
-    pitch, roll = np.moveaxis(np.asarray(levelled_by, dtype=np.float64), -1, 0)
-    half = 0.5 * np.hypot(pitch, roll)
-    # The quaternion (w, x, y, 0); sinc is that of signal processing, of multiples of pi.
-    w, of_axis = np.cos(half), 0.5 * np.sinc(half / np.pi)
-    x, y = of_axis * pitch, of_axis * roll
-    ww, xx, yy, xy, wx, wy = w * w, x * x, y * y, 2.0 * x * y, 2.0 * w * x, 2.0 * w * y
-    numbers = (ww + xx - yy, xy, wy, xy, ww - xx + yy, -wx, -wy, wx, ww - xx - yy)
-    return np.stack(numbers, axis=-1).reshape(*half.shape, 3, 3)
+    tilt = np.asarray(levelled_by, dtype=np.float64)
+    return rotation_of(np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1))
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:
