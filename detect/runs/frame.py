@@ -21,7 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.circles import (
+    CircleDetections,
+    candidates_at,
+    detect_circles,
+    disc_shape,
+    second_looks_at,
+)
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
@@ -175,6 +181,17 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     if isinstance(error, FrameError):
         return str(error)
     return f"{task.name}: {type(error).__name__}: {error}"
+
+
+def second_looks_alone(task: FrameTask, plan: FramePlan) -> None:
+    """The second look at an image for discs, as if the first one had found none."""
+    camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
+    if camera and table and settings and settings.verify and settings.refine:
+        if settings.polarity == "any":
+            settings = replace(settings, polarity="light")
+        image = read_image(task.frame, camera, plan.working_folder)
+        candidates = candidates_at(image, camera, table, settings, noise=0.0)
+        second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

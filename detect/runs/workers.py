@@ -102,6 +102,13 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     return rows_of_frames(chunk, plan)
 
 
+def look_twice(plan: FramePlan, chunk: Chunk) -> None:
+    """Compile the kernels of the second look at discs, by looking."""
+    from detect.runs.frame import second_looks_alone
+
+    second_looks_alone(chunk[0], plan)
+
+
 class _Crew:
     """The workers of a run: replaced when one of them has died."""
 
@@ -194,7 +201,7 @@ def local_workers(jobs: int, *, large: bool = False, halves: bool = False) -> Wo
     """Processes of this machine; 1 is this process itself.
 
     Of `large` tasks, which carry images or bring pictures back, each has one frame. With `halves`,
-    one that has to compile has the kernels of lines and those of discs compiled by two others.
+    one that has to compile has half of the kernels compiled by each of two others.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
@@ -234,8 +241,8 @@ class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
     def __init__(self, plan: FramePlan, *, halves: bool) -> None:
-        both = halves and plan.lines and plan.circles and _cores() > 1
-        self._halves = [replace(plan, circles=None), replace(plan, lines=None)] if both else []
+        self._plan = plan
+        self._halves = halves and plan.lines and plan.circles and _cores() > 1
         self._chunk: Chunk = ()
         self._forget = on_compilation(self._before_compilation)
 
@@ -250,11 +257,22 @@ class _InProcess(Executor):
 
     def _before_compilation(self) -> None:
         say_compiling()
-        halves, self._halves = self._halves, []  # only before the first kernel
+        if not self._halves:
+            return
+        self._halves = False  # only before the first kernel
+        discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
-        with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
-            pools = [started.enter_context(_ProcessPool(1, half, show=False)) for half in halves]
-            done = [p.submit(work_on_chunk, half, self._chunk) for p, half in zip(pools, halves)]
+        with (
+            suppress(OSError, ImportError, BrokenExecutor),
+            _ProcessPool(1, discs, show=False) as one,
+            _ProcessPool(1, lines, show=False) as other,
+        ):
+            # The second look shares kernels with the first one, which comes to them later.
+            done = [
+                one.submit(work_on_chunk, discs, self._chunk),
+                other.submit(look_twice, discs, self._chunk),
+                other.submit(work_on_chunk, lines, self._chunk),
+            ]
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
 
