@@ -183,8 +183,8 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     return f"{task.name}: {type(error).__name__}: {error}"
 
 
-def second_looks_alone(task: FrameTask, plan: FramePlan) -> None:
-    """The second look at an image for discs, as if the first one had found none."""
+def rims_alone(task: FrameTask, plan: FramePlan) -> None:
+    """What is done with rims in an image, as if the first look had found no disc."""
     camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
     if camera and table and settings and settings.verify and settings.refine:
         if settings.polarity == "any":
@@ -192,6 +192,8 @@ def second_looks_alone(task: FrameTask, plan: FramePlan) -> None:
         image = read_image(task.frame, camera, plan.working_folder)
         candidates = candidates_at(image, camera, table, settings, noise=0.0)
         second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
+        if plan.levelling == "run":
+            tilt_of_outlines(image, camera, candidates.floor_xy, settings.radius_m)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

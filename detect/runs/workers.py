@@ -102,11 +102,11 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     return rows_of_frames(chunk, plan)
 
 
-def look_twice(plan: FramePlan, chunk: Chunk) -> None:
-    """Compile the kernels of the second look at discs, by looking."""
-    from detect.runs.frame import second_looks_alone
+def look_round_discs(plan: FramePlan, chunk: Chunk) -> None:
+    """Compile the kernels that follow rims, by following those in an image."""
+    from detect.runs.frame import rims_alone
 
-    second_looks_alone(chunk[0], plan)
+    rims_alone(chunk[0], plan)
 
 
 class _Crew:
@@ -267,11 +267,11 @@ class _InProcess(Executor):
             _ProcessPool(1, discs, show=False) as one,
             _ProcessPool(1, lines, show=False) as other,
         ):
-            # The second look shares kernels with the first one, which comes to them later.
+            # Discs take twice as long as lines, and come to their rims at the end.
             done = [
                 one.submit(work_on_chunk, discs, self._chunk),
-                other.submit(look_twice, discs, self._chunk),
                 other.submit(work_on_chunk, lines, self._chunk),
+                other.submit(look_round_discs, discs, self._chunk),
             ]
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
