@@ -40,7 +40,7 @@ from detect.levelling import (
     with_common,
 )
 from detect.lines import LineDetections, detect_lines
-from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
+from detect.run_tilt import RunTilt, frame_tilts, smooth_axis, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
     FramePlan,
@@ -183,8 +183,8 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     return f"{task.name}: {type(error).__name__}: {error}"
 
 
-def rims_alone(task: FrameTask, plan: FramePlan) -> None:
-    """What is done with rims in an image, as if the first look had found no disc."""
+def after_first_look(task: FrameTask, plan: FramePlan) -> None:
+    """What follows the first look at discs in an image, as if that had found none."""
     camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
     if camera and table and settings and settings.verify and settings.refine:
         if settings.polarity == "any":
@@ -194,6 +194,7 @@ def rims_alone(task: FrameTask, plan: FramePlan) -> None:
         second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
         if plan.levelling == "run":
             tilt_of_outlines(image, camera, candidates.floor_xy, settings.radius_m)
+            smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

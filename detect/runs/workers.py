@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
-from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -102,11 +102,11 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     return rows_of_frames(chunk, plan)
 
 
-def look_round_discs(plan: FramePlan, chunk: Chunk) -> None:
-    """Compile the kernels that follow rims, by following those in an image."""
-    from detect.runs.frame import rims_alone
+def compile_rest(plan: FramePlan, chunk: Chunk) -> None:
+    """Compile the kernels of whatever follows the first look at discs, by using them."""
+    from detect.runs.frame import after_first_look
 
-    rims_alone(chunk[0], plan)
+    after_first_look(chunk[0], plan)
 
 
 class _Crew:
@@ -237,6 +237,10 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))
 
 
+class _CompiledElsewhereError(Exception):
+    """Instead of the kernel that a process was about to compile: there it is, to be loaded."""
+
+
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
@@ -249,7 +253,10 @@ class _InProcess(Executor):
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         self._chunk = cast("Chunk", args[-1])
         future: Future[R] = Future()
-        future.set_result(fn(*args, **kwargs))
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except _CompiledElsewhereError:
+            future.set_result(fn(*args, **kwargs))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -267,14 +274,16 @@ class _InProcess(Executor):
             _ProcessPool(1, discs, show=False) as one,
             _ProcessPool(1, lines, show=False) as other,
         ):
-            # Discs take twice as long as lines, and come to their rims at the end.
-            done = [
+            # Discs take twice as long as lines; when these are done, that has yet to begin which
+            # follows the first look.
+            done: list[Future[Any]] = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 other.submit(work_on_chunk, lines, self._chunk),
-                other.submit(look_round_discs, discs, self._chunk),
+                other.submit(compile_rest, discs, self._chunk),
             ]
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
+            raise _CompiledElsewhereError
 
 
 # They are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra have
