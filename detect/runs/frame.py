@@ -183,13 +183,13 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     return f"{task.name}: {type(error).__name__}: {error}"
 
 
-def after_first_look(task: FrameTask, plan: FramePlan) -> None:
-    """What follows the first look at discs in an image, as if that had found none."""
+def after_first_look(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
+    """What follows the first look at discs, as if that had found none: for its kernels."""
     camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
     if camera and table and settings and settings.verify and settings.refine:
         if settings.polarity == "any":
             settings = replace(settings, polarity="light")
-        image = read_image(task.frame, camera, plan.working_folder)
+        image = read_image(tasks[0].frame, camera, plan.working_folder)
         candidates = candidates_at(image, camera, table, settings, noise=0.0)
         second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
         if plan.levelling == "run":
@@ -379,66 +379,51 @@ def level_run(
         tilts = [tilt for _, _, tilt in frames]
     run = zip(read(), frames, tilts, strict=True)
     while batch := list(islice(run, _LEVELLED_AT_ONCE)):
-        to_level = [
-            _SeenDiscs(rows["circles"], tilt, by_verticals=found is not None or own is not None)
-            for rows, (_, _, own), tilt in batch
-            if tilt is not None
-        ]
-        level = iter(_levelled(to_level, camera, settings.calibration_px, found, common))
+        seen = [(rows["circles"], tilt) for rows, _, tilt in batch if tilt is not None]
+        level = iter(_levelled(seen, camera, settings.calibration_px, found, common))
         for rows, (prefix, lines, _), tilt in batch:
             by = format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)
             circles = rows["circles"] if tilt is None else next(level)
             yield {**rows, "circles": circles, RUN_TILT: f"{by}\n"}
 
 
-class _SeenDiscs(NamedTuple):
-    """A frame's rows as seen, its STEP first, and its tilt: by its own or the run's verticals?"""
-
-    rows: str
-    tilt: FrameTilt
-    by_verticals: bool
-
-
 def _levelled(
-    frames: Sequence[_SeenDiscs],
+    frames: Sequence[tuple[str, FrameTilt]],
     camera: Camera,
     calibration_px: float,
     run: RunTilt | None,
     common: FloatArray | None,
 ) -> list[str]:
-    """The rows of frames, levelled by their tilts.
+    """The rows of frames, each with its STEP first, levelled by their tilts.
 
-    These are the `run`'s, if there is one, and have the variances that all frames have in `common`.
+    These are the `run`'s, if there is one, and have the variances that all frames have in `common`;
+    else the frames' own, or unknown: by no lines.
     """
-    steps, words, counts = [], [], []
-    for frame in frames:
-        step, *rows = _lines(frame.rows)
-        steps.append(step)
-        words += [row.split() for row in rows]
-        counts.append(len(rows))
-    of_row = np.repeat(np.arange(len(frames)), counts)
+    texts: list[str] = []
+    words: list[list[str]] = []
+    frame_of_row: list[int] = []
+    for k, (text, by) in enumerate(frames):
+        step, *rows = _lines(text)
+        texts.append(f"{step}\n{format_levelling((by.pitch, by.roll))}\n")
+        words += map(str.split, rows)
+        frame_of_row += [k] * len(rows)
+    tilts = [frames[k][1] for k in frame_of_row]
     numbers = np.array([[float(word) for word in row[1:7]] for row in words]).reshape(-1, 6)
     xy, covariance = numbers[:, :2], numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
-    tilt, tilt_covariance = tilt_arrays([frame.tilt for frame in frames])
+    tilt, tilt_covariance = tilt_arrays(tilts)
     height_sigma = 0.0
     if run is not None:
         height_sigma = run.height_sigma  # as a share of the camera's height
         if common is not None:  # it comes with the calibration's other errors
             tilt_covariance = tilt_covariance - np.diag(common)
-    floor_xy, covariance, down = level_discs(
-        camera, xy, covariance, tilt[of_row], tilt_covariance[of_row]
-    )
+    floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt, tilt_covariance)
     from_camera = floor_xy - camera.centre[:2]
     covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
-    by_verticals = np.array([frame.by_verticals for frame in frames], np.bool_)[of_row]
+    by_verticals = np.array([run is not None or by.lines > 0 for by in tilts], np.bool_)
     covariance += common_covariance(camera, xy, calibration_px, by_verticals=by_verticals)
     level = circle_landmarks(floor_xy[down], numbers[down, 2], covariance[down])
-    texts = [
-        f"{step}\n{format_levelling((frame.tilt.pitch, frame.tilt.roll))}\n"
-        for step, frame in zip(steps, frames)
-    ]
     for k, row in zip(np.flatnonzero(down).tolist(), level):
-        texts[of_row[k]] += f"{format_record(row)} {' '.join(words[k][7:])}\n"
+        texts[frame_of_row[k]] += f"{format_record(row)} {' '.join(words[k][7:])}\n"
     return texts
 
 

@@ -102,13 +102,6 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     return rows_of_frames(chunk, plan)
 
 
-def compile_rest(plan: FramePlan, chunk: Chunk) -> None:
-    """Compile the kernels of whatever follows the first look at discs, by using them."""
-    from detect.runs.frame import after_first_look
-
-    after_first_look(chunk[0], plan)
-
-
 class _Crew:
     """The workers of a run: replaced when one of them has died."""
 
@@ -267,6 +260,8 @@ class _InProcess(Executor):
         if not self._halves:
             return
         self._halves = False  # only before the first kernel
+        from detect.runs.frame import after_first_look
+
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
         with (
@@ -279,7 +274,7 @@ class _InProcess(Executor):
             done: list[Future[Any]] = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 other.submit(work_on_chunk, lines, self._chunk),
-                other.submit(compile_rest, discs, self._chunk),
+                other.submit(after_first_look, discs, self._chunk),
             ]
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported

@@ -113,7 +113,7 @@ def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) 
     with local_workers(1, halves=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
     halves = ["work_on_chunk False True images", "work_on_chunk True False images"]
-    halves += ["compile_rest False True images"]
+    halves += ["after_first_look False True images"]
     assert began == [*halves, "compiled images", "compiled images"]
     only_lines = replace(plan, circles=None)
     with local_workers(1, halves=True).start(only_lines) as executor:
