@@ -176,7 +176,7 @@ def _look_at_all(
             if is_new and odds <= log_odds[count]:
                 continue
             is_new = True
-            for k in range(len(FEATURES)):  # assigning the row would compile as long as all else
+            for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
                 features[count, k] = noted[k]
             log_odds[count] = odds
             step[count], quality[count] = rim.step, _quality(grey)

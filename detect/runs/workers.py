@@ -269,8 +269,8 @@ class _InProcess(Executor):
             _ProcessPool(1, discs, show=False) as one,
             _ProcessPool(1, lines, show=False) as other,
         ):
-            # Discs take twice as long as lines; when these are done, that has yet to begin which
-            # follows the first look.
+            # Discs take twice as long as lines. So the process of the lines goes on with what
+            # follows the first look at discs, which the other one comes to last.
             done: list[Future[Any]] = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 other.submit(work_on_chunk, lines, self._chunk),
