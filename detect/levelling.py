@@ -18,6 +18,7 @@ of a pixel everywhere (`CircleSettings.calibration_px`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -43,7 +44,9 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
     Discs that the levelled camera would see above the horizon are left out.
     """
-    floor_xy, covariance, down = level_discs(camera, found.floor_xy, found.covariance, tilt)
+    floor_xy, covariance, down = level_discs(
+        camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
+    )
     return replace(
         found,
         pixels=found.pixels[down],
@@ -55,34 +58,49 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     )
 
 
-def level_discs(
-    camera: Camera, floor_xy: FloatArray, covariance: FloatArray, tilt: FrameTilt
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Positions (N, 2) on the floor (m) and their covariances, corrected for a tilt.
+def tilt_arrays(tilts: Sequence[FrameTilt]) -> tuple[FloatArray, FloatArray]:
+    """(N, 2) pitch and roll (rad) and their (N, 2, 2) covariances (rad^2)."""
+    numbers = np.array([(t.pitch, t.roll, t.cpp, t.cpr, t.crr) for t in tilts]).reshape(-1, 5)
+    return numbers[:, :2], numbers[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
-    Positions are those that the calibrated camera sees on a level robot. The covariances returned
-    are their own, carried along, and that due to the tilt's. Where the levelled ray does not meet
-    the floor, numbers are NaN and the mask is false.
+
+def level_discs(
+    camera: Camera,
+    floor_xy: FloatArray,
+    covariance: FloatArray,
+    tilt: FloatArray,
+    tilt_covariance: FloatArray,
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
+
+    Positions are those that the calibrated camera sees on a level robot. Pitch and roll (rad) and
+    their covariances are those of each position, (N, 2) and (N, 2, 2), or one of each for all. The
+    covariances returned are their own, carried along, and that due to the tilt's. Where the
+    levelled ray does not meet the floor, numbers are NaN and the mask is false.
     """
-    steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])
-    tilts = steps[:, 2:] + (tilt.pitch, tilt.roll)
-    level_xy, *ends = level_seen(camera, floor_xy + steps[:, None, :2], tilts)
+    steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])[:, None]
+    level_xy, *ends = level_seen(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
     jacobian = np.stack([ends[k] - ends[k + 4] for k in range(4)], axis=-1) / (2.0 * _STEP)
     of_all = np.zeros((len(floor_xy), 4, 4))
     of_all[:, :2, :2] = covariance
-    of_all[:, 2:, 2:] = [[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]
+    of_all[:, 2:, 2:] = tilt_covariance
     level_covariance = jacobian @ of_all @ jacobian.swapaxes(1, 2)
     down = np.isfinite(level_xy).all(axis=1) & np.isfinite(level_covariance).all(axis=(1, 2))
     return level_xy, level_covariance, np.asarray(down)
 
 
 def common_covariance(
-    camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool
+    camera: Camera,
+    floor_xy: FloatArray,
+    unstated_px: float,
+    *,
+    by_verticals: bool | NDArray[np.bool_],
 ) -> FloatArray:
     """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
 
     `unstated_px` is the standard deviation of the pixels of a camera that doesn't state its
-    covariance; `by_verticals`: the positions are levelled by the verticals that the camera sees.
+    covariance; `by_verticals`, for each position (N,) or all of them: it is levelled by the
+    verticals that the camera sees.
     """
     nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)
@@ -91,12 +109,11 @@ def common_covariance(
     if len(floor_xy) == 0 or not covariance.any():
         return nothing
     jacobian = floor_by_parameters(camera, floor_xy)
-    if by_verticals:
+    if np.any(by_verticals):
         steps = _STEP * np.vstack([np.eye(2), -np.eye(2)])
-        p, r, minus_p, minus_r = level_seen(
-            camera, np.broadcast_to(floor_xy, (4, *floor_xy.shape)), steps
-        )
+        p, r, minus_p, minus_r = level_seen(camera, floor_xy, steps[:, None])
         by_tilt = np.stack([p - minus_p, r - minus_r], axis=-1) / (2.0 * _STEP)
+        by_tilt = np.where(np.reshape(by_verticals, (-1, 1, 1)), by_tilt, 0.0)
         jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)
     return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from camera import Camera, write_camera
 from camera.options import Level
@@ -25,6 +24,7 @@ from detect.line_settings import LineSettings
 from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
+from detect.seen import level_matrix
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar
@@ -152,7 +152,7 @@ def mounting_of_run(
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
     """The camera as it is mounted, turned about the robot's origin on the floor."""
-    turn = Rotation.from_rotvec([mounting.pitch_rad, mounting.roll_rad, 0.0]).as_matrix()
+    turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
     up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
     a, b, c = ((float(x), float(y), float(z), float(t)) for x, y, z, t in pose)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -250,11 +251,13 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
             )
         ]
 
+    @cache  # of the unknowns, most concern one axis only
+    def log_likelihood(number: int, axis: _Axis) -> float:
+        return series[number].smoothed(axis)[0]
+
     def cost(unknowns: FloatArray) -> float:
-        likelihoods = [
-            axis.smoothed(one)[0] for axis, one in zip(series, axes_of(unknowns), strict=True)
-        ]
-        return float(0.5 * np.sum((unknowns / prior_sigma) ** 2) - sum(likelihoods))
+        likelihood = sum(log_likelihood(*each) for each in enumerate(axes_of(unknowns)))
+        return float(0.5 * np.sum((unknowns / prior_sigma) ** 2) - likelihood)
 
     def cost_of_free(values: FloatArray) -> float:
         unknowns = np.zeros(len(is_free))

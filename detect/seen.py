@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
+from camera.calibration.model import rotation_of
 from redetect.landmarks import Frame, Step
 
 FloatArray = NDArray[np.float64]
@@ -41,14 +42,15 @@ def level_seen(
 ) -> FloatArray:
     """Level positions (m) of discs that the calibrated camera sees on the floor.
 
-    Of positions (N, 2) or (M, N, 2) that were computed without the tilt, levelled by (2,) or (M, 2)
-    pitch and roll (rad). NaN where the levelled ray does not meet the floor.
+    Of positions (..., 2) that were computed without the tilt, levelled by pitch and roll (..., 2)
+    (rad), one for all or broadcast against them. NaN where the levelled ray does not meet the
+    floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
-    rays = (points - camera.centre) @ turn.swapaxes(-1, -2)
-    centre = (turn @ (camera.centre + np.array([0.0, 0.0, raised_m])))[..., None, :]
+    rays = (turn @ (points - camera.centre)[..., None])[..., 0]
+    centre = turn @ (camera.centre + np.array([0.0, 0.0, raised_m]))
     down = np.where(rays[..., 2:] < 0.0, rays[..., 2:], np.nan)
     return np.asarray(centre[..., :2] - centre[..., 2:] / down * rays[..., :2])
 
@@ -56,11 +58,7 @@ def level_seen(
 def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
     tilt = np.asarray(levelled_by, dtype=np.float64)
-    vectors = np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
-    from scipy.spatial.transform import Rotation  # a process that delegates starts without it
-
-    turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
-    return np.asarray(turns.reshape(*tilt.shape[:-1], 3, 3))
+    return rotation_of(np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1))
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:

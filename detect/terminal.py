@@ -101,6 +101,8 @@ def say_compiling() -> None:
 def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
     """Have something called before this process compiles a kernel, until the result is called.
 
+    If it raises, the kernel is not compiled.
+
     The compiler makes many objects and keeps most of them. Meanwhile Python does not search them
     for cycles again and again, which would take a tenth of the time.
     """
@@ -110,9 +112,9 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
         depth = 0  # of kernels that are compiled because others call them
 
         def on_start(self, _: object) -> None:
+            call()
             self.depth += 1
             gc.disable()
-            call()
 
         def on_end(self, _: object) -> None:
             self.depth -= 1

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from camera.distortion import (
     RADIUS_LIMIT,
@@ -155,8 +154,11 @@ def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:
 
 def rotation_of(vectors: FloatArray) -> FloatArray:
     """(..., 3, 3) rotations of (..., 3) rotation vectors."""
-    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
-    return np.asarray(matrices).reshape(*vectors.shape, 3)
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = cross_matrices(vectors)
+    # Rodrigues' formula; `np.sinc` has the pi of signal processing.
+    of_square = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + of_square * (cross @ cross))
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from detect.discs.quality import Centres
 from redetect.compiled import kernel
@@ -38,9 +37,9 @@ def local_maxima(quality: NDArray[np.float64], threshold: float) -> NDArray[np.b
         if not np.any(highest & (lost >= quality)):
             break
         highest &= lost < quality
-    plateau, count = ndimage.label(highest, around)
+    labels, plateau = cv2.connectedComponents(highest.astype(np.uint8), connectivity=8)
     rows, columns = np.nonzero(highest)
-    number = plateau[rows, columns] - 1
+    number, count = plateau[rows, columns] - 1, labels - 1  # 0 is what is no maximum
     size = np.bincount(number, minlength=count)
     off = np.zeros(len(number))
     for place in (rows, columns):

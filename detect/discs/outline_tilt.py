@@ -105,21 +105,21 @@ def fit_outline(
     x: float,
     y: float,
     radius: float,
-) -> tuple[bool, NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[bool, float, float, float, float, float]:
     """The tilt of one disc of about the middle (x, y) by (N, 2) points of its outline.
 
     Points are on the calibrated floor, relative to (x, y), metres; NaN where the outline is not
     seen. Each has the scale of the image along its direction; `centre` is the camera's. Returns
-    whether enough of the outline is on the ellipse, pitch and roll (rad), and their covariance by
-    the points alone.
+    whether enough of the outline is on the ellipse, pitch and roll (rad), and by the points alone
+    the variance of the pitch, the covariance, and the variance of the roll.
     """
     count = len(point_xy)
     unknowns = np.zeros(4)  # of the centre, metres; pitch, roll
     weight, residual, row = np.zeros(count), np.zeros(count), np.zeros((count, 4))
     for k in range(count):
         weight[k] = 0.0 if math.isnan(point_xy[k, 0]) else 1.0
-    normal, inverse, sigma = np.zeros((4, 4)), np.zeros((4, 4)), 0.0
-    shapes, off = np.empty((5, 4)), np.empty(count)
+    normal, inverse, right, sigma = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), 0.0
+    shapes, lengths, off = np.empty((5, 4)), np.empty(5), np.empty(count)
     for iteration in range(_ITERATIONS):
         pitch, roll = unknowns[2], unknowns[3]
         for i in range(5):
@@ -132,11 +132,11 @@ def fit_outline(
             if math.isnan(point_xy[k, 0]):
                 continue
             px, py = point_xy[k, 0] - unknowns[0], point_xy[k, 1] - unknowns[1]
-            lengths = np.empty(5)
             for i in range(5):
-                a, b, c, d = shapes[i]
-                lengths[i] = math.sqrt((a * px + b * py) ** 2 + (c * px + d * py) ** 2)
-            a, b, c, d = shapes[0]
+                across = shapes[i, 0] * px + shapes[i, 1] * py
+                along = shapes[i, 2] * px + shapes[i, 3] * py
+                lengths[i] = math.sqrt(across**2 + along**2)
+            a, b, c, d = shapes[0, 0], shapes[0, 1], shapes[0, 2], shapes[0, 3]
             across, along = (a * px + b * py) / lengths[0], (c * px + d * py) / lengths[0]
             residual[k] = (lengths[0] - radius) * px_per_m[k]
             row[k, 0] = -(across * a + along * c) * px_per_m[k]
@@ -154,17 +154,17 @@ def fit_outline(
             for k in range(count):
                 if weight[k] > 0.0:
                     weight[k] = 1.0 / (1.0 + (residual[k] / (2.0 * sigma)) ** 2) ** 2
-        normal.fill(0.0)
-        right = np.zeros(4)
-        for k in range(count):
-            for i in range(4):
-                right[i] -= weight[k] * row[k, i] * residual[k]
-                for j in range(4):
-                    normal[i, j] += weight[k] * row[k, i] * row[k, j]
         for i in range(4):
+            right[i] = 0.0
+            for k in range(count):
+                right[i] -= weight[k] * row[k, i] * residual[k]
+            for j in range(4):
+                normal[i, j] = 0.0
+                for k in range(count):
+                    normal[i, j] += weight[k] * row[k, i] * row[k, j]
             normal[i, i] *= 1.0 + 1e-9
         if not invert_positive(normal, inverse):
-            return False, unknowns[2:], inverse[2:, 2:]
+            return False, math.nan, math.nan, math.nan, math.nan, math.nan
         for i in range(4):
             for j in range(4):
                 unknowns[i] += inverse[i, j] * right[j]
@@ -176,19 +176,41 @@ def fit_outline(
         weights += weight[k]
     variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
     found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
-    return found, unknowns[2:], variance * inverse[2:, 2:]
+    return (
+        found,
+        unknowns[2],
+        unknowns[3],
+        variance * inverse[2, 2],
+        variance * inverse[2, 3],
+        variance * inverse[3, 3],
+    )
 
 
+@kernel()
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
-    mean = np.median(tilt, axis=0)
-    information = np.linalg.inv(covariance)
+    count = len(tilt)
+    mean, of_mean = np.empty(2), np.empty((2, 2))
+    one, information = np.empty(count), np.empty((count, 2, 2))
+    for i in range(2):
+        for k in range(count):
+            one[k] = tilt[k, i]
+        mean[i] = median(one)
+    for k in range(count):
+        invert_positive(covariance[k], information[k])
     for _ in range(_ITERATIONS):
-        off = tilt - mean
-        squared = np.einsum("ni,nij,nj->n", off, information, off)
-        weighed = ((_FREEDOM + 2.0) / (_FREEDOM + squared))[:, None, None] * information
-        of_mean = np.linalg.inv(weighed.sum(axis=0))
-        mean = of_mean @ np.einsum("nij,nj->i", weighed, tilt)
+        total, right = np.zeros((2, 2)), np.zeros(2)
+        for k in range(count):
+            a, b, c = information[k, 0, 0], information[k, 0, 1], information[k, 1, 1]
+            x, y = tilt[k, 0] - mean[0], tilt[k, 1] - mean[1]
+            weight = (_FREEDOM + 2.0) / (_FREEDOM + a * x * x + 2.0 * b * x * y + c * y * y)
+            for i in range(2):
+                for j in range(2):
+                    total[i, j] += weight * information[k, i, j]
+                    right[i] += weight * information[k, i, j] * tilt[k, j]
+        invert_positive(total, of_mean)
+        for i in range(2):
+            mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
     return mean, of_mean
 
 
@@ -208,7 +230,10 @@ def _tilts_of_discs(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         grey, scale = profiles(image, numbers, x, y, radius)
-        if not scale.min() >= LEAST_AXIS_PX:
+        long_enough = 0
+        for m in range(DIRECTIONS):
+            long_enough += scale[m] >= LEAST_AXIS_PX
+        if long_enough < DIRECTIONS:
             continue
         contrast = _contrast(grey)
         if not abs(contrast) >= LEAST_CONTRAST:
@@ -223,14 +248,13 @@ def _tilts_of_discs(
         if seen < LEAST_DIRECTIONS:
             continue
         # What a higher camera sees is larger than the calibrated floor has it.
-        found, tilt, covariance = fit_outline(
+        found, pitch, roll, cpp, cpr, crr = fit_outline(
             point_xy, px_per_m, centre, x, y, radius / height_ratio
         )
         if found:
-            for i in range(2):
-                tilts[used, i] = tilt[i]
-                for j in range(2):
-                    covariances[used, i, j] = covariance[i, j]
+            tilts[used, 0], tilts[used, 1] = pitch, roll
+            covariances[used, 0, 0], covariances[used, 1, 1] = cpp, crr
+            covariances[used, 0, 1] = covariances[used, 1, 0] = cpr
             used += 1
     return tilts[:used], covariances[:used]
 

@@ -176,7 +176,9 @@ def _look_at_all(
             if is_new and odds <= log_odds[count]:
                 continue
             is_new = True
-            features[count], log_odds[count] = noted, odds
+            for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
+                features[count, k] = noted[k]
+            log_odds[count] = odds
             step[count], quality[count] = rim.step, _quality(grey)
             place[count, 0], place[count, 1] = rim.x, rim.y
             seen_from[count, 0], seen_from[count, 1] = from_x, from_y

@@ -13,30 +13,34 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import groupby, zip_longest
+from itertools import groupby, islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.circles import (
+    CircleDetections,
+    candidates_at,
+    detect_circles,
+    disc_shape,
+    second_looks_at,
+)
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
-from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
-from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.levelling import (
     common_covariance,
     common_tilt_variance,
     level_discs,
     levelled,
+    tilt_arrays,
     with_common,
 )
 from detect.lines import LineDetections, detect_lines
-from detect.markers.detect import MarkerDetections, detect_markers
-from detect.run_tilt import frame_tilts, tilt_of_run
+from detect.run_tilt import RunTilt, frame_tilts, smooth_axis, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
     FramePlan,
@@ -70,6 +74,11 @@ from redetect.landmarks import (
     parse_rows,
     tilt_as_written,
 )
+
+if TYPE_CHECKING:
+    from detect.markers.detect import MarkerDetections
+
+FloatArray = NDArray[np.float64]
 
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -140,7 +149,7 @@ def _path(
             by_frame = found.tilt if plan.levelling == "frame" else None
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
-                settings = replace(settings, tilt_sigma_deg=0.0)
+                settings = _of_known_tilt(settings)
             found.seen = found.discs = detect_circles(image, camera, tables.discs, settings)
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
@@ -155,9 +164,16 @@ def _path(
         yield
 
         if plan.markers:
+            from detect.markers.detect import detect_markers  # hardly any run looks for them
+
             found.markers = detect_markers(image, plan.markers, camera)
     except COSTS_THE_FRAME as error:
         found.error = reason_of(error, task)
+
+
+@lru_cache(maxsize=4)
+def _of_known_tilt(settings: CircleSettings) -> CircleSettings:
+    return replace(settings, tilt_sigma_deg=0.0)
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
@@ -165,6 +181,20 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     if isinstance(error, FrameError):
         return str(error)
     return f"{task.name}: {type(error).__name__}: {error}"
+
+
+def after_first_look(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
+    """What follows the first look at discs, as if that had found none: for its kernels."""
+    camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
+    if camera and table and settings and settings.verify and settings.refine:
+        if settings.polarity == "any":
+            settings = replace(settings, polarity="light")
+        image = read_image(tasks[0].frame, camera, plan.working_folder)
+        candidates = candidates_at(image, camera, table, settings, noise=0.0)
+        second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
+        if plan.levelling == "run":
+            tilt_of_outlines(image, camera, candidates.floor_xy, settings.radius_m)
+            smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
@@ -181,6 +211,8 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
 #: Prefix, lines and tilt of a frame.
 _Tilted = tuple[str, int, FrameTilt | None]
 
+#: Number of frames whose discs are levelled at once.
+_LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
 PIXELS_AT_ONCE = 1 << 25
 
@@ -204,7 +236,6 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
         return rows_of_failure(task, found.error)
     try:
         rows = _rows_by_kind(task, found, plan)
-        picture = _drawn(rows, found, plan)
         return FrameRows(
             task.frame.step.prefix,
             rows,
@@ -215,7 +246,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                 "markers": len(found.markers or ()),
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
-            picture=None if picture is None else png_of(picture),
+            picture=_drawn(rows, found, plan),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
@@ -256,8 +287,11 @@ def _disc_rows(
     discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
 ) -> list[CircleLandmark]:
     """The rows, with the IDs of a known row of the same disc, or of a map's, or -1."""
-    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance)
-    ids: list[tuple[int, ...]] = [(-1,)] * len(discs)
+    unknown = np.full(len(discs), -1)
+    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
+    if not (known.discs or known.mapped):
+        return list(rows)
+    ids = [row.ids for row in rows]
     if known.discs:
         alike = discs if known.discs_level else seen
         named = ids_of_rows(alike.floor_xy, known.discs)
@@ -289,15 +323,16 @@ def _disc_records(
     ]
 
 
-def _drawn(
-    rows: Mapping[str, str], found: FrameDetections, plan: FramePlan
-) -> NDArray[np.uint8] | None:
-    """The picture of a plan."""
-    image, table = found.image, tables_of(plan).verticals
-    if image is None or plan.drawing is None:
+def _drawn(rows: Mapping[str, str], found: FrameDetections, plan: FramePlan) -> bytes | None:
+    """The picture of a plan, a PNG file."""
+    if found.image is None or plan.drawing is None:
         return None
+    from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
+    from detect.drawing.inputs import SeenRows
+
+    table = tables_of(plan).verticals
     if plan.drawing == "tracks" and found.lines is not None and table:
-        return draw_tracks(image, table, found.lines)
+        return png_of(draw_tracks(found.image, table, found.lines))
     kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
     frame = _frame_of(rows[kind])
     settings = plan.circles or CircleSettings()
@@ -305,8 +340,8 @@ def _drawn(
     frames: dict[str, Any] = {kind: frame}
     seen = SeenRows(**frames, tilt=found.tilt)
     name = Path(frame.step.prefix).name
-    picture = draw_rows(image, sight, seen, settings, CompareOptions(), name)
-    return picture if found.markers is None else draw_candidates(picture, found.markers)
+    picture = draw_rows(found.image, sight, seen, settings, CompareOptions(), name)
+    return png_of(picture if found.markers is None else draw_candidates(picture, found.markers))
 
 
 def level_run(
@@ -321,7 +356,6 @@ def level_run(
     levelled by its own; an unknown one has the standard deviation of the settings. The summary
     is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
     """
-    unknown_variance = math.radians(settings.tilt_sigma_deg) ** 2
     frames: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for rows in read():
@@ -329,55 +363,68 @@ def level_run(
         frames.append(own)
         outlines.append(by_outlines[0][2] if by_outlines else None)
     common = common_tilt_variance(camera)
-    summary.tilt = tilt_of_run(
+    found = summary.tilt = tilt_of_run(
         frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines), common
     )
-    height_sigma = 0.0 if summary.tilt is None else summary.tilt.height_sigma
-    for k, (rows, (prefix, lines, tilt)) in enumerate(zip(read(), frames, strict=True)):
-        by_verticals = tilt is not None or summary.tilt is not None
-        shared = np.zeros(2)
-        if summary.tilt is not None:
-            pitch, roll = summary.tilt.tilt[k].tolist()
-            cpp, crr = summary.tilt.variance[k].tolist()
-            tilt = tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
-            shared = shared if common is None else common
-        elif tilt is None and (unknown_variance or settings.calibration_px or common is not None):
-            tilt = FrameTilt(prefix, 0.0, 0.0, unknown_variance, 0.0, unknown_variance, 0)
-        circles = rows["circles"]
-        if tilt is not None:
-            # The part that is the calibration's comes with the calibration's other errors.
-            alone: FrameTilt = replace(tilt, cpp=tilt.cpp - shared[0], crr=tilt.crr - shared[1])
-            circles = _levelled(
-                circles, alone, camera, height_sigma, settings.calibration_px, by_verticals
-            )
-        yield {
-            **rows,
-            "circles": circles,
-            RUN_TILT: f"{format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)}\n",
-        }
+    if found is not None:
+        numbers = np.column_stack([found.tilt, found.variance]).tolist()
+        tilts: list[FrameTilt | None] = [
+            tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
+            for (prefix, lines, _), (pitch, roll, cpp, crr) in zip(frames, numbers, strict=True)
+        ]
+    elif settings.tilt_sigma_deg or settings.calibration_px or common is not None:
+        unknown = math.radians(settings.tilt_sigma_deg) ** 2
+        tilts = [t or FrameTilt(name, 0.0, 0.0, unknown, 0.0, unknown, 0) for name, _, t in frames]
+    else:
+        tilts = [tilt for _, _, tilt in frames]
+    run = zip(read(), frames, tilts, strict=True)
+    while batch := list(islice(run, _LEVELLED_AT_ONCE)):
+        seen = [(rows["circles"], tilt) for rows, _, tilt in batch if tilt is not None]
+        level = iter(_levelled(seen, camera, settings.calibration_px, found, common))
+        for rows, (prefix, lines, _), tilt in batch:
+            by = format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)
+            circles = rows["circles"] if tilt is None else next(level)
+            yield {**rows, "circles": circles, RUN_TILT: f"{by}\n"}
 
 
 def _levelled(
-    circles: str,
-    tilt: FrameTilt,
+    frames: Sequence[tuple[str, FrameTilt]],
     camera: Camera,
-    height_sigma: float,
     calibration_px: float,
-    by_verticals: bool,
-) -> str:
-    """A frame's rows, its STEP first; `height_sigma` is of the camera, as a share of its height."""
-    step, *rows = _lines(circles)
-    words = [row.split() for row in rows]
-    numbers = np.array([word[1:7] for word in words], np.float64).reshape(-1, 6)
+    run: RunTilt | None,
+    common: FloatArray | None,
+) -> list[str]:
+    """The rows of frames, each with its STEP first, levelled by their tilts.
+
+    These are the `run`'s, if there is one, and have the variances that all frames have in `common`;
+    else the frames' own, or unknown: by no lines.
+    """
+    texts: list[str] = []
+    words: list[list[str]] = []
+    frame_of_row: list[int] = []
+    for k, (text, by) in enumerate(frames):
+        step, *rows = _lines(text)
+        texts.append(f"{step}\n{format_levelling((by.pitch, by.roll))}\n")
+        words += map(str.split, rows)
+        frame_of_row += [k] * len(rows)
+    tilts = [frames[k][1] for k in frame_of_row]
+    numbers = np.array([[float(word) for word in row[1:7]] for row in words]).reshape(-1, 6)
     xy, covariance = numbers[:, :2], numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
-    floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt)
+    tilt, tilt_covariance = tilt_arrays(tilts)
+    height_sigma = 0.0
+    if run is not None:
+        height_sigma = run.height_sigma  # as a share of the camera's height
+        if common is not None:  # it comes with the calibration's other errors
+            tilt_covariance = tilt_covariance - np.diag(common)
+    floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt, tilt_covariance)
     from_camera = floor_xy - camera.centre[:2]
     covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
+    by_verticals = np.array([run is not None or by.lines > 0 for by in tilts], np.bool_)
     covariance += common_covariance(camera, xy, calibration_px, by_verticals=by_verticals)
     level = circle_landmarks(floor_xy[down], numbers[down, 2], covariance[down])
-    ids = [" ".join(words[k][7:]) for k in np.flatnonzero(down)]
-    discs = "".join(f"{format_record(row)} {own}\n" for row, own in zip(level, ids))
-    return f"{step}\n{format_levelling((tilt.pitch, tilt.roll))}\n{discs}"
+    for k, row in zip(np.flatnonzero(down).tolist(), level):
+        texts[frame_of_row[k]] += f"{format_record(row)} {' '.join(words[k][7:])}\n"
+    return texts
 
 
 def _frame_of(text: str) -> Frame:

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
-from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -194,7 +194,7 @@ def local_workers(jobs: int, *, large: bool = False, halves: bool = False) -> Wo
     """Processes of this machine; 1 is this process itself.
 
     Of `large` tasks, which carry images or bring pictures back, each has one frame. With `halves`,
-    one that has to compile has the kernels of lines and those of discs compiled by two others.
+    one that has to compile has half of the kernels compiled by each of two others.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
@@ -230,19 +230,26 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))
 
 
+class _CompiledElsewhereError(Exception):
+    """Instead of the kernel that a process was about to compile: there it is, to be loaded."""
+
+
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
     def __init__(self, plan: FramePlan, *, halves: bool) -> None:
-        both = halves and plan.lines and plan.circles and _cores() > 1
-        self._halves = [replace(plan, circles=None), replace(plan, lines=None)] if both else []
+        self._plan = plan
+        self._halves = halves and plan.lines and plan.circles and _cores() > 1
         self._chunk: Chunk = ()
         self._forget = on_compilation(self._before_compilation)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         self._chunk = cast("Chunk", args[-1])
         future: Future[R] = Future()
-        future.set_result(fn(*args, **kwargs))
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except _CompiledElsewhereError:
+            future.set_result(fn(*args, **kwargs))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -250,13 +257,28 @@ class _InProcess(Executor):
 
     def _before_compilation(self) -> None:
         say_compiling()
-        halves, self._halves = self._halves, []  # only before the first kernel
+        if not self._halves:
+            return
+        self._halves = False  # only before the first kernel
+        from detect.runs.frame import after_first_look
+
+        discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
-        with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
-            pools = [started.enter_context(_ProcessPool(1, half, show=False)) for half in halves]
-            done = [p.submit(work_on_chunk, half, self._chunk) for p, half in zip(pools, halves)]
+        with (
+            suppress(OSError, ImportError, BrokenExecutor),
+            _ProcessPool(1, discs, show=False) as one,
+            _ProcessPool(1, lines, show=False) as other,
+        ):
+            # Discs take twice as long as lines. So the process of the lines goes on with what
+            # follows the first look at discs, which the other one comes to last.
+            done: list[Future[Any]] = [
+                one.submit(work_on_chunk, discs, self._chunk),
+                other.submit(work_on_chunk, lines, self._chunk),
+                other.submit(after_first_look, discs, self._chunk),
+            ]
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
+            raise _CompiledElsewhereError
 
 
 # They are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra have

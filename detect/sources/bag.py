@@ -193,8 +193,6 @@ def compressed_content(message: Any, name: object) -> bytes:
     return bytes(message.data)
 
 
-#: Endings of bags that are one file.
-BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 #: What ROS calls the robot's base on the floor (REP 105, REP 120).
 BASE_FRAME = "base_footprint"
 #: Largest deviation of a conversion from the camera_info, anywhere in the image.

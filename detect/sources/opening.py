@@ -28,6 +28,8 @@ from detect.sources.poses import (
 )
 from detect.sources.video import LiveCamera, VideoFile
 
+#: Endings of bags that are one file.
+_BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
 
@@ -112,11 +114,11 @@ def _own_odometry(folder: Path) -> Path | None:
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
-    from detect.sources.bag import BAG_SUFFIXES, Bag  # takes long, and most sources are no bags
-
     bits = options.bits or None
-    is_bag = _is_ros2_bag(name) or name.suffix.lower() in BAG_SUFFIXES
+    is_bag = _is_ros2_bag(name) or name.suffix.lower() in _BAG_SUFFIXES
     if is_bag and name.exists():
+        from detect.sources.bag import Bag  # takes as long as everything else
+
         return Bag(name, options.image_topic, bits, options.base_frame)
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")

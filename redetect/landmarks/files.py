@@ -31,6 +31,9 @@ from redetect.landmarks.records import (
     Record,
     Row,
     Step,
+    numbers_of_circle,
+    numbers_of_line,
+    numbers_of_step,
 )
 from redetect.storage import write_whole
 from redetect.storage.messages import excerpt
@@ -247,6 +250,10 @@ def _ids(words: list[bytes]) -> tuple[int, ...]:
 
 LineEnd = Literal["\n", "\r\n"]
 
+_STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
+_CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
+_LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
+
 
 def format_record(record: Record) -> str:
     """Format a record as a row of a file, without line end.
@@ -255,18 +262,16 @@ def format_record(record: Record) -> str:
     landmarks have 6 significant digits, as C's ``%g``; corners of markers, in pixels, 4 decimals.
     """
     if isinstance(record, Step):
-        pose = [f"{getattr(record, name):8.5f}" for name in STEP_NUMBERS[:3]]
-        covariance = [f"{getattr(record, name):.12f}" for name in STEP_NUMBERS[3:]]
-        return " ".join(["STEP", record.prefix, *pose, *covariance])
+        return _STEP_ROW % (record.prefix, *numbers_of_step(record))
     if isinstance(record, MarkerLandmark):
         corners = (f"{c.u:.4f} {c.v:.4f} {c.cuu:g} {c.cuv:g} {c.cvv:g}" for c in record.corners)
         head = f"LANDMARK_M {record.dictionary} {record.id:d} {record.quality:g}"
         return " ".join([head, *corners])
-    is_circle = isinstance(record, CircleLandmark)
-    names = CIRCLE_NUMBERS if is_circle else LINE_NUMBERS
-    numbers = [f"{getattr(record, name):g}" for name in names]
-    ids = [f"{identifier:d}" for identifier in record.ids]
-    return " ".join(["LANDMARK_C" if is_circle else "LANDMARK_L", *numbers, *ids])
+    if isinstance(record, CircleLandmark):
+        row = _CIRCLE_ROW % numbers_of_circle(record)
+    else:
+        row = _LINE_ROW % numbers_of_line(record)
+    return " ".join([row, *map(str, record.ids)])
 
 
 def format_levelling(levelled_by: tuple[float, float]) -> str:

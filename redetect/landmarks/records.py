@@ -12,6 +12,7 @@ import os
 import re
 from dataclasses import dataclass
 from math import isfinite
+from operator import attrgetter
 
 from redetect.storage.messages import OneLineError, excerpt
 
@@ -43,6 +44,11 @@ class LandmarkFileError(LandmarkError):
 STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
 CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
 LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
+
+#: The numbers of a record as a tuple.
+numbers_of_step = attrgetter(*STEP_NUMBERS)
+numbers_of_circle = attrgetter(*CIRCLE_NUMBERS)
+numbers_of_line = attrgetter(*LINE_NUMBERS)
 
 MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
 MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
@@ -78,7 +84,7 @@ class Step:
     cphiphi: float
 
     def __post_init__(self) -> None:
-        _demand_finite(self, STEP_NUMBERS)
+        _demand_finite(STEP_NUMBERS, numbers_of_step(self))
         _demand_word(self.prefix, "image prefix")
 
 
@@ -107,7 +113,7 @@ class CircleLandmark:
     ids: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        _demand_finite(self, CIRCLE_NUMBERS)
+        _demand_finite(CIRCLE_NUMBERS, numbers_of_circle(self))
         _demand_ids(self.ids)
 
     @property
@@ -147,7 +153,7 @@ class LineLandmark:
     ids: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        _demand_finite(self, LINE_NUMBERS)
+        _demand_finite(LINE_NUMBERS, numbers_of_line(self))
         _demand_ids(self.ids)
 
     @property
@@ -175,7 +181,8 @@ class MarkerCorner:
     cvv: float
 
     def __post_init__(self) -> None:
-        _demand_finite(self, MARKER_CORNER_NUMBERS)
+        numbers = (self.u, self.v, self.cuu, self.cuv, self.cvv)
+        _demand_finite(MARKER_CORNER_NUMBERS, numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +210,7 @@ class MarkerLandmark:
         _demand_word(self.dictionary, "dictionary of markers")
         if not 0 <= self.id <= _LARGEST_ID:
             raise LandmarkError(f"marker's ID is {excerpt(self.id)}: expected 0 or more, 64 bits")
-        _demand_finite(self, ("quality",))
+        _demand_finite(("quality",), (self.quality,))
         if len(self.corners) != len(MARKER_CORNERS):
             raise LandmarkError(f"marker has {len(self.corners)} corners: expected 4")
 
@@ -269,11 +276,10 @@ class Row:
         return self if record == self.record else Row(record, line=self.line)
 
 
-def _demand_finite(record: object, names: tuple[str, ...]) -> None:
-    for name in names:
-        value = getattr(record, name)
-        if not isfinite(value):
-            raise LandmarkError(f"{name} is {value}: expected a finite number")
+def _demand_finite(names: tuple[str, ...], values: tuple[float, ...]) -> None:
+    if not all(map(isfinite, values)):
+        name, value = next(pair for pair in zip(names, values) if not isfinite(pair[1]))
+        raise LandmarkError(f"{name} is {value}: expected a finite number")
 
 
 def _demand_word(word: str, name: str) -> None:

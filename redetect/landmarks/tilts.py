@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
@@ -70,7 +70,7 @@ def format_no_tilt(prefix: str, lines: int) -> str:
 def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
     """The tilt rounded to the digits that its row has."""
     pitch, roll, cpp, cpr, crr = map(float, format_tilt(tilt).rsplit(" ", 6)[1:-1])
-    return replace(tilt, pitch=pitch, roll=roll, cpp=cpp, cpr=cpr, crr=crr)
+    return FrameTilt(tilt.prefix, pitch, roll, cpp, cpr, crr, tilt.lines)
 
 
 def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:

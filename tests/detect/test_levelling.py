@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections
-from detect.levelling import level_discs, levelled
+from detect.levelling import level_discs, levelled, tilt_arrays
 from detect.seen import level_seen
 from redetect.landmarks import FrameTilt
 from tools.published_camera import PUBLISHED_CAM
@@ -44,9 +44,8 @@ def test_covariances_are_those_of_a_monte_carlo(pitch: float, roll: float) -> No
     seen = seen_by_tilted_robot(CAMERA, pitch, roll)
     own = np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
     tilt = np.array([[2e-6, 5e-7], [5e-7, 1e-6]])
-    estimate = FrameTilt("e.0000", pitch, roll, 2e-6, 5e-7, 1e-6, 9)
     covariance = np.repeat(own[None], len(seen), axis=0)
-    _, predicted, _ = level_discs(CAMERA, seen, covariance, estimate)
+    _, predicted, _ = level_discs(CAMERA, seen, covariance, np.array([pitch, roll]), tilt)
     draws = 4000
     tilts = rng.multivariate_normal([pitch, roll], tilt, size=draws)
     noise = rng.multivariate_normal([0.0, 0.0], own, size=(draws, len(seen)))
@@ -79,7 +78,7 @@ def test_discs_are_levelled_as_positions_and_covariances_are(
     tilt = FrameTilt("e.0000", pitch, 0.01, 2e-6, 5e-7, 1e-6, 9)
     after = levelled(found, CAMERA, tilt)
     level_xy = level_seen(CAMERA, floor_xy, (pitch, 0.01))
-    _, level_cov, down = level_discs(CAMERA, floor_xy, covariance, tilt)
+    _, level_cov, down = level_discs(CAMERA, floor_xy, covariance, *tilt_arrays([tilt]))
     np.testing.assert_array_equal(down, np.isfinite(level_xy).all(axis=1))
     assert down.all() == (pitch != -0.2 or farthest_m == 5.0)
     np.testing.assert_allclose(after.floor_xy, level_xy[down], rtol=1e-12)

@@ -88,7 +88,7 @@ def test_no_workers_are_refused() -> None:
 
 
 def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) -> None:
-    """The kernels of lines and those of discs, each by a process of its own."""
+    """The kernels of lines and those of discs by a process each; what was begun begins again."""
     began: list[str] = []
 
     class Process(ThreadPoolExecutor):
@@ -98,7 +98,7 @@ def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) 
 
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
             plan, chunk = args
-            began.append(f"{bool(plan.lines)} {bool(plan.circles)} {chunk}")
+            began.append(f"{fn.__name__} {bool(plan.lines)} {bool(plan.circles)} {chunk}")
             return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
 
     def work(plan: FramePlan, chunk: str) -> int:
@@ -112,12 +112,13 @@ def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) 
     plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
     with local_workers(1, halves=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
-    halves = ["True False images", "False True images"]
+    halves = ["work_on_chunk False True images", "work_on_chunk True False images"]
+    halves += ["after_first_look False True images"]
     assert began == [*halves, "compiled images", "compiled images"]
     only_lines = replace(plan, circles=None)
     with local_workers(1, halves=True).start(only_lines) as executor:
         executor.submit(work, only_lines, "more")
-    assert began[4:] == ["compiled more", "compiled more"]
+    assert began[5:] == ["compiled more", "compiled more"]
 
 
 @pytest.mark.long
