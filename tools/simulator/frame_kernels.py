@@ -14,6 +14,7 @@ from tools.arrays import Float32Array, FloatArray
 from tools.simulator.ray_kernels import (
     CEILING,
     FLOOR,
+    NOTHING,
     SKY,
     first_met,
     nearest_quad,
@@ -55,7 +56,7 @@ def _lamp_light(scene: Scene, lamps: FloatArray, x: float, y: float, z: float) -
             dy = lamps[k, 1] + 0.3 * end * lamps[k, 4] - y
             dz = lamps[k, 2] - z
             squared = dx * dx + dy * dy + dz * dz
-            found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 0.99, False)
+            found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 0.99, NOTHING)
             if found < 0:
                 area = lamps[k, 3] * lamps[k, 4]
                 total += 0.5 * lamps[k, 5] * area * dz * dz / (np.pi * squared * squared)
@@ -171,7 +172,7 @@ def render_radiance(
     depth = np.empty((lines, width), dtype=np.float32)
     for line in range(lines):
         for u in range(width):
-            a, b, c, d = _sample(scene, u, 0.5 * line, optics, inverse, world_from_camera)
+            a, b, c, d = _sample(scene, float(u), 0.5 * line, optics, inverse, world_from_camera)
             light[line, u], seen[line, u], mirrored[line, u], depth[line, u] = a, b, c, d
     across = np.zeros((lines, width), dtype=np.bool_)
     for line in range(lines):
@@ -222,7 +223,7 @@ def render_mirrored(
         for j in range(image.shape[1]):
             if mirrored[i * stride, j * stride] <= 0.0:
                 continue
-            x, y = camera_ray(j * stride, 0.5 * i * stride, optics, inverse)
+            x, y = camera_ray(float(j * stride), 0.5 * i * stride, optics, inverse)
             dx = m[0, 0] * x + m[0, 1] * y + m[0, 2]
             dy = m[1, 0] * x + m[1, 1] * y + m[1, 2]
             dz = m[2, 0] * x + m[2, 1] * y + m[2, 2]
@@ -255,7 +256,7 @@ def smear(
     m = later_from_camera
     for line in range(lines):
         for u in range(width):
-            x, y = camera_ray(u, 0.5 * line, optics, inverse)
+            x, y = camera_ray(float(u), 0.5 * line, optics, inverse)
             d = 1e4 if seen[line, u] == SKY else depth[line, u]
             px = m[0, 0] * x * d + m[0, 1] * y * d + m[0, 2] * d + m[0, 3]
             py = m[1, 0] * x * d + m[1, 1] * y * d + m[1, 2] * d + m[1, 3]

@@ -15,7 +15,9 @@ import numpy as np
 from tools.arrays import BoolArray, FloatArray
 from tools.simulator.scene import Flooring, Mark, Scene, Texture
 
-_GLASS = float(Texture.WINDOW)
+# Textures that a ray may go through. Numba compiles a kernel anew for each integer or truth value
+# that is written into a call, but not for each float: so the seeds of textures are floats.
+_GLASS, NOTHING = float(Texture.WINDOW), -1.0
 _FAR = 1e30
 _NEAR = 1e-6
 
@@ -26,9 +28,9 @@ def nearest_quad(
     ox: float, oy: float, oz: float,
     dx: float, dy: float, dz: float,
     limit: float,
-    through_glass: bool,
+    clear: float,
 ) -> tuple[int, float]:  # fmt: skip
-    """First parallelogram that a ray meets, and where."""
+    """First parallelogram that a ray meets, and where; it goes through the texture `clear`."""
     quads = scene.quads
     start, items = scene.quad_start, scene.quad_items
     x0, y0, side = scene.grid[0], scene.grid[1], scene.grid[2]
@@ -77,7 +79,7 @@ def nearest_quad(
             r = quads[q, 8] * x + quads[q, 9] * y + quads[q, 10] * z - quads[q, 11]
             if r < 0.0 or r > 1.0:
                 continue
-            if through_glass and scene.surfaces[q].texture == _GLASS:
+            if scene.surfaces[q].texture == clear:
                 continue
             best, found = t, q
         beyond = min(next_x, next_y)
@@ -107,7 +109,7 @@ def points_visible(scene: Scene, eye: FloatArray, points: FloatArray, slack_m: f
         dz = points[k, 2] - eye[2]
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         limit = max(1.0 - slack_m / max(distance, 1e-9), 0.0)
-        found, _ = nearest_quad(scene, eye[0], eye[1], eye[2], dx, dy, dz, limit, False)
+        found, _ = nearest_quad(scene, eye[0], eye[1], eye[2], dx, dy, dz, limit, NOTHING)
         visible[k] = found < 0
     return visible
 
@@ -132,7 +134,7 @@ def sees_sun(scene: Scene, x: float, y: float, z: float) -> bool:
         row, column = raster_index(scene, x + t * dx, y + t * dy)
         if scene.indoors[row, column] == 1:
             return False
-    found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, True)
+    found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, _GLASS)
     return found < 0
 
 
@@ -153,16 +155,16 @@ _CEILING_ALBEDO = 0.80
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _hashed(ix: int, iy: int, seed: int) -> float:
+def _hashed(ix: int, iy: int, seed: float) -> float:
     """A number in [0, 1) that looks random and depends on nothing but the arguments."""
-    h = (ix * 374761393 + iy * 668265263 + seed * 974634777) & 0xFFFFFFFF
+    h = (ix * 374761393 + iy * 668265263 + int(seed) * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
     return (h ^ (h >> 15)) / 4294967296.0
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _noise(x: float, y: float, seed: int) -> float:
+def _noise(x: float, y: float, seed: float) -> float:
     """Smooth noise in [-1, 1] with features of size 1."""
     fx, fy = np.floor(x), np.floor(y)
     ix, iy = int(fx), int(fy)
@@ -181,7 +183,7 @@ def _seen(feature_m: float, footprint_m: float) -> float:
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _grain(x: float, y: float, size: float, seed: int, footprint_m: float) -> float:
+def _grain(x: float, y: float, size: float, seed: float, footprint_m: float) -> float:
     keep = _seen(size, footprint_m)
     return 0.0 if keep < 0.05 else keep * _noise(x / size, y / size, seed)
 
@@ -207,7 +209,7 @@ def _photograph(scene: Scene, layer: int, s: float, t: float, footprint: float) 
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _text(x: float, y: float, seed: int, footprint_m: float) -> float:
+def _text(x: float, y: float, seed: float, footprint_m: float) -> float:
     """Share of ink of lines of print; x to the right, y upward, metres."""
     line = np.floor(y / 0.012)
     keep = _seen(0.006, footprint_m)
@@ -222,20 +224,20 @@ def _text(x: float, y: float, seed: int, footprint_m: float) -> float:
 def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprint: float) -> float:
     row = scene.surfaces[q]
     texture, albedo, parameter = int(row.texture), row.albedo, row.parameter  # fmt: skip
-    width, height, seed = row.width, row.height, int(row.seed)
+    width, height, seed = row.width, row.height, row.seed
     x, y = s * width, t * height
     if texture == _WALL:
         if z < 0.09:  # skirting
             return parameter
         rough = _grain(x, z, 0.9, seed, footprint) * 0.03
-        rough += _grain(x, z, 0.12, seed + 1, footprint) * 0.025
+        rough += _grain(x, z, 0.12, seed + 1.0, footprint) * 0.025
         scuff = 0.0
         if z < 0.5:
-            scuff = 0.10 * max(_grain(x, 3.0 * z, 0.25, seed + 2, footprint) - 0.3, 0.0)
+            scuff = 0.10 * max(_grain(x, 3.0 * z, 0.25, seed + 2.0, footprint) - 0.3, 0.0)
         return albedo * (1.0 + rough - scuff)
     if texture == _WOOD:
-        rings = _noise(x / 0.035 + 1.2 * _noise(x / 0.2, y / 0.9, seed), y / 0.8, seed + 1)
-        fine = _grain(x, y / 12.0, 0.008, seed + 2, footprint)
+        rings = _noise(x / 0.035 + 1.2 * _noise(x / 0.2, y / 0.9, seed), y / 0.8, seed + 1.0)
+        fine = _grain(x, y / 12.0, 0.008, seed + 2.0, footprint)
         return albedo * (1.0 + 0.14 * rings * _seen(0.02, footprint) + 0.08 * fine)
     if texture == _PHOTOGRAPH:
         border = parameter
@@ -243,7 +245,7 @@ def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprin
             return albedo
         u = (x - border) / (width - 2.0 * border)
         v = (y - border) / (height - 2.0 * border)
-        layer = seed % scene.photographs.shape[0]
+        layer = int(seed) % scene.photographs.shape[0]
         return 0.04 + 0.85 * _photograph(scene, layer, u, v, footprint / width)
     if texture == _PAPER:
         margin = 0.12 * min(width, height)
@@ -255,7 +257,7 @@ def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprin
         joint *= _seen(0.02, footprint)
         return albedo * (1.0 - 0.35 * joint + 0.08 * _grain(x, y, 0.3, seed, footprint))
     if texture == _FOLIAGE:
-        leaves = _grain(x, y, 0.05, seed, footprint) + _grain(x, y, 0.17, seed + 1, footprint)
+        leaves = _grain(x, y, 0.05, seed, footprint) + _grain(x, y, 0.17, seed + 1.0, footprint)
         return albedo * max(1.0 + 0.7 * leaves, 0.1)
     if texture == _METAL:
         return albedo * (1.0 + 0.03 * _grain(x, y, 0.4, seed, footprint))
@@ -268,34 +270,34 @@ def _floor_albedo(scene: Scene, kind: int, x: float, y: float, footprint: float)
     texture, albedo, contrast, pitch = (
         int(row.kind), row.albedo, row.contrast, row.pitch
     )  # fmt: skip
-    stains = 0.25 * _grain(x, y, 1.3, 11, footprint) + 0.2 * _grain(x, y, 0.31, 12, footprint)
+    stains = 0.25 * _grain(x, y, 1.3, 11.0, footprint) + 0.2 * _grain(x, y, 0.31, 12.0, footprint)
     if texture == _LINOLEUM:
-        speckle = _grain(x, y, 0.012, 13, footprint) + 0.6 * _grain(x, y, 0.05, 14, footprint)
+        speckle = _grain(x, y, 0.012, 13.0, footprint) + 0.6 * _grain(x, y, 0.05, 14.0, footprint)
         seam = 0.0
         if pitch > 0.0 and abs(x - pitch * np.rint(x / pitch)) < 0.004:
             seam = _seen(0.008, footprint)
         return albedo * (1.0 + contrast * (speckle + stains) - 0.3 * seam)
     if texture == _CARPET:
-        pile = _grain(x, y, 0.008, 15, footprint) + _grain(x, y, 0.025, 16, footprint)
+        pile = _grain(x, y, 0.008, 15.0, footprint) + _grain(x, y, 0.025, 16.0, footprint)
         return albedo * (1.0 + contrast * (1.3 * pile + stains))
     if texture == _PARQUET:
         plank = np.floor(x / pitch)
         end = np.floor(y / (6.0 * pitch) + 0.5 * plank)
-        tone = 2.0 * _hashed(int(plank), int(end), 17) - 1.0
-        grain = _grain(12.0 * x, y, 0.1, 18, footprint)
+        tone = 2.0 * _hashed(int(plank), int(end), 17.0) - 1.0
+        grain = _grain(12.0 * x, y, 0.1, 18.0, footprint)
         groove = 1.0 if (x / pitch - plank) * pitch < 0.003 else 0.0
         fine = 0.5 * grain - 1.2 * groove * _seen(0.006, footprint)
         return albedo * (1.0 + contrast * (tone * _seen(pitch, footprint) + fine))
     if texture in (_TILES, _PAVING):
         column, line = np.floor(x / pitch), np.floor(y / pitch)
-        tone = 2.0 * _hashed(int(column), int(line), 19) - 1.0
+        tone = 2.0 * _hashed(int(column), int(line), 19.0) - 1.0
         groove = 0.004 if texture == _TILES else 0.008
         near = min(x / pitch - column, y / pitch - line) * pitch
         joint = _seen(2.0 * groove, footprint) if near < groove else 0.0
-        grit = _grain(x, y, 0.015, 20, footprint)
+        grit = _grain(x, y, 0.015, 20.0, footprint)
         fine = 0.4 * tone * _seen(pitch, footprint) + 0.5 * grit + stains - 3.0 * joint
         return max(albedo * (1.0 + contrast * fine), 0.02)
-    blades = _grain(x, y, 0.02, 21, footprint) + _grain(x, y, 0.09, 22, footprint)
+    blades = _grain(x, y, 0.02, 21.0, footprint) + _grain(x, y, 0.09, 22.0, footprint)
     return max(albedo * (1.0 + contrast * (blades + stains)), 0.02)
 
 
@@ -328,7 +330,7 @@ def _mark_share(scene: Scene, m: int, x: float, y: float) -> tuple[float, float]
     if abs(a) > radius or abs(b) > second:
         return 0.0, 0.0
     if shape == _PRINTED and abs(a) < 0.85 * radius and abs(b) < 0.9 * second:
-        return 1.0, albedo * (1.0 - 0.7 * _text(a, b, m, 0.004))
+        return 1.0, albedo * (1.0 - 0.7 * _text(a, b, float(m), 0.004))
     return 1.0, albedo
 
 
@@ -381,7 +383,7 @@ def first_met(
             row, column = raster_index(scene, ox + up * dx, oy + up * dy)
             if scene.indoors[row, column] == 1:
                 limit, met = up, CEILING
-    quad, distance = nearest_quad(scene, ox, oy, oz, dx, dy, dz, limit, False)
+    quad, distance = nearest_quad(scene, ox, oy, oz, dx, dy, dz, limit, NOTHING)
     if quad >= 0:
         return quad, distance
     return met, limit
@@ -458,7 +460,7 @@ def _floor_radiance(
             if int(scene.marks[mark].shape) == _LIGHT_SPOT:
                 light += share * shown
             else:
-                albedo = shown * (1.0 + 0.03 * _grain(x, y, 0.05, mark, footprint))
+                albedo = shown * (1.0 + 0.03 * _grain(x, y, 0.05, float(mark), footprint))
                 gloss = scene.marks[mark].gloss
                 seen = -10 - mark
     if scene.sun_reach[cell[0], cell[1]] == 1 and sees_sun(scene, x, y, 1e-3):

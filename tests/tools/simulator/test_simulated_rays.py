@@ -11,7 +11,7 @@ from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.slam.models import disc_in_robot
 from tools.simulator.driving import tilted_camera
 from tools.simulator.frame_kernels import camera_ray
-from tools.simulator.ray_kernels import nearest_quad, points_visible
+from tools.simulator.ray_kernels import NOTHING, nearest_quad, points_visible
 from tools.simulator.renderer import Light, optics_of, render_light, smeared
 from tools.simulator.scene import (
     Construction,
@@ -136,7 +136,7 @@ def test_nearest_of_random_rectangles_is_found() -> None:
         r = (q[:, 8:11] * point).sum(axis=1) - q[:, 11]
         met = (t > 1e-6) & (t < 50.0) & (s >= 0) & (s <= 1) & (r >= 0) & (r <= 1)
         (x, y, z), (dx, dy, dz) = origin, direction
-        found, distance = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, False)
+        found, distance = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, NOTHING)
         if not met.any():
             assert found == -1
             continue
