@@ -1,4 +1,4 @@
-"""Numba kernels that cast rays through a scene and shade what they meet.
+"""Numba kernels that cast rays through a scene, shade what they meet, and bake a scene's light.
 
 Rays go through a grid of upright and level parallelograms; textures, marks on the floor and baked
 light decide what comes back.
@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
-from tools.arrays import BoolArray, FloatArray
+from tools.arrays import BoolArray, Float32Array, FloatArray
 from tools.simulator.scene import Flooring, Mark, Scene, Texture
 
 # Textures that a ray may go through. Numba compiles a kernel anew for each integer or truth value
@@ -467,3 +468,115 @@ def _floor_radiance(
         light += scene.sun[3] * scene.sun[2]
     mirrored = gloss * (0.04 + 0.96 * (1.0 - cosine) ** 5)
     return albedo * light, seen, mirrored
+
+
+@nb.njit(cache=True, error_model="numpy")
+def light_along(
+    scene: Scene, origins: FloatArray, directions: FloatArray, pixel_angle: float
+) -> tuple[Float32Array, NDArray[np.int32], Float32Array, Float32Array]:
+    """What comes back along rays: light, what they met, its mirrored share, and how far it is.
+
+    `origins`, `directions` (N, 3), the lengths of which are the unit of the distances;
+    `pixel_angle`: of what a ray stands for (rad). Returns four arrays (N,).
+    """
+    count = len(directions)
+    light = np.empty(count, dtype=np.float32)
+    seen = np.empty(count, dtype=np.int32)
+    mirrored = np.empty(count, dtype=np.float32)
+    distance = np.empty(count, dtype=np.float32)
+    for k in range(count):
+        ox, oy, oz = origins[k, 0], origins[k, 1], origins[k, 2]
+        dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+        met, far = first_met(scene, ox, oy, oz, dx, dy, dz)
+        light[k], seen[k], mirrored[k] = radiance(
+            scene, ox, oy, oz, dx, dy, dz, met, far, pixel_angle
+        )
+        distance[k] = far
+    return light, seen, mirrored, distance
+
+
+_LAMP_REACH_M = 8.0
+_UPRIGHT_HEIGHT_M = 1.2
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _returned(scene: Scene, met: int) -> float:
+    """Light that comes back from a thing, roughly: what its own light is is not known yet."""
+    if met == SKY:
+        return scene.sky
+    if met == CEILING:
+        return 0.30
+    if met == FLOOR:
+        return 0.20
+    if scene.surfaces[met].texture == _GLASS:
+        return min(scene.surfaces[met].emission, 4.0)
+    if scene.surfaces[met].emission > 0.0:
+        return 0.0  # lamps are dealt with one by one
+    return 0.42 * scene.surfaces[met].albedo
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _lamp_light(scene: Scene, lamps: FloatArray, x: float, y: float, z: float) -> float:
+    """Light of the lamps on a level surface; two points of each lamp soften the shadows."""
+    total = 0.0
+    for k in range(lamps.shape[0]):
+        if abs(lamps[k, 0] - x) > _LAMP_REACH_M or abs(lamps[k, 1] - y) > _LAMP_REACH_M:
+            continue
+        for end in range(-1, 2, 2):
+            dx = lamps[k, 0] + 0.3 * end * lamps[k, 3] - x
+            dy = lamps[k, 1] + 0.3 * end * lamps[k, 4] - y
+            dz = lamps[k, 2] - z
+            squared = dx * dx + dy * dy + dz * dz
+            found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 0.99, NOTHING)
+            if found < 0:
+                area = lamps[k, 3] * lamps[k, 4]
+                total += 0.5 * lamps[k, 5] * area * dz * dz / (np.pi * squared * squared)
+    return total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def bake_light(scene: Scene, lamps: FloatArray, floor_rays: FloatArray, azimuths: int) -> None:
+    """Fill in ``floor_light``, ``side_light`` and ``sun_reach`` of a scene.
+    `lamps` (L, 6); `floor_rays` (R, 3).
+    """
+    rows, columns = scene.floor_kind.shape
+    for i in range(rows):
+        for j in range(columns):
+            x = scene.grid[0] + (j + 0.5) * scene.raster_m
+            y = scene.grid[1] + (i + 0.5) * scene.raster_m
+            outdoors = scene.indoors[i, j] == 0
+            every = 4 if outdoors else 1
+            total, count = 0.0, 0
+            for k in range(0, floor_rays.shape[0], every):
+                met, _ = first_met(
+                    scene, x, y, 0.005, floor_rays[k, 0], floor_rays[k, 1], floor_rays[k, 2]
+                )
+                total += _returned(scene, met)
+                count += 1
+            direct = 0.0 if outdoors else _lamp_light(scene, lamps, x, y, 0.005)
+            scene.floor_light[i, j] = total / count + direct
+            # A place the sun misses may still lie beside one that it reaches.
+            for k in range(9):
+                off_x, off_y = 0.5 * (k % 3 - 1), 0.5 * (k // 3 - 1)
+                if sees_sun(scene, x + off_x * scene.raster_m, y + off_y * scene.raster_m, 0.005):
+                    scene.sun_reach[i, j] = 1
+                    break
+            if i % 2 == 1 or j % 2 == 1:
+                continue
+            mean, along_x, along_y, count = 0.0, 0.0, 0.0, 0
+            for a in range(azimuths):
+                c, s = np.cos(2.0 * np.pi * a / azimuths), np.sin(2.0 * np.pi * a / azimuths)
+                for rise in (-0.4, 0.02, 0.45):
+                    met, _ = first_met(scene, x, y, _UPRIGHT_HEIGHT_M, c, s, rise)
+                    back = _returned(scene, met)
+                    mean += back
+                    along_x += c * back
+                    along_y += s * back
+                    count += 1
+            high = 0.0 if outdoors else _lamp_light(scene, lamps, x, y, _UPRIGHT_HEIGHT_M)
+            for di in range(2):
+                for dj in range(2):
+                    if i + di < rows and j + dj < columns:
+                        scene.side_light[i + di, j + dj, 0] = mean / count + 0.35 * high
+                        scene.side_light[i + di, j + dj, 1] = 1.6 * along_x / count
+                        scene.side_light[i + di, j + dj, 2] = 1.6 * along_y / count

@@ -314,7 +314,7 @@ def make_scene(
     """
     from scipy.ndimage import gaussian_filter
 
-    from tools.simulator.frame_kernels import bake_light
+    from tools.simulator.ray_kernels import bake_light
 
     x0, y0, x1, y1 = extent
     columns, rows = int(np.ceil((x1 - x0) / _CELL_M)), int(np.ceil((y1 - y0) / _CELL_M))
