@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 from tools.simulator.building import (
     CORRIDOR_M,
     HALF_CORRIDOR_M,

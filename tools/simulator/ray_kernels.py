@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.arrays import BoolArray, Float32Array, FloatArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray
 from tools.simulator.scene import Flooring, Mark, Scene, Texture
 
 # Textures that a ray may go through. Numba compiles a kernel anew for each integer or truth value

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.uncertainty import IDENTITY
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.trajectories.transforms import planar_transform
-from tools.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from tools.simulator.scene import Scene
 
 _RAYS_ACROSS_EDGES = 12

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 
 class Texture(IntEnum):

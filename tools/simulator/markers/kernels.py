@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from camera.kernels import project_direction
-from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 
 class SurfaceArrays(NamedTuple):
