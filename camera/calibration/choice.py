@@ -14,6 +14,9 @@ from redetect.array_types import IntArray
 from redetect.least_squares.solver import StartError
 
 _FOLDS = 8
+# Fits to folds end at a step that lowers the cost by less than this share: they begin where the fit
+# to all views ended, and what the rest would change is far less than a variance.
+_HOLDOUT_TOLERANCE = 1e-6
 # An additional coefficient must lower the sum of squared hold-out errors by this many variances.
 _WORTH = 4.0
 # The two tangential terms must lower it by `_TANGENTIAL_WORTH` variances and differ from 0 by
@@ -158,13 +161,14 @@ def holdout_error(
         folds = [every[every % number == fold] for fold in range(number)]
     squares = 0.0
     span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
+    fitted = partial(adjust, robust=settings.robust, tolerance=_HOLDOUT_TOLERANCE)
     for out in folds:
         used = np.setdiff1d(every, out)
-        fit = adjust(estimate.of(used), points.of(used), span, robust=settings.robust)
+        fit = fitted(estimate.of(used), points.of(used), span)
         held = points.of(out)
         there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
-            test = adjust(there, held, nothing, robust=settings.robust, sigma_px=fit.sigma_px)
+            test = fitted(there, held, nothing, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point lies past this fit's fold
             return float("inf")
         squares += float(np.sum(test.residuals**2))

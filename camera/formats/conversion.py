@@ -64,6 +64,11 @@ class CameraFit(NamedTuple):
     possible: Callable[[FloatArray], bool]
     measured: Callable[[FloatArray], Converted]
 
+    def away(self, parameters: FloatArray) -> FloatArray:
+        """(N,) distances from the pixels at which it sees the rays; infinite where it does not."""
+        found = np.linalg.norm(self.project(parameters)[0] - self.pixels, axis=1)
+        return np.where(np.isfinite(found), found, np.inf)
+
     def fitted(
         self, start: FloatArray, span: FloatArray, weights: FloatArray | None = None
     ) -> FloatArray:
@@ -97,14 +102,15 @@ class CameraFit(NamedTuple):
 
 def _nearest(fit: CameraFit, start: FloatArray, spans: Sequence[FloatArray]) -> Converted:
     """The fit with the smallest largest deviation, each span fitted from where the last ended."""
-    fits: list[tuple[Converted, FloatArray, FloatArray]] = []
+    fits: list[tuple[float, FloatArray, FloatArray]] = []
     parameters = start
     for span in spans:
         parameters = fit.fitted(parameters, span)
-        fits.append((fit.measured(parameters), parameters, span))
-        if fits[-1][0].deviation_px < EXACT_PX:
+        fits.append((float(fit.away(parameters).max()), parameters, span))
+        if fits[-1][0] < EXACT_PX:
             break
-    best, parameters, span = min(fits, key=lambda found: found[0].deviation_px)
+    _, parameters, span = min(fits, key=lambda found: found[0])
+    best = fit.measured(parameters)
     if best.deviation_px < EXACT_PX:
         return best
     return nearer(best, fit.measured(smallest_largest(fit, parameters, span)))
@@ -126,7 +132,7 @@ def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> Flo
     parameters = best = start
     smallest = float("inf")
     for _ in range(_LAWSON_ROUNDS):
-        away = np.linalg.norm(fit.project(parameters)[0] - fit.pixels, axis=1)
+        away = fit.away(parameters)
         worst = float(away.max())
         if not np.isfinite(worst):
             break

@@ -83,7 +83,8 @@ def inverse_blocks(
         pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
     )
     columns = np.repeat(np.arange(len(order), dtype=np.int64), np.diff(indptr))
-    keys = columns * len(order) + indices
+    keys = np.sort(columns * len(order) + indices)
+    indices = keys % len(order)
     lower = sparse.tril(factored.L, -1).tocoo()
     values = np.zeros(len(indices))
     values[np.searchsorted(keys, lower.col.astype(np.int64) * len(order) + lower.row)] = lower.data
@@ -103,7 +104,10 @@ def inverse_blocks(
 
 @kernel()
 def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
-    """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns."""
+    """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns.
+
+    Within a column, rows are in any order.
+    """
     n = len(indptr) - 1
     first_child = np.full(n, -1, dtype=np.int64)
     next_child = np.full(n, -1, dtype=np.int64)
@@ -114,7 +118,8 @@ def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntAr
         count = start[j]
         if count + n > len(rows):
             larger = np.empty(2 * len(rows) + n, dtype=np.int64)
-            larger[:count] = rows[:count]
+            for at in range(count):
+                larger[at] = rows[at]
             rows = larger
         mark[j] = j
         for at in range(indptr[j], indptr[j + 1]):
@@ -133,9 +138,10 @@ def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntAr
                     count += 1
             child = next_child[child]
         start[j + 1] = count
-        rows[start[j] : count].sort()
         if count > start[j]:
-            parent = rows[start[j]]
+            parent = n
+            for at in range(start[j], count):
+                parent = min(parent, rows[at])
             next_child[j] = first_child[parent]
             first_child[parent] = j
     return start, rows[: start[n]].copy()

@@ -20,7 +20,6 @@ from detect.settings import CircleSettings
 from lut import build_disc_table, build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, pinhole, render, tilted
 from tests.detect.painted_floor import PaintedFloor
-from tools.simulator.renderer import optics_of
 
 TANGENTIAL = (2e-3, -3e-3)
 #: EuRoC's cam0: its lens alone, and a decentred one like it.
@@ -151,19 +150,3 @@ def test_straight_pixels_of_markers(decentred: Camera) -> None:
     plumb_bob = replace(alone, tangential=(0.0, 0.0), polynomial=EUROC)
     expected = plumb_bob.undistort(pixels) * scale + np.array([384.0, 144.0])
     np.testing.assert_allclose(picture_of(image, plumb_bob).straighten(pixels), expected, atol=0.01)
-
-
-@pytest.mark.parametrize("polynomial", [(0.0, 0.0, 0.0), EUROC])
-def test_simulated_rays_are_the_cameras(
-    decentred: Camera, polynomial: tuple[float, float, float]
-) -> None:
-    from tools.simulator.frame_kernels import camera_ray
-
-    if any(polynomial):
-        decentred = replace(decentred, coef=(0.0,) * 5, polynomial=polynomial)
-    optics = optics_of(decentred)
-    u, v = np.meshgrid(np.linspace(-0.5, 767.5, 21), np.linspace(-0.5, 287.9, 17))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = np.array([camera_ray(a, b, optics.numbers, optics.inverse) for a, b in pixels])
-    points = np.column_stack([rays, np.ones(len(rays))])
-    np.testing.assert_allclose(decentred.project(points), pixels, atol=1e-9)

@@ -19,8 +19,8 @@ import tyro
 from detect import __version__
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
+from redetect.array_types import ByteArray
 from redetect.storage.command_line import exit_code_of
-from tools.arrays import ByteArray
 from tools.benchmark import functions as f
 from tools.benchmark.material import (
     Picture,

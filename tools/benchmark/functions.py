@@ -76,7 +76,7 @@ def all_detectors(camera: Camera) -> dict[str, Function]:
 
 
 def peers() -> dict[str, Function]:
-    """Detectors of circles and lines of OpenCV and scikit-image, as far as they are installed."""
+    """Detectors of circles and lines of OpenCV and scikit-image."""
     import cv2
     from skimage.feature import canny
     from skimage.transform import hough_circle
@@ -95,17 +95,12 @@ def peers() -> dict[str, Function]:
             param1=100, param2=30, minRadius=low, maxRadius=high,
         )  # fmt: skip
 
-    found: dict[str, Function] = {
+    return {
         "cv2.HoughCircles": opencv_hough,
         "cv2.SimpleBlobDetector": lambda p: blobs.detect(p.grey),
         "skimage hough_circle": lambda p: hough_circle(canny(p.grey, sigma=2.0), radii),
         "cv2 LSD": lambda p: segments.detect(p.grey),
     }
-    extra = getattr(cv2, "ximgproc", None)
-    if extra is not None and hasattr(extra, "createFastLineDetector"):
-        fast = extra.createFastLineDetector()
-        found["cv2.ximgproc FLD"] = lambda p: fast.detect(p.grey)
-    return found
 
 
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from camera import Camera, write_camera
 from detect.sources.interface import Run
+from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import Frame, write_frames
-from tools.arrays import ByteArray, FloatArray
 from tools.simulator.markers.things import photograph_files
 from tools.simulator.single_disc import render_disc
 

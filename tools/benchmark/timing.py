@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 
 #: However slow a function is, it is called this often (as far as there are images and rounds).
 LEAST_CALLS = 3

@@ -18,8 +18,8 @@ from detect.discs.fit import blur_ratio_of
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import cached_disc_table
+from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
-from tools.arrays import ByteArray, FloatArray
 from tools.evaluation.single_fits import fit_discs
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc

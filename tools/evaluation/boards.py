@@ -12,8 +12,8 @@ from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.calibration.model import cross_matrices, project_points, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
+from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError
-from tools.arrays import ByteArray, FloatArray, IntArray
 
 #: Standard deviations of a board's turns about its axes.
 _TILTS_RAD = np.array([0.45, 0.45, 0.3])

@@ -24,7 +24,7 @@ from camera.uncertainty import (
     projection_sigma,
     with_intrinsics,
 )
-from tools.arrays import FloatArray, IntArray
+from redetect.array_types import FloatArray, IntArray
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.tables import Table
 

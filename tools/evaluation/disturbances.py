@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.arrays import ByteArray, Float32Array, FloatArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray
 
 #: Signed distance into a shape of some size, radii, at places (s, t).
 Distance = Callable[[FloatArray, FloatArray, float], FloatArray]

@@ -20,8 +20,8 @@ from camera import Camera, read_camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.settings import CircleSettings
 from lut import cached_disc_table
+from redetect.array_types import ByteArray, FloatArray
 from redetect.storage import write_whole
-from tools.arrays import ByteArray, FloatArray
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
 from tools.evaluation.tables import markdown_table
 

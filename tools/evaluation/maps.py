@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tyro.conf import Positional
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
 from redetect.plane import between
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording
@@ -22,7 +23,6 @@ from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, read_recording
-from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.tables import Table
 from tools.simulator.driving import step_covariance
 

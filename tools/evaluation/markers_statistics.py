@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
+from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
-from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from tools.simulator.markers.samples import SampleFrame
 from tools.simulator.markers.truth import MarkerTruth
 
@@ -200,18 +200,12 @@ def table_of(frames: Sequence[ScoredFrame]) -> Table:
     return Table(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
 
 
-#: Limits of the bins of each quantity.
-BINS: dict[str, tuple[float, ...]] = {
-    "width_px": (12, 16, 20, 28, 40, 60, 90, 130, 200),
-    "slant_deg": (0, 15, 30, 45, 60, 70),
-    "blur_px": (0.3, 0.5, 0.8, 1.3, 2.0, 3.0),
-    "contrast_grey": (10, 20, 35, 60, 100, 200),
-}
-TITLES = {
-    "width_px": "width / px",
-    "slant_deg": "slant / deg",
-    "blur_px": "blur / px",
-    "contrast_grey": "contrast / grey levels",
+#: What each quantity is called, and the limits of its bins.
+BINS: dict[str, tuple[str, tuple[float, ...]]] = {
+    "width_px": ("width / px", (12, 16, 20, 28, 40, 60, 90, 130, 200)),
+    "slant_deg": ("slant / deg", (0, 15, 30, 45, 60, 70)),
+    "blur_px": ("blur / px", (0.3, 0.5, 0.8, 1.3, 2.0, 3.0)),
+    "contrast_grey": ("contrast / grey levels", (10, 20, 35, 60, 100, 200)),
 }
 
 # A bin in which fewer markers were found says nothing of their errors.
@@ -254,11 +248,11 @@ def binned(table: Table) -> list[Bin]:
     """Figures of all markers that are clearly in view, and by bins of each quantity."""
     clear = table.columns["clear"] > 0.0
     bins = [_bin(table, clear, "all")]
-    for quantity, limits in BINS.items():
+    for quantity, (title, limits) in BINS.items():
         values = table.columns[quantity]
         for low, high in itertools.pairwise(limits):
             inside = (values >= low) & ((values < high) | (values == limits[-1]) & (values == high))
-            bins.append(_bin(table, clear & inside, f"{TITLES[quantity]} {low:g}-{high:g}"))
+            bins.append(_bin(table, clear & inside, f"{title} {low:g}-{high:g}"))
     return bins
 
 

@@ -27,7 +27,7 @@ from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_step
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import DiscTable, cached_disc_table
-from tools.arrays import BoolArray, ByteArray, Float32Array, FloatArray
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
 from tools.evaluation.disturbed import BLURRED, Stage, render_scene
 

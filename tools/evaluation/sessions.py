@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.clock import ClockSegment, read_clock
@@ -38,7 +39,6 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
-from tools.arrays import BoolArray, FloatArray
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings

@@ -13,8 +13,8 @@ from detect.discs.evidence import evidence_of
 from detect.discs.fit import RESULT, fit_disc, fit_settings, fitted_positions
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, Effort, FitSettings
+from redetect.array_types import ByteArray, FloatArray
 from redetect.compiled import kernel
-from tools.arrays import ByteArray, FloatArray
 
 _BLUR_PX = 0.6
 

@@ -13,10 +13,10 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from detect.seen import image_positions
 from detect.sources.image_files import image_name
+from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.models import disc_in_robot
-from tools.arrays import FloatArray
 
 #: An error of the image smaller than this is not believed, pixels along u.
 _LEAST_SIGMA_PX = 0.3

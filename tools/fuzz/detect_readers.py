@@ -28,9 +28,9 @@ from detect.sources.interface import (
 )
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
+from redetect.array_types import ByteArray
 from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
-from tools.arrays import ByteArray
 from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader
 
 #: Images are read for a calibration of this size.

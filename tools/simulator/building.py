@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.arrays import ByteArray, FloatArray
+from redetect.array_types import ByteArray, FloatArray
 from tools.simulator.scene import (
     CEILING_M,
     Construction,

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from camera import Camera
 from camera.uncertainty import with_pose
+from redetect.array_types import FloatArray
 from redetect.groundtruth.trajectories.transforms import transform
 from redetect.landmarks import Step
 from redetect.plane import between
-from tools.arrays import FloatArray
 
 
 def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:

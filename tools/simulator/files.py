@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from redetect.array_types import ByteArray
 from redetect.storage import write_whole
-from tools.arrays import ByteArray
 
 
 def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:

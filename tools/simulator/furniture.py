@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 from tools.simulator.building import (
     CORRIDOR_M,
     HALF_CORRIDOR_M,
@@ -385,7 +385,8 @@ def _lookalike(label: str, x: float, y: float, rng: np.random.Generator) -> Floo
 
 def _low_segments(building: Construction) -> FloatArray:
     """(K, 4) ground plan of everything upright that reaches the floor."""
-    low = [c for c in building.corners if c[:, 2].min() < 0.02 and np.ptp(c[:, 2]) > 0.02]
+    z = (corners := building.corners())[:, :, 2]
+    low = corners[(z.min(axis=1) < 0.02) & (np.ptp(z, axis=1) > 0.02)]
     return np.array([[*c[0, :2], *c[1, :2]] for c in low]).reshape(-1, 4)
 
 

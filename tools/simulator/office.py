@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.arrays import BoolArray, FloatArray
+from redetect.array_types import BoolArray, FloatArray
 from tools.simulator.building import (
     DEPTH_M,
     DOOR_HEIGHT_M,

@@ -1,4 +1,4 @@
-"""Numba kernels that cast rays through a scene and shade what they meet.
+"""Numba kernels that cast rays through a scene, shade what they meet, and bake a scene's light.
 
 Rays go through a grid of upright and level parallelograms; textures, marks on the floor and baked
 light decide what comes back.
@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
-from tools.arrays import BoolArray, FloatArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray
 from tools.simulator.scene import Flooring, Mark, Scene, Texture
 
-_GLASS = float(Texture.WINDOW)
+# Textures that a ray may go through. Numba compiles a kernel anew for each integer or truth value
+# that is written into a call, but not for each float: so the seeds of textures are floats.
+_GLASS, NOTHING = float(Texture.WINDOW), -1.0
 _FAR = 1e30
 _NEAR = 1e-6
 
@@ -26,9 +29,9 @@ def nearest_quad(
     ox: float, oy: float, oz: float,
     dx: float, dy: float, dz: float,
     limit: float,
-    through_glass: bool,
+    clear: float,
 ) -> tuple[int, float]:  # fmt: skip
-    """First parallelogram that a ray meets, and where."""
+    """First parallelogram that a ray meets, and where; it goes through the texture `clear`."""
     quads = scene.quads
     start, items = scene.quad_start, scene.quad_items
     x0, y0, side = scene.grid[0], scene.grid[1], scene.grid[2]
@@ -77,7 +80,7 @@ def nearest_quad(
             r = quads[q, 8] * x + quads[q, 9] * y + quads[q, 10] * z - quads[q, 11]
             if r < 0.0 or r > 1.0:
                 continue
-            if through_glass and scene.surfaces[q].texture == _GLASS:
+            if scene.surfaces[q].texture == clear:
                 continue
             best, found = t, q
         beyond = min(next_x, next_y)
@@ -107,7 +110,7 @@ def points_visible(scene: Scene, eye: FloatArray, points: FloatArray, slack_m: f
         dz = points[k, 2] - eye[2]
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         limit = max(1.0 - slack_m / max(distance, 1e-9), 0.0)
-        found, _ = nearest_quad(scene, eye[0], eye[1], eye[2], dx, dy, dz, limit, False)
+        found, _ = nearest_quad(scene, eye[0], eye[1], eye[2], dx, dy, dz, limit, NOTHING)
         visible[k] = found < 0
     return visible
 
@@ -132,7 +135,7 @@ def sees_sun(scene: Scene, x: float, y: float, z: float) -> bool:
         row, column = raster_index(scene, x + t * dx, y + t * dy)
         if scene.indoors[row, column] == 1:
             return False
-    found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, True)
+    found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 50.0, _GLASS)
     return found < 0
 
 
@@ -153,16 +156,16 @@ _CEILING_ALBEDO = 0.80
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _hashed(ix: int, iy: int, seed: int) -> float:
+def _hashed(ix: int, iy: int, seed: float) -> float:
     """A number in [0, 1) that looks random and depends on nothing but the arguments."""
-    h = (ix * 374761393 + iy * 668265263 + seed * 974634777) & 0xFFFFFFFF
+    h = (ix * 374761393 + iy * 668265263 + int(seed) * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
     return (h ^ (h >> 15)) / 4294967296.0
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _noise(x: float, y: float, seed: int) -> float:
+def _noise(x: float, y: float, seed: float) -> float:
     """Smooth noise in [-1, 1] with features of size 1."""
     fx, fy = np.floor(x), np.floor(y)
     ix, iy = int(fx), int(fy)
@@ -181,7 +184,7 @@ def _seen(feature_m: float, footprint_m: float) -> float:
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _grain(x: float, y: float, size: float, seed: int, footprint_m: float) -> float:
+def _grain(x: float, y: float, size: float, seed: float, footprint_m: float) -> float:
     keep = _seen(size, footprint_m)
     return 0.0 if keep < 0.05 else keep * _noise(x / size, y / size, seed)
 
@@ -207,7 +210,7 @@ def _photograph(scene: Scene, layer: int, s: float, t: float, footprint: float) 
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _text(x: float, y: float, seed: int, footprint_m: float) -> float:
+def _text(x: float, y: float, seed: float, footprint_m: float) -> float:
     """Share of ink of lines of print; x to the right, y upward, metres."""
     line = np.floor(y / 0.012)
     keep = _seen(0.006, footprint_m)
@@ -222,20 +225,20 @@ def _text(x: float, y: float, seed: int, footprint_m: float) -> float:
 def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprint: float) -> float:
     row = scene.surfaces[q]
     texture, albedo, parameter = int(row.texture), row.albedo, row.parameter  # fmt: skip
-    width, height, seed = row.width, row.height, int(row.seed)
+    width, height, seed = row.width, row.height, row.seed
     x, y = s * width, t * height
     if texture == _WALL:
         if z < 0.09:  # skirting
             return parameter
         rough = _grain(x, z, 0.9, seed, footprint) * 0.03
-        rough += _grain(x, z, 0.12, seed + 1, footprint) * 0.025
+        rough += _grain(x, z, 0.12, seed + 1.0, footprint) * 0.025
         scuff = 0.0
         if z < 0.5:
-            scuff = 0.10 * max(_grain(x, 3.0 * z, 0.25, seed + 2, footprint) - 0.3, 0.0)
+            scuff = 0.10 * max(_grain(x, 3.0 * z, 0.25, seed + 2.0, footprint) - 0.3, 0.0)
         return albedo * (1.0 + rough - scuff)
     if texture == _WOOD:
-        rings = _noise(x / 0.035 + 1.2 * _noise(x / 0.2, y / 0.9, seed), y / 0.8, seed + 1)
-        fine = _grain(x, y / 12.0, 0.008, seed + 2, footprint)
+        rings = _noise(x / 0.035 + 1.2 * _noise(x / 0.2, y / 0.9, seed), y / 0.8, seed + 1.0)
+        fine = _grain(x, y / 12.0, 0.008, seed + 2.0, footprint)
         return albedo * (1.0 + 0.14 * rings * _seen(0.02, footprint) + 0.08 * fine)
     if texture == _PHOTOGRAPH:
         border = parameter
@@ -243,7 +246,7 @@ def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprin
             return albedo
         u = (x - border) / (width - 2.0 * border)
         v = (y - border) / (height - 2.0 * border)
-        layer = seed % scene.photographs.shape[0]
+        layer = int(seed) % scene.photographs.shape[0]
         return 0.04 + 0.85 * _photograph(scene, layer, u, v, footprint / width)
     if texture == _PAPER:
         margin = 0.12 * min(width, height)
@@ -255,7 +258,7 @@ def _surface_albedo(scene: Scene, q: int, s: float, t: float, z: float, footprin
         joint *= _seen(0.02, footprint)
         return albedo * (1.0 - 0.35 * joint + 0.08 * _grain(x, y, 0.3, seed, footprint))
     if texture == _FOLIAGE:
-        leaves = _grain(x, y, 0.05, seed, footprint) + _grain(x, y, 0.17, seed + 1, footprint)
+        leaves = _grain(x, y, 0.05, seed, footprint) + _grain(x, y, 0.17, seed + 1.0, footprint)
         return albedo * max(1.0 + 0.7 * leaves, 0.1)
     if texture == _METAL:
         return albedo * (1.0 + 0.03 * _grain(x, y, 0.4, seed, footprint))
@@ -268,34 +271,34 @@ def _floor_albedo(scene: Scene, kind: int, x: float, y: float, footprint: float)
     texture, albedo, contrast, pitch = (
         int(row.kind), row.albedo, row.contrast, row.pitch
     )  # fmt: skip
-    stains = 0.25 * _grain(x, y, 1.3, 11, footprint) + 0.2 * _grain(x, y, 0.31, 12, footprint)
+    stains = 0.25 * _grain(x, y, 1.3, 11.0, footprint) + 0.2 * _grain(x, y, 0.31, 12.0, footprint)
     if texture == _LINOLEUM:
-        speckle = _grain(x, y, 0.012, 13, footprint) + 0.6 * _grain(x, y, 0.05, 14, footprint)
+        speckle = _grain(x, y, 0.012, 13.0, footprint) + 0.6 * _grain(x, y, 0.05, 14.0, footprint)
         seam = 0.0
         if pitch > 0.0 and abs(x - pitch * np.rint(x / pitch)) < 0.004:
             seam = _seen(0.008, footprint)
         return albedo * (1.0 + contrast * (speckle + stains) - 0.3 * seam)
     if texture == _CARPET:
-        pile = _grain(x, y, 0.008, 15, footprint) + _grain(x, y, 0.025, 16, footprint)
+        pile = _grain(x, y, 0.008, 15.0, footprint) + _grain(x, y, 0.025, 16.0, footprint)
         return albedo * (1.0 + contrast * (1.3 * pile + stains))
     if texture == _PARQUET:
         plank = np.floor(x / pitch)
         end = np.floor(y / (6.0 * pitch) + 0.5 * plank)
-        tone = 2.0 * _hashed(int(plank), int(end), 17) - 1.0
-        grain = _grain(12.0 * x, y, 0.1, 18, footprint)
+        tone = 2.0 * _hashed(int(plank), int(end), 17.0) - 1.0
+        grain = _grain(12.0 * x, y, 0.1, 18.0, footprint)
         groove = 1.0 if (x / pitch - plank) * pitch < 0.003 else 0.0
         fine = 0.5 * grain - 1.2 * groove * _seen(0.006, footprint)
         return albedo * (1.0 + contrast * (tone * _seen(pitch, footprint) + fine))
     if texture in (_TILES, _PAVING):
         column, line = np.floor(x / pitch), np.floor(y / pitch)
-        tone = 2.0 * _hashed(int(column), int(line), 19) - 1.0
+        tone = 2.0 * _hashed(int(column), int(line), 19.0) - 1.0
         groove = 0.004 if texture == _TILES else 0.008
         near = min(x / pitch - column, y / pitch - line) * pitch
         joint = _seen(2.0 * groove, footprint) if near < groove else 0.0
-        grit = _grain(x, y, 0.015, 20, footprint)
+        grit = _grain(x, y, 0.015, 20.0, footprint)
         fine = 0.4 * tone * _seen(pitch, footprint) + 0.5 * grit + stains - 3.0 * joint
         return max(albedo * (1.0 + contrast * fine), 0.02)
-    blades = _grain(x, y, 0.02, 21, footprint) + _grain(x, y, 0.09, 22, footprint)
+    blades = _grain(x, y, 0.02, 21.0, footprint) + _grain(x, y, 0.09, 22.0, footprint)
     return max(albedo * (1.0 + contrast * (blades + stains)), 0.02)
 
 
@@ -328,7 +331,7 @@ def _mark_share(scene: Scene, m: int, x: float, y: float) -> tuple[float, float]
     if abs(a) > radius or abs(b) > second:
         return 0.0, 0.0
     if shape == _PRINTED and abs(a) < 0.85 * radius and abs(b) < 0.9 * second:
-        return 1.0, albedo * (1.0 - 0.7 * _text(a, b, m, 0.004))
+        return 1.0, albedo * (1.0 - 0.7 * _text(a, b, float(m), 0.004))
     return 1.0, albedo
 
 
@@ -381,7 +384,7 @@ def first_met(
             row, column = raster_index(scene, ox + up * dx, oy + up * dy)
             if scene.indoors[row, column] == 1:
                 limit, met = up, CEILING
-    quad, distance = nearest_quad(scene, ox, oy, oz, dx, dy, dz, limit, False)
+    quad, distance = nearest_quad(scene, ox, oy, oz, dx, dy, dz, limit, NOTHING)
     if quad >= 0:
         return quad, distance
     return met, limit
@@ -458,10 +461,122 @@ def _floor_radiance(
             if int(scene.marks[mark].shape) == _LIGHT_SPOT:
                 light += share * shown
             else:
-                albedo = shown * (1.0 + 0.03 * _grain(x, y, 0.05, mark, footprint))
+                albedo = shown * (1.0 + 0.03 * _grain(x, y, 0.05, float(mark), footprint))
                 gloss = scene.marks[mark].gloss
                 seen = -10 - mark
     if scene.sun_reach[cell[0], cell[1]] == 1 and sees_sun(scene, x, y, 1e-3):
         light += scene.sun[3] * scene.sun[2]
     mirrored = gloss * (0.04 + 0.96 * (1.0 - cosine) ** 5)
     return albedo * light, seen, mirrored
+
+
+@nb.njit(cache=True, error_model="numpy")
+def light_along(
+    scene: Scene, origins: FloatArray, directions: FloatArray, pixel_angle: float
+) -> tuple[Float32Array, NDArray[np.int32], Float32Array, Float32Array]:
+    """What comes back along rays: light, what they met, its mirrored share, and how far it is.
+
+    `origins`, `directions` (N, 3), the lengths of which are the unit of the distances;
+    `pixel_angle`: of what a ray stands for (rad). Returns four arrays (N,).
+    """
+    count = len(directions)
+    light = np.empty(count, dtype=np.float32)
+    seen = np.empty(count, dtype=np.int32)
+    mirrored = np.empty(count, dtype=np.float32)
+    distance = np.empty(count, dtype=np.float32)
+    for k in range(count):
+        ox, oy, oz = origins[k, 0], origins[k, 1], origins[k, 2]
+        dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
+        met, far = first_met(scene, ox, oy, oz, dx, dy, dz)
+        light[k], seen[k], mirrored[k] = radiance(
+            scene, ox, oy, oz, dx, dy, dz, met, far, pixel_angle
+        )
+        distance[k] = far
+    return light, seen, mirrored, distance
+
+
+_LAMP_REACH_M = 8.0
+_UPRIGHT_HEIGHT_M = 1.2
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _returned(scene: Scene, met: int) -> float:
+    """Light that comes back from a thing, roughly: what its own light is is not known yet."""
+    if met == SKY:
+        return scene.sky
+    if met == CEILING:
+        return 0.30
+    if met == FLOOR:
+        return 0.20
+    if scene.surfaces[met].texture == _GLASS:
+        return min(scene.surfaces[met].emission, 4.0)
+    if scene.surfaces[met].emission > 0.0:
+        return 0.0  # lamps are dealt with one by one
+    return 0.42 * scene.surfaces[met].albedo
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _lamp_light(scene: Scene, lamps: FloatArray, x: float, y: float, z: float) -> float:
+    """Light of the lamps on a level surface; two points of each lamp soften the shadows."""
+    total = 0.0
+    for k in range(lamps.shape[0]):
+        if abs(lamps[k, 0] - x) > _LAMP_REACH_M or abs(lamps[k, 1] - y) > _LAMP_REACH_M:
+            continue
+        for end in range(-1, 2, 2):
+            dx = lamps[k, 0] + 0.3 * end * lamps[k, 3] - x
+            dy = lamps[k, 1] + 0.3 * end * lamps[k, 4] - y
+            dz = lamps[k, 2] - z
+            squared = dx * dx + dy * dy + dz * dz
+            found, _ = nearest_quad(scene, x, y, z, dx, dy, dz, 0.99, NOTHING)
+            if found < 0:
+                area = lamps[k, 3] * lamps[k, 4]
+                total += 0.5 * lamps[k, 5] * area * dz * dz / (np.pi * squared * squared)
+    return total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def bake_light(scene: Scene, lamps: FloatArray, floor_rays: FloatArray, azimuths: int) -> None:
+    """Fill in ``floor_light``, ``side_light`` and ``sun_reach`` of a scene.
+    `lamps` (L, 6); `floor_rays` (R, 3).
+    """
+    rows, columns = scene.floor_kind.shape
+    for i in range(rows):
+        for j in range(columns):
+            x = scene.grid[0] + (j + 0.5) * scene.raster_m
+            y = scene.grid[1] + (i + 0.5) * scene.raster_m
+            outdoors = scene.indoors[i, j] == 0
+            every = 4 if outdoors else 1
+            total, count = 0.0, 0
+            for k in range(0, floor_rays.shape[0], every):
+                met, _ = first_met(
+                    scene, x, y, 0.005, floor_rays[k, 0], floor_rays[k, 1], floor_rays[k, 2]
+                )
+                total += _returned(scene, met)
+                count += 1
+            direct = 0.0 if outdoors else _lamp_light(scene, lamps, x, y, 0.005)
+            scene.floor_light[i, j] = total / count + direct
+            # A place the sun misses may still lie beside one that it reaches.
+            for k in range(9):
+                off_x, off_y = 0.5 * (k % 3 - 1), 0.5 * (k // 3 - 1)
+                if sees_sun(scene, x + off_x * scene.raster_m, y + off_y * scene.raster_m, 0.005):
+                    scene.sun_reach[i, j] = 1
+                    break
+            if i % 2 == 1 or j % 2 == 1:
+                continue
+            mean, along_x, along_y, count = 0.0, 0.0, 0.0, 0
+            for a in range(azimuths):
+                c, s = np.cos(2.0 * np.pi * a / azimuths), np.sin(2.0 * np.pi * a / azimuths)
+                for rise in (-0.4, 0.02, 0.45):
+                    met, _ = first_met(scene, x, y, _UPRIGHT_HEIGHT_M, c, s, rise)
+                    back = _returned(scene, met)
+                    mean += back
+                    along_x += c * back
+                    along_y += s * back
+                    count += 1
+            high = 0.0 if outdoors else _lamp_light(scene, lamps, x, y, _UPRIGHT_HEIGHT_M)
+            for di in range(2):
+                for dj in range(2):
+                    if i + di < rows and j + dj < columns:
+                        scene.side_light[i + di, j + dj, 0] = mean / count + 0.35 * high
+                        scene.side_light[i + di, j + dj, 1] = 1.6 * along_x / count
+                        scene.side_light[i + di, j + dj, 2] = 1.6 * along_y / count

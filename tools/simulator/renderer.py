@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import lens_numbers
+from camera.uncertainty import IDENTITY
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.trajectories.transforms import planar_transform
-from tools.arrays import ByteArray, Float32Array, FloatArray
 from tools.simulator.scene import Scene
 
-_INVERSE_NODES = 16384
 _RAYS_ACROSS_EDGES = 12
 _EDGE_CONTRAST = 0.035
 _MIRROR_STRIDE = 2
 _MIRROR_BLUR = (1.5, 2.5)  # standard deviations along u and v, in strides
+_ABOVE_FLOOR_M = 1e-4
+_SKY_M = 1e4
 
 
 class Light(NamedTuple):
@@ -29,35 +31,18 @@ class Light(NamedTuple):
     depth: Float32Array  # (2 H, W) depth along the optical axis (m).
 
 
-@dataclass(frozen=True)
-class Optics:
-    """The camera's projection as the ray caster takes it."""
-
-    numbers: FloatArray
-    """scaleX, scaleY, offsetX, offsetY, nodes of `inverse` per unit of squared radius, and
-    `camera.kernels.lens_numbers`."""
-    inverse: FloatArray
-    """Undistorted over distorted radius at equal steps of the squared distorted radius, by the
-    radial distortion."""
+@lru_cache(maxsize=4)
+def _pixel_rays(lens: Camera) -> FloatArray:
+    """(2 H, W, 3) directions in the camera frame that the pixels of the full frame see."""
+    places = np.meshgrid(np.arange(lens.width), 0.5 * np.arange(2 * lens.height))
+    return _rays(lens, np.stack(places, axis=-1))
 
 
-def optics_of(camera: Camera) -> Optics:
-    """Tabulate the inverse of a camera's distortion over its image."""
-    u = np.array([-1.0, camera.width]) - camera.offset_x
-    v = np.array([-1.0, camera.height + 0.5]) - camera.offset_y
-    reach = np.hypot(np.abs(u).max() / camera.scale_x, np.abs(v).max() / camera.scale_y)
-    radius = np.sqrt(np.linspace(0.0, reach * reach, _INVERSE_NODES))
-    pixels = np.stack(
-        [camera.offset_x + camera.scale_x * radius, np.full_like(radius, camera.offset_y)], axis=-1
-    )
-    ratio = np.ones_like(radius)
-    radial = replace(camera, tangential=(0.0, 0.0))
-    ratio[1:] = radial.undistort(pixels)[1:, 0] / radius[1:]
-    if np.isnan(ratio).any():
+def _rays(camera: Camera, pixels: FloatArray) -> FloatArray:
+    rays = camera.unproject(pixels)
+    if np.isnan(rays).any():
         raise ValueError("the camera's image reaches past the fold of its distortion")
-    numbers = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
-    per_unit = (_INVERSE_NODES - 1) / (reach * reach)
-    return Optics(np.array([*numbers, per_unit, *lens_numbers(camera)]), ratio)
+    return rays
 
 
 def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:
@@ -67,21 +52,37 @@ def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:
 
 
 def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
-    """Cast the rays of one frame. `pose` (3,)."""
+    """Cast the rays of one frame, more of them through pixels across an edge. `pose` (3,)."""
     from scipy.ndimage import gaussian_filter
 
-    from tools.simulator.frame_kernels import render_mirrored, render_radiance
+    from tools.simulator.ray_kernels import light_along
 
-    optics = optics_of(camera)
     world_from_camera = camera_in_world(camera, pose)
-    light, seen, mirrored, depth = render_radiance(
-        scene, optics.numbers, optics.inverse, world_from_camera, camera.width, 2 * camera.height,
-        _ray_offsets(_RAYS_ACROSS_EDGES), _EDGE_CONTRAST,
-    )  # fmt: skip
-    if mirrored.any():
-        image, weight = render_mirrored(
-            scene, optics.numbers, optics.inverse, world_from_camera, mirrored, _MIRROR_STRIDE
-        )
+    eye, angle = world_from_camera[:, 3], 1.0 / camera.scale_x
+
+    def cast(rays: FloatArray) -> list[Any]:
+        directions = (rays @ world_from_camera[:, :3].T).reshape(-1, 3)
+        found = light_along(scene, np.tile(eye, (len(directions), 1)), directions, angle)
+        return [values.reshape(rays.shape[:-1]) for values in found]
+
+    rays = _pixel_rays(replace(camera, robot_from_camera=IDENTITY))
+    light, seen, mirrored, depth = cast(rays)
+    edges = _across_edges(light, seen)
+    line, u = np.nonzero(edges)
+    offsets = _ray_offsets(_RAYS_ACROSS_EDGES)
+    places = u[:, None] + offsets[:, 0], 0.5 * (line[:, None] + offsets[:, 1])
+    several, _, glossy, _ = cast(_rays(camera, np.stack(places, axis=-1)))
+    light[edges], mirrored[edges] = several.mean(axis=1), glossy.mean(axis=1)
+    coarse = slice(None, None, _MIRROR_STRIDE)
+    directions = rays[coarse, coarse] @ world_from_camera[:, :3].T
+    reflecting = (mirrored[coarse, coarse] > 0.0) & (directions[..., 2] < 0.0)
+    if reflecting.any():
+        down = directions[reflecting]
+        floor = eye - (eye[2] / down[:, 2:]) * down
+        floor[:, 2] = _ABOVE_FLOOR_M
+        weight = reflecting.astype(np.float32)
+        image = np.zeros_like(weight)
+        image[reflecting] = light_along(scene, floor, down * [1.0, 1.0, -1.0], 8.0 * angle)[0]
         # A floor mirrors blurred; where it ends, nothing of the wall may be mixed in.
         blur = (_MIRROR_BLUR[1], _MIRROR_BLUR[0])
         share = np.maximum(gaussian_filter(weight, blur), 1e-6)
@@ -90,25 +91,47 @@ def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
     return Light(light, seen, depth)
 
 
+def _across_edges(light: Float32Array, seen: NDArray[np.int32]) -> BoolArray:
+    """Which pixels differ from a neighbour in what they see, or in its light."""
+    across = np.zeros(light.shape, dtype=np.bool_)
+    for first, second in ((np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:])):
+        a, b = light[first], light[second]
+        differ = (seen[first] != seen[second]) | (np.abs(a - b) > _EDGE_CONTRAST * (a + b))
+        across[first] |= differ
+        across[second] |= differ
+    return across
+
+
 def smeared(
     light: Light, camera: Camera, pose: FloatArray, pose_at_end: FloatArray
 ) -> Float32Array:
-    """Motion blur of an exposure that is at `pose` in its middle and at `pose_at_end` at its end.
+    """Motion blur of an exposure that is at `pose` in its middle and at `pose_at_end` at its end:
+    the mean along each pixel's path.
 
     Both are robot poses (x, y, heading) in the world.
     """
-    from tools.simulator.frame_kernels import smear
+    from scipy.ndimage import map_coordinates
 
-    optics = optics_of(camera)
+    from tools.simulator.ray_kernels import SKY
+
     now, later = camera_in_world(camera, pose), camera_in_world(camera, pose_at_end)
-    rotation = later[:, :3].T @ now[:, :3]
-    shift = later[:, :3].T @ (now[:, 3] - later[:, 3])
-    return np.asarray(
-        smear(
-            light.radiance, light.seen, light.depth, optics.numbers, optics.inverse,
-            np.ascontiguousarray(np.column_stack([rotation, shift])),
-        )
-    )  # fmt: skip
+    rays = _pixel_rays(replace(camera, robot_from_camera=IDENTITY))
+    depth = np.where(light.seen == SKY, _SKY_M, light.depth)
+    points = (rays * depth[..., None]) @ now[:, :3].T + now[:, 3]
+    ends = camera.project((points - later[:, 3]) @ later[:, :3])
+    places = np.indices(depth.shape).reshape(2, -1)
+    # What leaves the sight stays where it is.
+    way = np.nan_to_num((ends[..., ::-1] * [2.0, 1.0]).reshape(-1, 2).T - places)
+    steps = np.ceil(2.0 * np.hypot(*way)).astype(np.int64)
+    total = light.radiance.ravel().astype(np.float64)
+    for step in range(1, steps.max() + 1):
+        moving = steps >= step
+        off = (step / steps[moving]) * way[:, moving]
+        for side in (-off, off):
+            total[moving] += map_coordinates(
+                light.radiance, places[:, moving] + side, order=1, mode="nearest"
+            )
+    return np.asarray((total / (2 * steps + 1)).reshape(depth.shape), dtype=np.float32)
 
 
 def _ray_offsets(count: int) -> FloatArray:

@@ -11,8 +11,8 @@ import numpy as np
 
 from camera import Camera, parse_camera, write_camera
 from camera.uncertainty import exact
+from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
-from tools.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from tools.published_camera import PUBLISHED_CAM
 from tools.simulator.building import EXTENT
 from tools.simulator.driving import (
@@ -312,28 +312,24 @@ def write_beside(
     plan: RunPlan, folder: Path, what: str, truths: Sequence[FrameTruth], *, overwrite: bool
 ) -> None:
     """Write what is in view besides the listed discs, as `detect compare` reads it."""
-    unlisted, lookalikes = [], []
-    for truth in truths:
-        unlisted.append(tuple(_nominal_row(disc) for disc in truth.discs if not disc.listed))
-        lookalikes.append(tuple(_nominal_row(disc) for disc in truth.lookalikes))
+    unlisted = [tuple(_nominal_row(d) for d in truth.discs if not d.listed) for truth in truths]
+    lookalikes = [tuple(map(_nominal_row, truth.lookalikes)) for truth in truths]
     for name, text, rows in (
         ("unlisted.circles", _UNLISTED_FORMAT, unlisted),
         ("lookalikes.circles", _LOOKALIKE_FORMAT, lookalikes),
     ):
         _write_landmarks(plan, folder / name, what, text, rows, overwrite)
-    edges = [
-        tuple(line_row(edge, plan.camera) for edge in truth.edges if _shows(edge))
-        for truth in truths
-    ]
     if any(truth.edges for truth in truths):
+        edges = [
+            tuple(line_row(e, plan.camera) for e in truth.edges if not e.listed and _shows(e))
+            for truth in truths
+        ]
         place = folder / "unlisted.lines"
         _write_landmarks(plan, place, what, _UNLISTED_LINES_FORMAT, edges, overwrite)
 
 
 def _shows(edge: SeenEdge) -> bool:
-    """Whether an edge that is not listed shows in the image."""
-    shows = abs(edge.contrast) >= _LEAST_STEP and edge.rows >= _LEAST_ROWS
-    return shows and not edge.listed
+    return abs(edge.contrast) >= _LEAST_STEP and edge.rows >= _LEAST_ROWS
 
 
 def _nominal_row(disc: SeenDisc) -> CircleLandmark:

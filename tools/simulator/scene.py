@@ -6,6 +6,7 @@ turns into it by a rotation about z and a shift: a robot at heading 0 looks alon
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import lru_cache
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 
 class Texture(IntEnum):
@@ -173,9 +174,8 @@ class FloorMark:
 class Construction:
     """A world while it is being built."""
 
-    quads: list[list[Any]] = field(default_factory=list)
-    surfaces: list[list[float]] = field(default_factory=list)
-    corners: list[FloatArray] = field(default_factory=list)
+    quads: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
     edges: list[UprightEdge] = field(default_factory=list)
     marks: list[FloorMark] = field(default_factory=list)
     lamps: list[list[float]] = field(default_factory=list)
@@ -185,24 +185,14 @@ class Construction:
 
     def quad(self, origin: FloatArray, a: FloatArray, b: FloatArray, look: Look) -> None:
         """Add the rectangle with a corner `origin` and the edges `a` and `b` (m)."""
-        normal = np.array(
-            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-        )
-        normal = normal / np.linalg.norm(normal)
-        s, t = a / (a @ a), b / (b @ b)
-        self.quads.append([*normal, normal @ origin, *s, s @ origin, *t, t @ origin])
-        width, height = float(np.linalg.norm(a)), float(np.linalg.norm(b))
-        seed = len(self.quads) * 7919 % 1000003
-        self.surfaces.append(
-            [look.texture, look.albedo, look.parameter, look.emission, width, height, seed]
-        )
-        self.corners.append(np.array([origin, origin + a, origin + b, origin + a + b]))
+        self.quads.append((origin, a, b))
+        self.looks.append(look)
 
     def upright(
         self, start: FloatArray, end: FloatArray, z0: float, z1: float, look: Look, label: str = ""
     ) -> None:
         """Add an upright rectangle above the segment start-end; its sides are edges if labelled."""
-        if z1 - z0 <= 1e-9 or np.linalg.norm(end - start) <= 1e-9:
+        if z1 - z0 <= 1e-9 or math.dist(start, end) <= 1e-9:
             return
         self.quad(
             np.array([*start, z0]),
@@ -277,6 +267,15 @@ class Construction:
                     x, y = a0 + s * along_a
                     self.edges.append(UprightEdge(float(x), float(y), 0.0, CEILING_M, "corner"))
 
+    def sides(self) -> FloatArray:
+        """(3, Q, 3) a corner of each rectangle and both edges from there."""
+        return np.moveaxis(np.array(self.quads).reshape(-1, 3, 3), 1, 0)
+
+    def corners(self) -> FloatArray:
+        """(Q, 4, 3) corners of all rectangles."""
+        origin, a, b = self.sides()
+        return np.stack([origin, origin + a, origin + b, origin + a + b], axis=1)
+
     def distinct_edges(self) -> list[UprightEdge]:
         """All edges, those at one place (1 mm) with touching heights joined."""
         piles: dict[tuple[int, int], list[UprightEdge]] = {}
@@ -315,14 +314,14 @@ def make_scene(
     """
     from scipy.ndimage import gaussian_filter
 
-    from tools.simulator.frame_kernels import bake_light
+    from tools.simulator.ray_kernels import bake_light
 
     x0, y0, x1, y1 = extent
     columns, rows = int(np.ceil((x1 - x0) / _CELL_M)), int(np.ceil((y1 - y0) / _CELL_M))
     grid = np.array([x0, y0, _CELL_M, columns, rows])
-    quad_boxes = np.array(
-        [[*c[:, :2].min(axis=0), *c[:, :2].max(axis=0)] for c in building.corners]
-    ).reshape(-1, 4)
+    quads, surfaces = _rectangles(building)
+    corners = building.corners()[:, :, :2]
+    quad_boxes = np.hstack([corners.min(axis=1), corners.max(axis=1)])
     marks = np.array(
         [
             [m.shape, m.x, m.y, m.radius, m.second, m.angle, m.albedo, m.gloss, m.reach]
@@ -333,8 +332,8 @@ def make_scene(
     quad_start, quad_items = _sorted_into_cells(quad_boxes, grid)
     mark_start, mark_items = _sorted_into_cells(mark_boxes, grid)
     scene = Scene(
-        quads=np.array(building.quads, dtype=np.float64).reshape(-1, 12),
-        surfaces=_records(building.surfaces, SURFACE),
+        quads=quads,
+        surfaces=surfaces,
         quad_start=quad_start,
         quad_items=quad_items,
         marks=_records(marks, MARK),
@@ -363,6 +362,22 @@ def make_scene(
             [gaussian_filter(scene.side_light[:, :, k], 1.0) for k in range(3)], axis=-1
         ),
     )
+
+
+def _rectangles(building: Construction) -> tuple[FloatArray, Any]:
+    """`quads` and `surfaces` of a `Scene`."""
+    origin, a, b = building.sides()
+    across = np.cross(a, b)
+    axes = [
+        across / np.linalg.norm(across, axis=1, keepdims=True),
+        *(side / np.sum(side**2, axis=1, keepdims=True) for side in (a, b)),
+    ]
+    quads = [np.column_stack([axis, np.sum(axis * origin, axis=1)]) for axis in axes]
+    looks = np.array([(k.texture, k.albedo, k.parameter, k.emission) for k in building.looks])
+    lengths = [np.linalg.norm(side, axis=1) for side in (a, b)]
+    seeds = np.arange(1, len(looks) + 1) * 7919 % 1000003
+    surfaces = np.column_stack([looks.reshape(-1, 4), *lengths, seeds])
+    return np.hstack(quads), _records(surfaces, SURFACE)
 
 
 def raster_shape(extent: tuple[float, float, float, float]) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 
 
 @nb.njit(cache=True)

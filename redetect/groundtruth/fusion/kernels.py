@@ -130,7 +130,8 @@ def move(
 
 
 @kernel()
-def _wrap(angle: float) -> float:
+def wrap(angle: float) -> float:
+    """The same angle in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -152,17 +153,12 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 
 
 @kernel()
-def _squared_innovation(
-    p: FloatArray,
-    measured_covariance: FloatArray,
-    innovation: FloatArray,
-    s: FloatArray,
-    s_inverse: FloatArray,
+def squared_innovation(
+    innovation: FloatArray, s: FloatArray, s_inverse: FloatArray
 ) -> tuple[float, float]:
-    """Normalised square of an innovation, and its covariance's determinant; fills the last two."""
-    for i in range(POSE):
-        for j in range(POSE):
-            s[i, j] = p[i, j] + measured_covariance[i, j]
+    """Normalised square of an innovation with covariance `s`, whose inverse is filled in; and the
+    determinant of `s`.
+    """
     determinant = _invert_3x3(s, s_inverse)
     squared = 0.0
     for i in range(POSE):
@@ -172,32 +168,31 @@ def _squared_innovation(
 
 
 @kernel()
-def _update(
+def take_in(
     x: FloatArray,
     p: FloatArray,
+    common: FloatArray,
     innovation: FloatArray,
     s_inverse: FloatArray,
     gain: FloatArray,
-    temporary: FloatArray,
 ) -> None:
-    """Take a measured pose in; gain and temporary are work space."""
-    for i in range(STATE):
+    """Take a measured pose into a state and its covariance, in place.
+
+    `x`, `p` (d,), (d, d). `common` (d, 3): covariance of the state and what is measured of it.
+    `s_inverse` (3, 3): of the innovation's covariance. `gain` (d, 3): work space.
+    """
+    for i in range(len(x)):
         for j in range(POSE):
             total = 0.0
             for n in range(POSE):
-                total += p[i, n] * s_inverse[n, j]
+                total += common[i, n] * s_inverse[n, j]
             gain[i, j] = total
-    for i in range(STATE):
-        for j in range(POSE):
-            x[i] += gain[i, j] * innovation[j]
-        for j in range(STATE):
+            x[i] += total * innovation[j]
+        for j in range(i + 1):
             total = 0.0
             for n in range(POSE):
-                total += gain[i, n] * p[n, j]
-            temporary[i, j] = total
-    for i in range(STATE):
-        for j in range(i, STATE):
-            p[i, j] -= 0.5 * (temporary[i, j] + temporary[j, i])
+                total += gain[i, n] * common[j, n]
+            p[i, j] -= total
             p[j, i] = p[i, j]
 
 
@@ -247,6 +242,16 @@ def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
     )
 
 
+# Element by element: Numba compiles an assignment of arrays with its error's text, for seconds.
+@kernel()
+def keep(states: FloatArray, covariances: FloatArray, k: int, x: FloatArray, p: FloatArray) -> None:
+    """Write a state and its covariance down as those of a node."""
+    for i in range(len(x)):
+        states[k, i] = x[i]
+        for j in range(len(x)):
+            covariances[k, i, j] = p[i, j]
+
+
 @kernel()
 def filter_forward(
     odometry: Odometry,
@@ -267,7 +272,7 @@ def filter_forward(
     and why. `surprise`: minus twice the logarithm of the likelihood of the accepted innovations.
     """
     controls, nodes = odometry.controls, measured.nodes
-    keep = len(history.predicted) > 0
+    kept = len(history.predicted) > 0
     predicted, predicted_covariance = history.predicted, history.predicted_covariance
     filtered, filtered_covariance = history.filtered, history.filtered_covariance
     transitions = history.transitions
@@ -280,8 +285,8 @@ def filter_forward(
     s = np.empty((POSE, POSE))
     s_inverse = np.empty((POSE, POSE))
     innovation = np.empty(POSE)
+    common = np.empty((STATE, POSE))
     gain = np.empty((STATE, POSE))
-    temporary = np.empty((STATE, STATE))
     m = 0
     rejections = 0
     surprise = 0.0
@@ -293,19 +298,20 @@ def filter_forward(
                 move(x, p, f, controls[k], odometry.variances[k], points[k - 1])
             else:
                 move(x, p, f, controls[k], odometry.variances[k], x.copy())
-            if keep:
-                transitions[k] = f
-        if keep:
-            predicted[k] = x
-            predicted_covariance[k] = p
+            if kept:
+                for i in range(STATE):
+                    for j in range(STATE):
+                        transitions[k, i, j] = f[i, j]
+        if kept:
+            keep(predicted, predicted_covariance, k, x, p)
         while m < nodes.shape[0] and nodes[m] == k:
             for i in range(POSE):
                 innovation[i] = measured.poses[m, i] - x[i]
             if points.shape[0] > 1:
                 ahead = points[k, 2] - x[2]
-                innovation[2] = ahead + _wrap(innovation[2] - ahead)
+                innovation[2] = ahead + wrap(innovation[2] - ahead)
             else:
-                innovation[2] = _wrap(innovation[2])
+                innovation[2] = wrap(innovation[2])
             lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
             if lost or rejections >= gating.restart_after:
                 for i in range(POSE):
@@ -319,30 +325,32 @@ def filter_forward(
                 rejections = 0
                 cut = False
                 restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
-                if keep:
-                    predicted[k] = x
-                    predicted_covariance[k] = p
-                    transitions[k, :POSE] = 0.0
-            squared, determinant = _squared_innovation(
-                p, measured.covariances[m], innovation, s, s_inverse
-            )
+                if kept:
+                    keep(predicted, predicted_covariance, k, x, p)
+                    for i in range(POSE):
+                        for j in range(STATE):
+                            transitions[k, i, j] = 0.0
+            for j in range(POSE):
+                for i in range(STATE):
+                    common[i, j] = p[i, j]
+                for i in range(POSE):
+                    s[i, j] = p[i, j] + measured.covariances[m, i, j]
+            squared, determinant = squared_innovation(innovation, s, s_inverse)
             squared_innovations[m] = squared
             accepted[m] = squared <= gating.largest_squared
             if accepted[m]:
                 rejections = 0
                 surprise += squared + math.log(determinant)
-                _update(x, p, innovation, s_inverse, gain, temporary)
+                take_in(x, p, common, innovation, s_inverse, gain)
             else:
                 rejections += 1
                 surprise += gating.largest_squared + math.log(determinant)
             m += 1
-        if keep:
-            filtered[k] = x
-            filtered_covariance[k] = p
+        if kept:
+            keep(filtered, filtered_covariance, k, x, p)
     return squared_innovations, accepted, restarted, surprise
 
 
-@kernel()
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     """Smooth what a filter left, from the last node to the first (Rauch, Tung, Striebel).
 
@@ -351,23 +359,45 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
 
     Returns `states`, `covariances` (N, d), (N, d, d).
     """
-    predicted, predicted_covariance = history.predicted, history.predicted_covariance
-    filtered, filtered_covariance = history.filtered, history.filtered_covariance
-    transitions = history.transitions
-    smoothed, smoothed_covariance = np.empty_like(filtered), np.empty_like(filtered_covariance)
-    last = predicted.shape[0] - 1
-    smoothed[last] = filtered[last]
-    smoothed_covariance[last] = filtered_covariance[last]
-    for k in range(last - 1, -1, -1):
-        p = filtered_covariance[k]
-        expected = predicted_covariance[k + 1].copy()
-        for i in range(len(expected)):
-            # States without any variance stay as they are.
-            if expected[i, i] == 0.0:
-                expected[i, i] = 1.0
-        gain = np.ascontiguousarray(np.linalg.solve(expected, transitions[k + 1] @ p).T)
-        smoothed[k] = filtered[k] + gain @ (smoothed[k + 1] - predicted[k + 1])
-        change = smoothed_covariance[k + 1] - predicted_covariance[k + 1]
-        spread = p + gain @ change @ gain.T
-        smoothed_covariance[k] = 0.5 * (spread + spread.T)
-    return smoothed, smoothed_covariance
+    expected = history.predicted_covariance[1:].copy()
+    # States without any variance stay as they are.
+    variances = np.einsum("kii->ki", expected)
+    variances[variances == 0.0] = 1.0
+    reached = history.transitions[1:] @ history.filtered_covariance[:-1]
+    gains = np.linalg.solve(expected, reached).swapaxes(1, 2)
+    states, covariances = history.filtered.copy(), history.filtered_covariance.copy()
+    _take_back(
+        states, covariances, np.ascontiguousarray(gains), history.predicted,
+        history.predicted_covariance,
+    )  # fmt: skip
+    return states, covariances
+
+
+@kernel()
+def _take_back(
+    states: FloatArray,
+    covariances: FloatArray,
+    gains: FloatArray,
+    predicted: FloatArray,
+    predicted_covariance: FloatArray,
+) -> None:
+    """Make filtered states and covariances smoothed ones, in place; `gains` (N - 1, d, d)."""
+    count, size = states.shape
+    change = np.empty((size, size))
+    for k in range(count - 2, -1, -1):
+        gain = gains[k]
+        for i in range(size):
+            for j in range(size):
+                states[k, i] += gain[i, j] * (states[k + 1, j] - predicted[k + 1, j])
+                total = 0.0
+                for n in range(size):
+                    total += gain[i, n] * (
+                        covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
+                    )
+                change[i, j] = total
+        for i in range(size):
+            for j in range(i + 1):
+                total = covariances[k, i, j]
+                for n in range(size):
+                    total += change[i, n] * gain[j, n]
+                covariances[k, i, j] = covariances[k, j, i] = total

@@ -23,7 +23,11 @@ from redetect.groundtruth.fusion.kernels import (
     POSE,
     FilterHistory,
     empty_history,
+    keep,
     smooth_backward,
+    squared_innovation,
+    take_in,
+    wrap,
 )
 from redetect.groundtruth.fusion.movement import MovementProblem
 from redetect.groundtruth.trajectories.streams import (
@@ -173,49 +177,67 @@ def _filter(
     minus twice the logarithm of the measurements' likelihood.
     """
     count = len(times_s)
-    variances = np.array([errors[0] ** 2, errors[0] ** 2, errors[1] ** 2])
     x = np.zeros(_STATE)
     p = np.zeros((_STATE, _STATE))
-    for i in range(POSE):
-        p[i, i] = variances[i]
-    for i in range(POSE, _STATE):
-        p[i, i] = alignment_sigmas[i - POSE] ** 2
-    keep = len(history.predicted) > 0
+    for i in range(_STATE):
+        p[i, i] = _variance(errors, i) if i < POSE else alignment_sigmas[i - POSE] ** 2
+    kept = len(history.predicted) > 0
     squared = np.zeros(count)
     surprise = 0.0
-    h = np.zeros((POSE, _STATE))
-    h[0, 0] = h[0, 3] = h[1, 1] = h[1, 4] = h[2, 2] = h[2, 5] = h[2, 6] = 1.0
+    innovation = np.zeros(POSE)
+    common = np.zeros((_STATE, POSE))
+    gain = np.zeros((_STATE, POSE))
+    s = np.zeros((POSE, POSE))
+    s_inverse = np.zeros((POSE, POSE))
+    shares = np.ones(_STATE)
     for k in range(count):
-        f = np.eye(_STATE)
         if k > 0:
             for i in range(POSE):
-                share = math.exp(-(times_s[k] - times_s[k - 1]) / errors[3 if i == 2 else 2])
-                f[i, i] = share
-                x[i] *= share
-                p[i] *= share
-                p[:, i] *= share
-                p[i, i] += variances[i] * (1.0 - share * share)
-        if keep:
-            history.transitions[k] = f
-            history.predicted[k], history.predicted_covariance[k] = x, p
+                shares[i] = math.exp(-(times_s[k] - times_s[k - 1]) / errors[3 if i == 2 else 2])
+            for i in range(_STATE):
+                x[i] *= shares[i]
+                for j in range(_STATE):
+                    p[i, j] *= shares[i] * shares[j]
+            for i in range(POSE):
+                p[i, i] += _variance(errors, i) * (1.0 - shares[i] * shares[i])
+        if kept:
+            for i in range(_STATE):
+                for j in range(_STATE):
+                    history.transitions[k, i, j] = shares[i] if i == j else 0.0
+            keep(history.predicted, history.predicted_covariance, k, x, p)
         if math.isnan(differences[k, 0]):
             squared[k] = math.inf
             surprise += _OUTLIER_SURPRISE
         else:
-            h[0, 5], h[1, 5] = -offsets[k, 1], offsets[k, 0]
-            innovation = differences[k] - h @ x
-            innovation[2] = (innovation[2] + math.pi) % (2.0 * math.pi) - math.pi
-            s = h @ p @ h.T + covariances[k]
-            gain = np.linalg.solve(s, h @ p).T
-            squared[k] = innovation @ np.linalg.solve(s, innovation)
-            surprise += min(squared[k] + math.log(np.linalg.det(s)), _OUTLIER_SURPRISE)
+            # What is measured: (x0 + x3 - y x5, x1 + x4 + x x5, x2 + x5 + x6) at an offset (x, y).
+            across, along = -offsets[k, 1], offsets[k, 0]
+            innovation[0] = differences[k, 0] - (x[0] + x[3] + across * x[5])
+            innovation[1] = differences[k, 1] - (x[1] + x[4] + along * x[5])
+            innovation[2] = wrap(differences[k, 2] - (x[2] + x[5] + x[6]))
+            for i in range(_STATE):
+                common[i, 0] = p[i, 0] + p[i, 3] + across * p[i, 5]
+                common[i, 1] = p[i, 1] + p[i, 4] + along * p[i, 5]
+                common[i, 2] = p[i, 2] + p[i, 5] + p[i, 6]
+            for j in range(POSE):
+                s[0, j] = common[0, j] + common[3, j] + across * common[5, j]
+                s[1, j] = common[1, j] + common[4, j] + along * common[5, j]
+                s[2, j] = common[2, j] + common[5, j] + common[6, j]
+                for i in range(POSE):
+                    s[i, j] += covariances[k, i, j]
+            squared[k], determinant = squared_innovation(innovation, s, s_inverse)
+            surprise += min(squared[k] + math.log(determinant), _OUTLIER_SURPRISE)
             if squared[k] <= gate:
-                x = x + gain @ innovation
-                p = p - gain @ s @ gain.T
-                p = 0.5 * (p + p.T)
-        if keep:
-            history.filtered[k], history.filtered_covariance[k] = x, p
+                take_in(x, p, common, innovation, s_inverse, gain)
+        if kept:
+            keep(history.filtered, history.filtered_covariance, k, x, p)
     return squared, surprise
+
+
+@kernel()
+def _variance(errors: FloatArray, i: int) -> float:
+    """Stationary variance of the error of x, y (m^2) or the heading (rad^2)."""
+    sigma = errors[1] if i == 2 else errors[0]
+    return float(sigma * sigma)
 
 
 def smooth_localisation(

@@ -130,7 +130,9 @@ def _likeliest(
 ) -> tuple[float, float, FloatArray] | None:
     """Surprise, squared distance of the end and states, by Gauss-Newton steps, if they settle."""
     count = len(path)
-    measured = MeasuredPoses(np.array([count - 1]), path[-1:, :POSE].copy(), end_spread[None])
+    measured = MeasuredPoses(
+        np.array([count - 1]), path[-1:, :POSE].copy(), end_spread[None].copy()
+    )
     history = empty_history(count)
     for _ in range(_MOST_STEPS):
         squared, _, _, surprise = filter_forward(

@@ -303,7 +303,7 @@ def refine_outline(
         to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
         open_count, v = _hold_open(h, g, np.array([sx / used, sy / used]), to_start, fit)
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
-        local_covariance[:, :] = np.linalg.inv(h)
+        local_covariance = np.ascontiguousarray(np.linalg.inv(h))
         delta = -local_covariance @ g
         if step == fit.steps - 1 or (
             step > 0 and math.sqrt(delta[0] ** 2 + delta[1] ** 2) + abs(delta[2]) < 1e-6
@@ -315,8 +315,9 @@ def refine_outline(
     if used >= 3:
         c, s = math.cos(pose[2]), math.sin(pose[2])
         turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        covariance[:] = turn_world @ local_covariance @ np.ascontiguousarray(turn_world.T)
-        calibration[:] = -(turn_world @ local_covariance) @ cross
+        turned = turn_world @ local_covariance
+        covariance = turned @ np.ascontiguousarray(turn_world.T)
+        calibration = -turned @ cross
     return OutlinePose(
         pose, covariance, calibration, used, chi2, open_count, rms, weak, information, gradient
     )

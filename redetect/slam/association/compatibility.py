@@ -94,9 +94,14 @@ def joint_compatible(
     innovation, predicted, measured = map(_contiguous, (innovations, predicted_covariance, noise))
     n, _, width = innovation.shape
     squared = individual_distances(innovation, predicted, measured)
-    gates = chi_squared_gates(gate_probability, width, n)
+    gates = chi_squared_gates(gate_probability, width, max(n, 1))
+    candidates = np.argsort(squared, axis=1, kind="stable")
+    counts = np.sum(squared <= gates[1], axis=1)
+    # Rows with few candidates first: they decide most.
+    rows = np.argsort(counts, kind="stable")
+    rows = rows[counts[rows] > 0]
     landmark, distance, nodes = search_jointly(
-        innovation, predicted, measured, squared, gates, most_nodes
+        innovation, predicted, measured, rows, candidates, counts, gates, most_nodes
     )
     return Pairing(landmark, float(distance), nodes < most_nodes)
 
@@ -186,33 +191,21 @@ def search_jointly(
     innovations: FloatArray,
     predicted: FloatArray,
     noise: FloatArray,
-    squared: FloatArray,
+    rows: IntArray,
+    candidates: IntArray,
+    counts: IntArray,
     gates: FloatArray,
     most_nodes: int,
 ) -> tuple[IntArray, float, int]:
     """Depth-first branch and bound over all ways to give rows landmarks.
 
-    Parameters are those of `joint_compatible`, and the
-    individual distances (n, m), the joint gate of k pairs `gates[k]` (n + 1), and how many pairs
-    may be tried.
+    Parameters are those of `joint_compatible`, and the rows in the order in which they get
+    landmarks, the first `counts` (n,) of `candidates` (n, m) of each, the joint gate of k pairs
+    `gates[k]` (n + 1), and how many pairs may be tried.
 
     Returns `partner` (n,), `squared distance`, `nodes`.
     """
     n, m, width = innovations.shape
-    # Rows with few candidates first: they decide most.
-    counts = np.zeros(n, dtype=np.int64)
-    candidates = np.zeros((n, m), dtype=np.int64)
-    for i in range(n):
-        order = np.argsort(squared[i], kind="mergesort")
-        for j in order:
-            if squared[i, j] <= gates[1]:
-                candidates[i, counts[i]] = j
-                counts[i] += 1
-    rows = np.argsort(counts, kind="mergesort")
-    first = 0
-    while first < n and counts[rows[first]] == 0:
-        first += 1
-    rows = rows[first:]
     depth = len(rows)
 
     best = np.full(n, -1, dtype=np.int64)
@@ -278,7 +271,8 @@ def search_jointly(
             pairs > best_count or (pairs == best_count and total[pairs] < best_squared)
         ):
             best_count, best_squared = pairs, total[pairs]
-            best[:] = partner
+            for i in range(n):
+                best[i] = partner[i]
         level += 1
         choice[level] = 0
     return best, best_squared, nodes

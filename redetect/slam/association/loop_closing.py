@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
@@ -112,7 +112,7 @@ _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
 # Largest squared error of a loop whose odometry errs at random; and of how many standard deviations
 # the systematic error of each step may be.
-_MOST_SQUARED = float(chi2.isf(1e-6, 3))
+_MOST_SQUARED = float(chdtri(3, 1e-6))
 _SYSTEMATIC_SIGMAS = 2.0
 # Weight of a step that says nothing: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
@@ -204,7 +204,7 @@ def pairs_in_place(
     apart = xy[first] - xy[second]
     both = covariance[first] + covariance[second]
     squared = squared_mahalanobis(apart, both)
-    usable = np.flatnonzero(one_place & (squared <= chi2.ppf(gate_probability, 2)))
+    usable = np.flatnonzero(one_place & (squared <= chdtri(2, 1.0 - gate_probability)))
     ordered = usable[np.lexsort((second[usable], first[usable], squared[usable]))]
     return [(int(first[k]), int(second[k])) for k in ordered]
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
@@ -334,7 +334,8 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
     Two of the landmarks agree because the motion was made from them; of the others each agrees by
     chance with probability `chance`.
     """
-    tail = float(binom.logsf(agreeing - 3, max(present - 2, 0), min(chance, 1.0)))
+    with np.errstate(divide="ignore"):
+        tail = float(np.log(bdtrc(agreeing - 3, max(present - 2, 0), min(chance, 1.0))))
     return float(np.log10(max(tried, 1)) + tail / np.log(10.0))
 
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
@@ -323,7 +323,7 @@ def _without_clutter(
     recording: Recording, labels: IntArray, path: FloatArray, setting: AssociateSettings
 ) -> IntArray:
     """Labels of discs, -1 for rows that fit none, and for those of discs that too few rows fit."""
-    gate = chi2.ppf(setting.kept_probability, 2)
+    gate = chdtri(2, 1.0 - setting.kept_probability)
     circles = recording.circles
     kept = np.ones(len(labels), dtype=np.bool_)
     none = np.zeros(0, dtype=np.int64)
@@ -360,7 +360,7 @@ def _spread(
 
 def _isotropic(count: int, reach_m: float) -> FloatArray:
     """(count, 2, 2) covariances with which positions are compatible up to a distance."""
-    return np.tile(0.5 * reach_m**2 / chi2.ppf(_SAME_PLACE, 2) * np.eye(2), (count, 1, 1))
+    return np.tile(0.5 * reach_m**2 / chdtri(2, 1.0 - _SAME_PLACE) * np.eye(2), (count, 1, 1))
 
 
 def _merged_lines(
@@ -384,7 +384,7 @@ def _merged_lines(
     xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)[labels]
     off = bearing_of_vertical(path[lines.frame + 1], xy, camera_xy) - lines.bearing_rad
     # Lines without a place have nothing that their rows could contradict.
-    gate = lines.sigma_rad * np.sqrt(chi2.ppf(setting.kept_probability, 1))
+    gate = lines.sigma_rad * np.sqrt(chdtri(1, 1.0 - setting.kept_probability))
     kept = ~(np.abs(wrap_angle(off)) > gate)
     kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= setting.fewest_rows
     return np.where(kept, labels, -1)

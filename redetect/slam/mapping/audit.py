@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.sparse.linalg import SuperLU
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
@@ -210,10 +210,10 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
     new_id = min(others, key=others.__getitem__, default=UNKNOWN_ID)
     kind: Kind = "exchange"
     mended = others.get(new_id, np.inf)
-    if mended > chi2.isf(_LEAST_PROBABILITY, 2 * len(rows)):
+    if mended > chdtri(2 * len(rows), _LEAST_PROBABILITY):
         kind, new_id = "split", int(max(circles.ids.max(), graph.disc_ids.max())) + 1
         mended = _misfit(recording, fit, rows, new_id, place)
-        if len(rows) == 1 or mended > chi2.isf(_LEAST_PROBABILITY, 2 * len(rows) - 2):
+        if len(rows) == 1 or mended > chdtri(2 * len(rows) - 2, _LEAST_PROBABILITY):
             kind, new_id, mended = "drop", UNKNOWN_ID, np.nan
     own = int(np.searchsorted(graph.disc_ids, number))
     return Group(

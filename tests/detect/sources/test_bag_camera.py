@@ -36,6 +36,14 @@ def foreign(published_camera: Camera) -> ForeignCamera:
     return found
 
 
+@pytest.fixture(scope="module")
+def plumb_bob(published_camera: Camera) -> ForeignCamera:
+    """A lens that the model contains, so that nothing is fitted, at the published camera's size."""
+    c = published_camera
+    pinhole = c.scale_x, c.scale_y, c.offset_x, c.offset_y
+    return ForeignCamera("radtan", c.width, c.height, *pinhole, (-0.1, 0.0, 0.0, 0.0, 0.0))
+
+
 def info(ros: Ros, camera: ForeignCamera, **changed: Any) -> Any:
     k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
     model = ROS_NAMES[camera.model]
@@ -97,14 +105,14 @@ def test_a_bag_that_needs_nothing_else(
 
 
 def test_without_a_pose_only_markers(
-    small_run: Path, tmp_path: Path, published_camera: Camera, foreign: ForeignCamera
+    small_run: Path, tmp_path: Path, published_camera: Camera, plumb_bob: ForeignCamera
 ) -> None:
     ros = Ros()
     (tmp_path / "bag").mkdir()
     transforms = ros.static_transforms(("map", OPTICAL, in_ros_axes(published_camera)))
     said = [
         Said("/tf_static", 1.0, transforms),
-        Said("/front/camera_info", 1.0, info(ros, foreign)),
+        Said("/front/camera_info", 1.0, info(ros, plumb_bob)),
     ]
     path = ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
     told = r"no static transforms lead from 'base_footprint' to 'front_optical': name a \.cam file"
@@ -119,7 +127,7 @@ def test_without_a_pose_only_markers(
 
 
 def test_camera_infos_that_say_nothing_or_too_little(
-    small_run: Path, tmp_path: Path, foreign: ForeignCamera
+    small_run: Path, tmp_path: Path, plumb_bob: ForeignCamera
 ) -> None:
     ros = Ros()
     blank = ros.camera_info(768, 288, "plumb_bob", [], [0.0] * 9, OPTICAL)
@@ -130,7 +138,7 @@ def test_camera_infos_that_say_nothing_or_too_little(
     with pytest.raises(DetectError, match=r"no calibration: expected a \.cam file beside"):
         open_run(path)
     for name, changed in (("binned", {"binning_x": 2}), ("cut", {"roi_width": 100})):
-        said = [Said("/front/camera_info", 1.0, info(ros, foreign, **changed))]
+        said = [Said("/front/camera_info", 1.0, info(ros, plumb_bob, **changed))]
         path = ros.write(tmp_path / name, recorded(small_run, ros, said))
         with pytest.raises(DetectError, match="binning or roi is set: name a calibration"):
             open_source(path)

@@ -26,7 +26,6 @@ from tools.evaluation.markers_statistics import (
     MISSED,
     OURS,
     PEERS,
-    TITLES,
     Found,
     Outcome,
     ScoredFrame,
@@ -127,10 +126,10 @@ def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
     table = table_of(frames)
     bins = binned(table)
     clear = table.columns["clear"] > 0.0
-    for quantity, limits in BINS.items():
+    for quantity, (title, limits) in BINS.items():
         values = table.columns[quantity][clear]
         inside = np.count_nonzero((values >= limits[0]) & (values <= limits[-1]))
-        assert sum(b.markers for b in bins if b.label.startswith(TITLES[quantity])) == inside
+        assert sum(b.markers for b in bins if b.label.startswith(title)) == inside
     assert counts_lines(table)[0].startswith("2 frames")
 
 

@@ -11,7 +11,7 @@ from scipy.special import erf
 
 from camera import Camera
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 from tools.simulator.markers.rendering import (
     Imaging,
     exact_grey,

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.plane import between, compose
-from tools.arrays import FloatArray, IntArray
 from tools.simulator.laser.settings import ReadingErrors
 
 

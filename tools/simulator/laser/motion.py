@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 from tools.simulator.laser.settings import DrivingLimits, WheelErrors
 
 _GRID_M = 0.002

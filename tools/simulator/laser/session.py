@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
-from tools.arrays import FloatArray
 from tools.simulator.laser.motion import Curve, RobotClock, Route, Stop
 from tools.simulator.laser.settings import LaserSettings
 from tools.simulator.laser.site import (

@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
-from redetect.groundtruth.trajectories.streams import (
-    PlanarPoses,
-    write_planar_poses,
-)
+from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.validation.reference_poses import (
     DIMENSIONS_HEAD,
     FIDUCIAL_DISTANCES_HEAD,
@@ -25,7 +23,6 @@ from redetect.groundtruth.validation.reference_poses import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
-from tools.arrays import BoolArray, FloatArray
 from tools.simulator.files import write_bytes
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
@@ -60,10 +57,9 @@ def exact_poses(plan: SessionPlan, times_s: FloatArray) -> PlanarPoses:
 
 def in_visits(plan: SessionPlan, times_s: FloatArray, margin_s: float) -> BoolArray:
     """Which times lie within a visit or a margin round it."""
-    within = np.zeros(len(times_s), dtype=bool)
-    for begin, end in plan.visits:
-        within |= (times_s >= begin - margin_s) & (times_s <= end + margin_s)
-    return within
+    begin, end = np.array(plan.visits).T[:, :, None]
+    within = (times_s >= begin - margin_s) & (times_s <= end + margin_s)
+    return np.asarray(np.any(within, axis=0))
 
 
 def odometry_stream(plan: SessionPlan) -> PlanarPoses:
@@ -181,7 +177,7 @@ def write_session(
     _write_tape(plan, folder, overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
-    write_bytes(folder / "ptpd.log", ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
+    _write_lines(folder / "ptpd.log", lines, overwrite)
     _write_truth(plan, folder, overwrite)
     return plan
 
@@ -195,14 +191,16 @@ def _write_tape(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
         f"wall{i},{','.join(f'{x:.4f}' for x in drawn[i])},{length[i] + rng.normal(0.0, sigma):.4f}"
         for i in np.argsort(-length, kind="stable")[:_DIMENSIONS]
     ]
-    lines = "\n".join([DIMENSIONS_HEAD, *rows]) + "\n"
-    write_bytes(folder / "dimensions.csv", lines.encode(), overwrite=overwrite)
+    _write_lines(folder / "dimensions.csv", [DIMENSIONS_HEAD, *rows], overwrite)
     rows = [
         f"{a},{b},{math.dist(FIDUCIALS[a], FIDUCIALS[b]) + rng.normal(0.0, sigma):.4f}"
         for a, b in combinations(FIDUCIALS, 2)
     ]
-    lines = "\n".join([FIDUCIAL_DISTANCES_HEAD, *rows]) + "\n"
-    write_bytes(folder / "fiducial_distances.csv", lines.encode(), overwrite=overwrite)
+    _write_lines(folder / "fiducial_distances.csv", [FIDUCIAL_DISTANCES_HEAD, *rows], overwrite)
+
+
+def _write_lines(path: Path, lines: list[str], overwrite: bool) -> None:
+    write_bytes(path, ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
 
 
 def _drawn(plan: SessionPlan) -> FloatArray:
@@ -211,16 +209,19 @@ def _drawn(plan: SessionPlan) -> FloatArray:
     return walls + sigma * plan.random("drawing").standard_normal(walls.shape)
 
 
+def _by_hand(
+    scanner: Scanner, sigma_m: float, sigma_deg: float, rng: np.random.Generator
+) -> Scanner:
+    """A scanner with its pose as it was measured."""
+    sigma = np.array([sigma_m, sigma_m, np.deg2rad(sigma_deg)])
+    pose = scanner.pose + sigma * rng.standard_normal(3)
+    return replace(scanner, pose=pose, covariance=np.diag(sigma**2))
+
+
 def _mounted_by_hand(plan: SessionPlan) -> Robot:
-    """The robot with the mounts of its scanners as they were measured."""
     settings, rng = plan.settings, plan.random("mounts")
-    sigma = np.array(
-        [settings.mount_sigma_m, settings.mount_sigma_m, np.deg2rad(settings.mount_sigma_deg)]
-    )
-    scanners = tuple(
-        replace(s, pose=s.pose + sigma * rng.standard_normal(3), covariance=np.diag(sigma**2))
-        for s in plan.robot.scanners
-    )
+    sigmas = settings.mount_sigma_m, settings.mount_sigma_deg
+    scanners = tuple(_by_hand(scanner, *sigmas, rng) for scanner in plan.robot.scanners)
     return replace(plan.robot, scanners=scanners)
 
 
@@ -239,16 +240,10 @@ def _write_site(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
 
 def _measured_by_hand(plan: SessionPlan) -> list[Scanner]:
     settings, rng = plan.settings, plan.random("hand")
-    sigma = np.array(
-        [settings.hand_sigma_m, settings.hand_sigma_m, np.deg2rad(settings.hand_sigma_deg)]
-    )
-    scanners = []
-    for scanner in plan.scanners:
-        pose = scanner.pose + sigma * rng.standard_normal(3)
-        if scanner.name == settings.faults.wrong_scanner:
-            pose = pose + np.array(settings.faults.by)
-        scanners.append(replace(scanner, pose=pose, covariance=np.diag(sigma**2)))
-    return scanners
+    sigmas = settings.hand_sigma_m, settings.hand_sigma_deg
+    scanners = [_by_hand(scanner, *sigmas, rng) for scanner in plan.scanners]
+    name, off = settings.faults.wrong_scanner, np.array(settings.faults.by)
+    return [replace(s, pose=s.pose + off) if s.name == name else s for s in scanners]
 
 
 def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:

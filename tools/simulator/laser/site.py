@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.arrays import BoolArray, FloatArray
+from redetect.array_types import BoolArray, FloatArray
 
 #: (N, 3) poses of the robot at times (N,).
 Poses = Callable[[FloatArray], FloatArray]

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from redetect.array_types import FloatArray
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.building import HEAD
 from redetect.groundtruth.lasers.scanners import Robot, Scans, scanner_entry
 from redetect.groundtruth.validation.reference_poses import DISTANCES_HEAD, Distance, Survey
 from redetect.storage import write_whole
-from tools.arrays import FloatArray
 
 
 def write_scans(path: Path, scans: Scans, *, overwrite: bool = False) -> None:

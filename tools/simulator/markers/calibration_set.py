@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from camera.boards.board import Board
+from redetect.array_types import ByteArray, FloatArray
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.trajectories.transforms import (
     apply,
@@ -23,7 +24,6 @@ from redetect.groundtruth.trajectories.transforms import (
     planar_transform,
     quaternion_xyzw,
 )
-from tools.arrays import ByteArray, FloatArray
 from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (

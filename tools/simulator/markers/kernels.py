@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from camera.kernels import project_direction
-from tools.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 
 class SurfaceArrays(NamedTuple):
@@ -59,14 +59,17 @@ def _mark_segment(
     numbers: FloatArray,
     from_texel: FloatArray,
     ends: tuple[float, float, float, float],
-    pieces: int,
+    pieces: float,
 ) -> None:
-    """Mark the quarters of pixels that a segment crosses, and widen the box (in pixels) by it."""
+    """Mark the quarters of pixels that a segment crosses, and widen the box (in pixels) by it.
+
+    `pieces`: their whole number; as a float, so that Numba compiles once for all.
+    """
     rows, columns = crossed.shape
     height, width = rows // 2, columns // 2
     a0, b0, a1, b1 = ends
     u0, v0 = _texel_point(numbers, from_texel, a0, b0)
-    for piece in range(pieces):
+    for piece in range(int(pieces)):
         t = (piece + 1.0) / pieces
         u1, v1 = _texel_point(numbers, from_texel, a0 + t * (a1 - a0), b0 + t * (b1 - b0))
         known0, known1 = not math.isnan(u0), not math.isnan(u1)
@@ -116,9 +119,9 @@ def mark_edges(
         for k in range(2):
             # Long edges bend under distortion, so they go in pieces.
             across = (0.0, float(k * rows), float(columns), float(k * rows))
-            _mark_segment(crossed, box, numbers, matrix, across, 64)
+            _mark_segment(crossed, box, numbers, matrix, across, 64.0)
             down = (float(k * columns), 0.0, float(k * columns), float(rows))
-            _mark_segment(crossed, box, numbers, matrix, down, 64)
+            _mark_segment(crossed, box, numbers, matrix, down, 64.0)
         if surfaces.smooth[s] or box[2] < box[0] or box[3] < box[1]:
             continue
         start, texels = surfaces.starts[s], surfaces.texels
@@ -130,12 +133,12 @@ def mark_edges(
                     right = texels[start + r * columns + c + 1]
                     if right != here and not (hole and math.isnan(right)):
                         side = (c + 1.0, float(r), c + 1.0, r + 1.0)
-                        _mark_segment(crossed, box, numbers, matrix, side, 4)
+                        _mark_segment(crossed, box, numbers, matrix, side, 4.0)
                 if r + 1 < rows:
                     below = texels[start + (r + 1) * columns + c]
                     if below != here and not (hole and math.isnan(below)):
                         side = (float(c), r + 1.0, c + 1.0, r + 1.0)
-                        _mark_segment(crossed, box, numbers, matrix, side, 4)
+                        _mark_segment(crossed, box, numbers, matrix, side, 4.0)
 
 
 @nb.njit(cache=True, error_model="numpy")

@@ -15,7 +15,7 @@ import numpy as np
 from camera import Camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
-from tools.arrays import ByteArray, Float32Array, FloatArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray
 from tools.simulator.markers.kernels import SurfaceArrays, mark_edges, shade
 from tools.simulator.markers.surface import Surface, Texture, plain
 

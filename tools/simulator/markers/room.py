@@ -13,9 +13,9 @@ import numpy as np
 from camera import Camera
 from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
+from redetect.array_types import FloatArray
 from redetect.groundtruth.markers.session import Rig
 from redetect.groundtruth.trajectories.transforms import planar_transform, transform
-from tools.arrays import FloatArray
 from tools.simulator.markers.surface import (
     Surface,
     Texture,

@@ -13,8 +13,8 @@ import numpy as np
 from camera import Camera, format_camera, write_camera
 from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import marker_dictionary
+from redetect.array_types import ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.trajectories.transforms import transform
-from tools.arrays import ByteArray, Float32Array, FloatArray
 from tools.simulator.files import encoded, write_bytes, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
 from tools.simulator.markers.rendering import (

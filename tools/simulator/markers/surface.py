@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from detect.markers.dictionaries import MarkerDictionary
-from tools.arrays import BoolArray, Float32Array, FloatArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray
 
 #: Outward face of each side of a box, as the surface's x and y axes in the box's frame.
 _SIDES = {

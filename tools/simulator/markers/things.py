@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from detect.markers.dictionaries import MarkerDictionary
-from tools.arrays import ByteArray, Float32Array, FloatArray
+from redetect.array_types import ByteArray, Float32Array, FloatArray
 from tools.simulator.markers.surface import (
     BLACK,
     LEAST_DIFFERENCE,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from camera import Camera
-from tools.arrays import FloatArray
+from redetect.array_types import FloatArray
 from tools.simulator.markers.kernels import SurfaceArrays, count_visible
 from tools.simulator.markers.surface import Surface, square_corners
 
