@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from redetect.slam.models import OdometryNoise
+from redetect.slam.settings import AddedNoise, AssociateSettings
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -243,23 +244,6 @@ class Associate(RunsFlags):
 
     Parameters
     ----------
-    method : str
-        `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
-        frame's rows (JCBB).
-    map_level : bool
-        Then search loops by fitting local maps of landmarks to each other.
-    gate_probability : float
-        Share of right rows that pass the gate.
-    sigma_scale : float
-        Factor on the discs' standard deviations: a robot that sways moves them by more than the
-        file says.
-    tilt_sigma_deg : float
-        Standard deviation of the robot's sway, which moves all discs of a frame together.
-    kept_probability : float
-        Share of a disc's right rows that keep its ID at the map level, by their covariances as the
-        file states them; rows farther from its place in the map get -1.
-    fewest_rows : int
-        Discs of fewer such rows are taken for clutter: their rows get -1.
     noise : several floats
         Score again with noise added to the measurements (factors on their standard deviation).
     seed : int
@@ -270,16 +254,10 @@ class Associate(RunsFlags):
         found_2.circles, ... for found.circles. The scores go into a .json beside.
     """
 
-    method: Literal["nearest", "joint"] = "joint"
-    map_level: bool = True
-    gate_probability: float = 0.999
-    sigma_scale: float = 1.4
-    tilt_sigma_deg: float = 0.2
-    kept_probability: float = 0.99
-    fewest_rows: int = 3
     noise: tuple[float, ...] = ()
     seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    settings: OmitArgPrefixes[AssociateSettings] = field(default_factory=AssociateSettings)
 
 
 @dataclass(frozen=True)
@@ -292,20 +270,10 @@ class Noise:
     ----------
     run : Path
         Run folder, or a .circles, .lines or .txt file.
-    sigma : float
-        Standard deviation added to disc positions along x and y (m).
-    bearing_sigma : float
-        Standard deviation added to bearings of lines (rad).
-    step_sigma : float
-        Standard deviation added to dx and dy of each step (m).
-    turn_sigma : float
-        Standard deviation added to dphi of each step (rad).
     lines : bool
         Of a run folder take the .lines file instead of the .circles.
     stem : str
         Name of the landmark file in the folder; by default map, else detected.
-    seed : int
-        Everything random follows from it.
     output : Path
         The file to write.
     force : bool
@@ -313,15 +281,11 @@ class Noise:
     """
 
     run: Positional[Path]
-    sigma: float = 0.0
-    bearing_sigma: float = 0.0
-    step_sigma: float = 0.0
-    turn_sigma: float = 0.0
     lines: bool = False
     stem: MaybeStr = None
-    seed: int = 1
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False
+    noise: OmitArgPrefixes[AddedNoise] = field(default_factory=AddedNoise)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +23,6 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
-
-Method = Literal["nearest", "joint"]
 
 DEFAULT_GATE_PROBABILITY = 0.999
 #: Bound of the joint search.
