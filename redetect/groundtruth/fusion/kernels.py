@@ -134,73 +134,6 @@ def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@kernel()
-def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
-    """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
-    a, b, c = m[0, 0], m[0, 1], m[0, 2]
-    d, e, f = m[1, 1], m[1, 2], m[2, 2]
-    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * c00 + b * c01 + c * c02
-    scale = 1.0 / determinant
-    inverse[0, 0] = c00 * scale
-    inverse[0, 1] = inverse[1, 0] = c01 * scale
-    inverse[0, 2] = inverse[2, 0] = c02 * scale
-    inverse[1, 1] = (a * f - c * c) * scale
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
-    inverse[2, 2] = (a * d - b * b) * scale
-    return float(determinant)
-
-
-@kernel()
-def _squared_innovation(
-    p: FloatArray,
-    measured_covariance: FloatArray,
-    innovation: FloatArray,
-    s: FloatArray,
-    s_inverse: FloatArray,
-) -> tuple[float, float]:
-    """Normalised square of an innovation, and its covariance's determinant; fills the last two."""
-    for i in range(POSE):
-        for j in range(POSE):
-            s[i, j] = p[i, j] + measured_covariance[i, j]
-    determinant = _invert_3x3(s, s_inverse)
-    squared = 0.0
-    for i in range(POSE):
-        for j in range(POSE):
-            squared += innovation[i] * s_inverse[i, j] * innovation[j]
-    return squared, determinant
-
-
-@kernel()
-def _update(
-    x: FloatArray,
-    p: FloatArray,
-    innovation: FloatArray,
-    s_inverse: FloatArray,
-    gain: FloatArray,
-    temporary: FloatArray,
-) -> None:
-    """Take a measured pose in; gain and temporary are work space."""
-    for i in range(STATE):
-        for j in range(POSE):
-            total = 0.0
-            for n in range(POSE):
-                total += p[i, n] * s_inverse[n, j]
-            gain[i, j] = total
-    for i in range(STATE):
-        for j in range(POSE):
-            x[i] += gain[i, j] * innovation[j]
-        for j in range(STATE):
-            total = 0.0
-            for n in range(POSE):
-                total += gain[i, n] * p[n, j]
-            temporary[i, j] = total
-    for i in range(STATE):
-        for j in range(i, STATE):
-            p[i, j] -= 0.5 * (temporary[i, j] + temporary[j, i])
-            p[j, i] = p[i, j]
-
-
 class Odometry(NamedTuple):
     """Movements to N nodes, each from the node before; the first is not used."""
 
@@ -277,11 +210,6 @@ def filter_forward(
     x = start.copy()
     p = start_covariance.copy()
     f = np.eye(STATE)
-    s = np.empty((POSE, POSE))
-    s_inverse = np.empty((POSE, POSE))
-    innovation = np.empty(POSE)
-    gain = np.empty((STATE, POSE))
-    temporary = np.empty((STATE, STATE))
     m = 0
     rejections = 0
     surprise = 0.0
@@ -299,8 +227,7 @@ def filter_forward(
             predicted[k] = x
             predicted_covariance[k] = p
         while m < nodes.shape[0] and nodes[m] == k:
-            for i in range(POSE):
-                innovation[i] = measured.poses[m, i] - x[i]
+            innovation = measured.poses[m] - x[:POSE]
             if points.shape[0] > 1:
                 ahead = points[k, 2] - x[2]
                 innovation[2] = ahead + _wrap(innovation[2] - ahead)
@@ -308,14 +235,12 @@ def filter_forward(
                 innovation[2] = _wrap(innovation[2])
             lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
             if lost or rejections >= gating.restart_after:
-                for i in range(POSE):
-                    for j in range(STATE):
-                        p[i, j] = 0.0
-                        p[j, i] = 0.0
+                p[:POSE, :] = 0.0
+                p[:, :POSE] = 0.0
                 for i in range(POSE):
                     p[i, i] = gating.restart_variances[i]
-                    x[i] += innovation[i]
-                    innovation[i] = 0.0
+                x[:POSE] += innovation
+                innovation[:] = 0.0
                 rejections = 0
                 cut = False
                 restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
@@ -323,18 +248,22 @@ def filter_forward(
                     predicted[k] = x
                     predicted_covariance[k] = p
                     transitions[k, :POSE] = 0.0
-            squared, determinant = _squared_innovation(
-                p, measured.covariances[m], innovation, s, s_inverse
-            )
+            spread = p[:POSE, :POSE] + measured.covariances[m]
+            inverse = np.linalg.inv(spread)
+            squared = innovation @ inverse @ innovation
+            log_determinant = math.log(np.linalg.det(spread))
             squared_innovations[m] = squared
             accepted[m] = squared <= gating.largest_squared
             if accepted[m]:
                 rejections = 0
-                surprise += squared + math.log(determinant)
-                _update(x, p, innovation, s_inverse, gain, temporary)
+                surprise += squared + log_determinant
+                gain = np.ascontiguousarray(p[:, :POSE]) @ inverse
+                x += gain @ innovation
+                p -= gain @ p[:POSE]
+                p[:] = 0.5 * (p + p.T)
             else:
                 rejections += 1
-                surprise += gating.largest_squared + math.log(determinant)
+                surprise += gating.largest_squared + log_determinant
             m += 1
         if keep:
             filtered[k] = x
