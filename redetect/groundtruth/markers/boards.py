@@ -77,10 +77,8 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class DoubleBoard:
-    """Two boards held together."""
+    """The boards `FIRST` and `SECOND`, held together."""
 
-    first: str
-    second: str
     offset: FloatArray | None  # (4, 4): `first_from_second`; None if it is to be estimated.
     covariance: FloatArray  # (6, 6): of its right perturbation; zeros if it is exactly known.
 
@@ -133,7 +131,7 @@ def read_boards(path: Path) -> BoardsFile:
     world = parse_pose(content.inner("world_from_board"))
     double = None
     if FIRST in boards:
-        double = DoubleBoard(FIRST, SECOND, None, np.zeros((6, 6)))
+        double = DoubleBoard(None, np.zeros((6, 6)))
         if content.values.get("first_from_second") is not None:
             entry = content.inner("first_from_second")
             double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))

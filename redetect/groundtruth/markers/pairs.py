@@ -43,7 +43,6 @@ class MarkerPose:
 class PairConsensus:
     """The pose of one marker relative to another."""
 
-    pair: tuple[int, int]  # (int, int): indices a, b
     a_from_b: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
@@ -70,38 +69,46 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
 
 
-def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairConsensus:
+def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     """The transform that most times agree with.
 
-    `pair` (int, int). `times`: from `pair_estimates`, one for each time that shows both markers.
+    `times`: from `pair_estimates`, one for each time that shows both markers.
     """
-    poses, covariances, costs, owner = _stacked(times)
+    poses = np.concatenate([time.poses for time in times])
+    covariances = np.concatenate([time.covariances for time in times])
+    costs = np.concatenate([time.costs - time.costs.min() for time in times])
+    owner = np.repeat(np.arange(len(times)), [len(time.poses) for time in times])
+
+    def nearest(pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Each time's estimate nearest to a pose: squared normalised distance, and which it is."""
+        apart = log_se3(inverse(pose) @ poses)
+        distance = squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
+        order = np.lexsort((distance, owner))
+        best = order[np.searchsorted(owner[order], np.arange(len(times)))]
+        return distance[best], best
+
     # The surest estimates are hypotheses: those of a marker seen large and aslant.
     spread = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
     surest = np.argsort(spread, kind="stable")[:_HYPOTHESES]
     totals = []
     for hypothesis in surest:
-        distance = _distances(poses[hypothesis], covariances[hypothesis], poses, covariances, costs)
-        totals.append(np.sum(np.minimum(_least(distance, owner, len(times))[0], _AGREES)))
+        distance, _ = nearest(poses[hypothesis], covariances[hypothesis])
+        totals.append(np.sum(np.minimum(distance, _AGREES)))
     chosen = surest[int(np.argmin(totals))]
     consensus, covariance = poses[chosen], covariances[chosen]
     for _ in range(10):
-        distance, best = _least(
-            _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
-        )
+        distance, best = nearest(consensus, covariance)
         agreeing = best[distance < _AGREES]
         if not len(agreeing):  # not even the hypothesis: its own covariance is the floor's
             agreeing = np.array([chosen])
-        new, covariance, _ = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
+        new, covariance = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
         moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
         consensus = new
         if moved < 1e-10:
             break
-    distance, best = _least(
-        _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
-    )
+    distance, best = nearest(consensus, covariance)
     first = np.array([costs[b] <= costs[owner == t].min() for t, b in enumerate(best)])
-    return PairConsensus(pair, consensus, covariance, poses[best], distance < _AGREES, first)
+    return PairConsensus(consensus, covariance, poses[best], distance < _AGREES, first)
 
 
 def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
@@ -140,32 +147,3 @@ def chained_poses(
         if len(poses) == before:
             raise GroundTruthError("a marker is not connected to the others")
     return np.stack([poses[marker] for marker in range(len(parents))])
-
-
-def _stacked(times: Sequence[MarkerPose]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    return (
-        np.concatenate([time.poses for time in times]),
-        np.concatenate([time.covariances for time in times]),
-        np.concatenate([time.costs - time.costs.min() for time in times]),
-        np.repeat(np.arange(len(times)), [len(time.poses) for time in times]),
-    )
-
-
-def _distances(
-    consensus: FloatArray,
-    covariance: FloatArray,
-    poses: FloatArray,
-    covariances: FloatArray,
-    costs: FloatArray,
-) -> FloatArray:
-    """Squared normalised distances of all estimates, and what they cost in the image."""
-    apart = log_se3(inverse(consensus) @ poses)
-    return squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
-
-
-def _least(distance: FloatArray, owner: IntArray, times: int) -> tuple[FloatArray, IntArray]:
-    """Each time's smallest distance and which estimate that is."""
-    order = np.lexsort((distance, owner))
-    first = np.searchsorted(owner[order], np.arange(times))
-    best = order[first]
-    return distance[best], best

@@ -23,6 +23,7 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     UNDETERMINED,
+    Chain,
     ChainPoints,
     inverted_information,
     project_chain,
@@ -63,13 +64,12 @@ class PoseProblem:
 
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
-        return project_chain(
-            self.network.cameras,
-            self.network.world_from_camera,
-            world_from_robot[None],
-            self.rig.robot_from_marker,
-            self.seen,
-        )
+        return project_chain(self.chain(world_from_robot), self.seen)
+
+    def chain(self, world_from_robot: FloatArray) -> Chain:
+        """Cameras, robot and markers, the robot at a pose."""
+        network, parts = self.network, self.rig.robot_from_marker
+        return Chain(network.cameras, network.world_from_camera, world_from_robot[None], parts)
 
     def extent_px(self, view: int) -> float:
         """Width and height of a marker in an image, together."""
@@ -216,9 +216,7 @@ def predicted_errors(
 def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
     """None if one cannot be seen."""
     network, rig, seen = problem.network, problem.rig, problem.seen
-    projection = project_chain_with_jacobians(
-        network.cameras, network.world_from_camera, pose[None], rig.robot_from_marker, seen
-    )
+    projection = project_chain_with_jacobians(problem.chain(pose), seen)
     residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
         return None

@@ -17,6 +17,7 @@ from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     AdjustedBundle,
     Bundle,
+    Chain,
     PosePrior,
     adjust_bundle,
     project_chain,
@@ -106,7 +107,7 @@ def estimate_rig(
     renumbered = {old: new for new, old in enumerate(kept)}
     tree = tuple(renumbered[parents[i]] for i in kept)
     pairs = {
-        (renumbered[a], renumbered[b]): replace(c, pair=(renumbered[a], renumbered[b]))
+        (renumbered[a], renumbered[b]): c
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
@@ -120,16 +121,7 @@ def estimate_rig(
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
     adjusted, rig = _adjusted(bundle, rig, settings)
-    return RigEstimate(
-        rig,
-        ids[root],
-        pairs,
-        tree,
-        adjusted,
-        views,
-        times,
-        left_out,
-    )
+    return RigEstimate(rig, ids[root], pairs, tree, adjusted, views, times, left_out)
 
 
 def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[AdjustedBundle, Rig]:
@@ -190,7 +182,7 @@ def _consensus_of_pairs(
                 pair = (view_a.rig_index, view_b.rig_index)
                 if a is not None and b is not None and pair[0] < pair[1]:
                     estimates.setdefault(pair, []).append(pair_estimates(a, b))
-    return {pair: pair_consensus(pair, times) for pair, times in sorted(estimates.items())}
+    return {pair: pair_consensus(times) for pair, times in sorted(estimates.items())}
 
 
 def _root(
@@ -295,9 +287,8 @@ def _best_start(
     best, least = None, np.inf
     for view, solutions in own:
         for pose in solutions.poses @ inverse(start[view.rig_index]):
-            pixels = project_chain(
-                network.cameras, network.world_from_camera, pose[None], start, points
-            )
+            chain = Chain(network.cameras, network.world_from_camera, pose[None], start)
+            pixels = project_chain(chain, points)
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue
@@ -338,7 +329,7 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
         cameras = len(estimate.adjusted.bundle.cameras)
         priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
         starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
-    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings)
 
 
@@ -383,7 +374,7 @@ def rig_by_reference_poses(
         raise GroundTruthError(
             "no images show two markers of the rig at the time of any reference pose"
         )
-    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings), len(priors)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
+from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
 from redetect.groundtruth.markers.refinement import Floor, PoseProblem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
 from redetect.groundtruth.trajectories.transforms import (
@@ -116,9 +116,8 @@ def points_of(
         camera, np.zeros(len(camera), np.int64), part, points,
         np.zeros((len(camera), 2)), np.tile(np.eye(2) * sigma_px**2, (len(camera), 1, 1)),
     )  # fmt: skip
-    pixels = project_chain(
-        cameras, world_from_camera, world_from_robot[None], rig.robot_from_marker, empty
-    )
+    chain = Chain(cameras, world_from_camera, world_from_robot[None], rig.robot_from_marker)
+    pixels = project_chain(chain, empty)
     if noise is not None:
         pixels = pixels + noise.normal(0.0, sigma_px, pixels.shape)
     seen = ChainPoints(camera, empty.body, part, points, pixels, empty.covariances)

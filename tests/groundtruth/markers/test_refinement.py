@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.adjustment import (
+    Chain,
     project_chain,
     project_chain_with_jacobians,
 )
@@ -62,12 +63,13 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
         "part": problem.rig.robot_from_marker,
     }
 
-    def project(by: dict[str, FloatArray]) -> FloatArray:
-        return project_chain(problem.network.cameras, by["camera"], by["body"], by["part"], seen)
+    def chain(by: dict[str, FloatArray]) -> Chain:
+        return Chain(problem.network.cameras, by["camera"], by["body"], by["part"])
 
-    projection = project_chain_with_jacobians(
-        problem.network.cameras, poses["camera"], poses["body"], poses["part"], seen
-    )
+    def project(by: dict[str, FloatArray]) -> FloatArray:
+        return project_chain(chain(by), seen)
+
+    projection = project_chain_with_jacobians(chain(poses), seen)
     np.testing.assert_allclose(projection.pixels, project(poses), atol=1e-9)
     step = 1e-6
     for name in poses:
