@@ -17,11 +17,6 @@ from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 
 
-def nominal_mounting(camera: Camera) -> FloatArray:
-    """(3, 4) robot_from_camera as calibrated."""
-    return np.column_stack([camera.rotation, camera.centre])
-
-
 def rows_through_mounting(
     camera: Camera, floor_xy: FloatArray, mounting: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -250,10 +250,6 @@ def read_recording(
     noise : OdometryNoise
         Of the steps that state no covariance.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     redetect.landmarks.LandmarkFileError

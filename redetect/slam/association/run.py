@@ -106,10 +106,6 @@ def associate_run(
         The camera's centre in the robot frame (m); only bearings of lines need it.
     progress : callable, optional
         Called with a description of the current stage.
-
-    Returns
-    -------
-    RunAssociation
     """
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)

@@ -28,7 +28,6 @@ from redetect.least_squares.solver import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
-from redetect.slam.mounting import nominal_mounting
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +195,7 @@ def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estim
     if graph.camera is None:
         raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
     if weighting.calibrate and start.mounting is None:
-        start = replace(start, mounting=nominal_mounting(graph.camera))
+        start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
     if weighting.tilt_sigma_rad > 0.0:
         if weighting.calibrate and weighting.row_errors != "recorded":
             raise SlamError("a separate tilt for each pose: expected row errors as recorded")
