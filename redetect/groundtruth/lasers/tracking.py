@@ -461,26 +461,25 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
         | ~determined[rows[:-1]]
     )
     first = np.flatnonzero(parted)
-    run = np.cumsum(parted) - 1
-    within = (np.arange(len(rows)) - first[run]) // sets_per_pose
-    begins = parted | np.concatenate([[True], np.diff(within) != 0])
-    block = np.cumsum(begins) - 1
-    count = int(block[-1]) + 1
+    within = np.arange(len(rows)) - first[np.cumsum(parted) - 1]
+    begins = np.flatnonzero(within % sets_per_pose == 0)
+    size = np.diff(begins, append=len(rows))
+    block = np.repeat(np.arange(len(begins)), size)
 
-    size = np.bincount(block, minlength=count).astype(np.float64)
+    def mean_of(values: FloatArray) -> FloatArray:
+        """Means of the sets of each block."""
+        return np.asarray((np.add.reduceat(values, begins).T / size).T)
+
     origin = times[0]
-    middle = np.bincount(block, times - origin, minlength=count) / size
-    lead = track.poses[rows[np.flatnonzero(begins)]]
+    middle = mean_of(times - origin)
+    lead = track.poses[rows[begins]]
     moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
     apart = moved - lead[block]
     apart[:, 2] = wrap_angle(apart[:, 2])
     # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
     # with equal weights at the mean time an error of the motion drops out.
-    noise, shared = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
-    mean = np.zeros((count, 3))
-    np.add.at(mean, block, apart / size[block][:, None])
-    np.add.at(noise, block, track.noise[rows] / (size**2)[block][:, None, None])
-    np.add.at(shared, block, (track.covariances - track.noise)[rows] / size[block][:, None, None])
+    mean, noise = mean_of(apart), mean_of(track.noise[rows]) / size[:, None, None]
+    shared = mean_of((track.covariances - track.noise)[rows])
     poses = lead + mean
     poses[:, 2] = wrap_angle(poses[:, 2])
     covariances = noise + shared

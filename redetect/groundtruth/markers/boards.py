@@ -45,10 +45,8 @@ _WINDOW = 0.4
 def checkerboard(columns: int, rows: int, square_m: float) -> Board:
     """A board by its numbers of inner corners, one even and one odd, and the side of a square.
 
-    Raises
-    ------
-    GroundTruthError
-        If the board is symmetric under rotation by 180 degrees, or is too small.
+    Raises `GroundTruthError` if the board is symmetric under rotation by 180 degrees, or is too
+    small.
     """
     try:
         board = Board("checkerboard", columns, rows, square_m)
@@ -151,10 +149,8 @@ def read_boards(path: Path) -> BoardsFile:
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """The corners of the board in an image.
 
-    Raises
-    ------
-    GroundTruthError
-        If the image cannot be read, has another size than the calibration, or shows no board.
+    Raises `GroundTruthError` if the image cannot be read, has another size than the calibration, or
+    shows no board.
     """
     if image.corners is not None:
         return BoardView(image.camera, image.board, image.corners)

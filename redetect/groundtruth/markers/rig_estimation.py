@@ -50,7 +50,6 @@ class RigEstimate:
     rig: Rig
     reference: int  # The marker whose frame it is
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
-    parents: tuple[int, ...]  # The tree: each marker's index of the marker that it was chained to
     adjusted: AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
     times: int  # How many times (images, without a network) were used
@@ -105,7 +104,7 @@ def estimate_rig(
     kept = [i for i in range(len(ids)) if parents[i] >= 0]
     left_out = _reasons(ids, parents, seen, settings)
     renumbered = {old: new for new, old in enumerate(kept)}
-    tree = tuple(renumbered[parents[i]] for i in kept)
+    tree = [renumbered[parents[i]] for i in kept]
     pairs = {
         (renumbered[a], renumbered[b]): c
         for (a, b), c in pairs.items()
@@ -121,7 +120,7 @@ def estimate_rig(
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
     adjusted, rig = _adjusted(bundle, rig, settings)
-    return RigEstimate(rig, ids[root], pairs, tree, adjusted, views, times, left_out)
+    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
 
 
 def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[AdjustedBundle, Rig]:

@@ -7,6 +7,7 @@ each camera; both may say how uncertain that is (see docs/groundtruth.md).
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -218,7 +219,7 @@ DETECTED_NAME = "detected.markers"
 NETWORK_NAME = "network.json"
 RIG_NAME = "rig.json"
 
-_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
+_IMAGE_SUFFIX = re.compile(r"\.(?:jpe?g|png|p[gp]m|tiff?|bmp)\Z", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -326,7 +327,4 @@ def _times_by_name(path: Path) -> dict[str, float]:
 def _image_name(prefix: str) -> str:
     """An image's name without folder and ending, by which rows and times belong together."""
     name = prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
-    for suffix in _IMAGE_SUFFIXES:
-        if name.lower().endswith(suffix):
-            return name[: -len(suffix)]
-    return name
+    return _IMAGE_SUFFIX.sub("", name)

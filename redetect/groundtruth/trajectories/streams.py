@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import parse_numbers, read_rows, read_table
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
@@ -35,10 +35,7 @@ _COVARIANCE_COLUMNS = 13
 class PlanarPoses:
     """Poses of a robot on the floor over time.
 
-    Raises
-    ------
-    GroundTruthError
-        If shapes disagree, a number is not finite or times descend.
+    Raises `GroundTruthError` if shapes disagree, a number is not finite or times descend.
     """
 
     times_s: FloatArray  # (N,): seconds, not descending
@@ -103,7 +100,7 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
 
     Raises
     ------
-    StreamError
+    GroundTruthError
         If the file cannot be read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
@@ -111,15 +108,16 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     for line, words in read_rows(path):
         if len(words) not in allowed:
             expected = f"{' or '.join(map(str, allowed))}: t, x, y, theta and 9 of covariance"
-            raise StreamError(path, line, f"{len(words)} numbers: expected {expected}")
+            raise GroundTruthError(f"{path}:{line}: {len(words)} numbers: expected {expected}")
         allowed = (len(words),)
         rows.append(parse_numbers(path, line, words))
         if len(rows) > 1 and rows[-1][0] < rows[-2][0]:
-            raise StreamError(
-                path, line, f"time {rows[-1][0]:.6f} s is before the row above: expected in order"
+            raise GroundTruthError(
+                f"{path}:{line}: time {rows[-1][0]:.6f} s is before the row above: expected in "
+                "order"
             )
     if not rows:
-        raise StreamError(path, None, "no poses in it")
+        raise GroundTruthError(f"{path}: no poses in it")
     table = np.array(rows)
     covariances = table[:, 4:].reshape(-1, 3, 3) if allowed == (_COVARIANCE_COLUMNS,) else None
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
@@ -167,13 +165,15 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
 
     Raises
     ------
-    StreamError
+    GroundTruthError
         If the file cannot be read, a row is malformed or a prefix is listed twice.
     """
     times: dict[str, float] = {}
     for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):
         if prefix in times:
-            raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
+            raise GroundTruthError(
+                f"{path}:{line}: prefix {excerpt(prefix)} is listed a second time"
+            )
         times[prefix] = seconds
     return times
 

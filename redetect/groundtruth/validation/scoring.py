@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -140,16 +140,12 @@ class RelativeScore:
 def read_relations(path: str | os.PathLike[str]) -> Relations:
     """Read a file of relations: rows t_i, t_j, x, y, z, roll, pitch, yaw between blanks or commas.
 
-    Of these x, y and yaw count: poses are on a floor.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read or a row is malformed; the message names file and line.
+    Of these x, y and yaw count: poses are on a floor. Raises `GroundTruthError` if the file cannot
+    be read or a row is malformed; the message names file and line.
     """
     rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
     if not rows:
-        raise StreamError(path, None, "no relations in it")
+        raise GroundTruthError(f"{path}: no relations in it")
     table = np.array([row.numbers for row in rows])
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 

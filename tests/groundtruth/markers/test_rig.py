@@ -224,7 +224,6 @@ def test_markers_never_seen_together_are_bridged_by_a_third() -> None:
     kept = ({0, 4}, {4, 1}, {1, 5}, {5, 2}, {2, 3})
     estimate = estimated(walk_round(rig, 40, seed=7, kept=kept), rig, reference=31)
     assert set(estimate.pairs) == {(0, 4), (1, 4), (1, 5), (2, 5), (2, 3)}
-    assert [rig.ids[p] for p in estimate.parents] == [31, 35, 36, 33, 31, 32]
     square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
     assert square / dof < 2.0
 
