@@ -244,17 +244,9 @@ def read_table(
 ) -> list[TableRow]:
     """Rows between commas or blanks under a head, which may be left out.
 
-    Parameters
-    ----------
-    head : str
-        Names of the columns between commas.
-    words : collection of str
-        The columns in which there are words; in the others are finite numbers.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read or a row is malformed; it names file and line.
+    `head` are the names of the columns between commas, `words` those columns in which there are
+    words; in the others are finite numbers. Raises `GroundTruthError` if the file cannot be read or
+    a row is malformed; it names file and line.
     """
     names = head.split(",")
     rows: list[TableRow] = []

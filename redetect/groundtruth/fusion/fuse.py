@@ -313,22 +313,10 @@ def leave_out(
 ) -> tuple[LeftOut, ...]:
     """Leave each segment of the ground truth between two others out, and predict it.
 
-    Parameters
-    ----------
-    odometry, streams, settings
-        As of `redetect.groundtruth.fusion.fuse.fuse`. Segments are those of the first stream; the
-        others are left out at the same times.
-
-    Returns
-    -------
-    tuple of LeftOut
-        In order of time. The first segment and the last are not among them, since a fused path goes
-        from the first measured pose to the last.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are fewer than three segments within the odometry's time.
+    Takes what `fuse` takes. Segments are those of the first stream; the others are left out at the
+    same times. The first segment and the last are not among the results, since a fused path goes
+    from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
+    three segments within the odometry's time.
     """
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)

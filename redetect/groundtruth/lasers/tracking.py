@@ -382,11 +382,8 @@ def track_without_suspects(
     """Follow the robot, leaving out scanners whose readings do not fit the others'.
 
     One at a time, the worst first, and only while three scanners or more are left to say so.
-
-    Returns
-    -------
-    left_out : dict of str to (2, 3) float64
-        By scanner, the shift that its readings suggest and its standard deviations.
+    Returns the track and, of those left out, the shift that their readings suggest and its standard
+    deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
     track = track_robot(sets, fixed, robot, settings)
@@ -422,28 +419,16 @@ LARGEST_GAP_S = 0.05
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
-    """Poses of a track, each from `sets_per_pose` consecutive sets.
+    """Poses of a track, each from `sets_per_pose` consecutive sets; 1: every set by itself.
 
-    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set
-    is in one pose only, so that the readings' errors in different poses are independent; those of
-    the scanners' poses are common to all and are not averaged away.
+    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set is
+    in one pose only, so that the readings' errors in different poses are independent; those of the
+    scanners' poses are common to all and are not averaged away. A block is shorter at the end of a
+    visit, and where sets have no determined pose.
 
-    Parameters
-    ----------
-    sets_per_pose : int
-        1: every set by itself. A block is shorter at the end of a visit, and where sets have no
-        determined pose.
-
-    Returns
-    -------
-    PlanarPoses
-        Sets with an undetermined direction come as poses of their own, with the covariance that
-        says so; those whose front is unknown do not come at all.
-
-    Raises
-    ------
-    GroundTruthError
-        If `sets_per_pose` is not positive.
+    Sets with an undetermined direction come as poses of their own, with the covariance that says
+    so; those whose front is unknown do not come at all. Raises `GroundTruthError` if
+    `sets_per_pose` is not positive.
     """
     if sets_per_pose < 1:
         raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")

@@ -238,17 +238,9 @@ def adjust_bundle(
 ) -> AdjustedBundle:
     """Adjust all free poses: robustly first, then by least squares without the wrong views.
 
-    Parameters
-    ----------
-    bundle : Bundle
-        Its poses are the start.
-    outlier_sigma, outlier_px : float
-        A view is wrong if its normalised error and its residuals (px) are larger than these.
-
-    Raises
-    ------
-    GeometryError
-        If the start has a point behind its camera, or the points do not determine the poses.
+    The bundle's poses are the start. A view is wrong if its normalised error and its residuals (px)
+    are larger than `outlier_sigma` and `outlier_px`. Raises `GeometryError` if the start has a
+    point behind its camera, or the points do not determine the poses.
     """
     everything = np.ones(len(bundle.seen), dtype=np.bool_)
     bundle = _minimised(bundle, everything, _ROBUST, _NEAR)

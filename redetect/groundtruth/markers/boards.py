@@ -105,17 +105,10 @@ class BoardsFile:
 
 
 def read_boards(path: Path) -> BoardsFile:
-    """Read a ``boards.json`` and the calibrations of its cameras.
+    """Read a ``boards.json``, or that of a folder, and the calibrations of its cameras.
 
-    Parameters
-    ----------
-    path : path
-        The file, or its folder.
-
-    Raises
-    ------
-    GroundTruthError, camera.CameraError
-        If a file cannot be read or an entry is missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
+    missing or impossible.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
     content = JsonObject.read(path)

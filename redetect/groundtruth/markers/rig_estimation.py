@@ -33,7 +33,7 @@ from redetect.groundtruth.markers.pairs import (
 from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
-from redetect.groundtruth.settings import RigSettings
+from redetect.groundtruth.settings import PoseSettings, RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
 
@@ -154,6 +154,7 @@ def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) ->
         rig,  # with identities: the marker itself is the body
         chain_points([view], rig, settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
+        PoseSettings(loss="linear"),
     )
     found = []
     for start in view_poses(problem, 0):
@@ -306,16 +307,8 @@ _REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
 def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSettings) -> RigEstimate:
     """Put a rig into the frame in which some of its markers are known.
 
-    Parameters
-    ----------
-    known : Rig
-        One or more of its markers in the robot's frame; their covariances, apart from each other,
-        are their priors'.
-
-    Raises
-    ------
-    GroundTruthError
-        If the rig has none of them.
+    `known` has one or more of its markers in the robot's frame; their covariances, apart from each
+    other, are their priors'. Raises `GroundTruthError` if the rig has none of them.
     """
     ids = estimate.rig.ids
     common = [marker for marker in ids if marker in known.ids]
@@ -335,26 +328,10 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
 def rig_by_reference_poses(
     estimate: RigEstimate, reference: PlanarPoses, settings: RigSettings
 ) -> tuple[RigEstimate, int]:
-    """Put a rig into the frame of a robot whose poses are known at some times.
+    """Put a rig into the frame of a robot whose poses, standing level, are known at some times.
 
-    Parameters
-    ----------
-    estimate : RigEstimate
-        Made with a network, whose world is that of the poses.
-    reference : PlanarPoses
-        The robot standing level.
-    settings : RigSettings
-        With the tolerance between a pose's time and an image's.
-
-    Returns
-    -------
-    int
-        How many times have a known pose.
-
-    Raises
-    ------
-    GroundTruthError
-        If none has one.
+    The estimate was made with a network, whose world is that of the poses. Returns how many times
+    have a known pose as well; raises `GroundTruthError` if none has one.
     """
     bundle = estimate.adjusted.bundle
     body_of_view = bundle.seen.body[np.searchsorted(bundle.view, np.arange(len(estimate.views)))]

@@ -70,17 +70,9 @@ def marker_corners(width_m: float) -> FloatArray:
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read a ``rig.json``.
+    """Read a ``rig.json``; its markers come in the order of their identifiers.
 
-    Returns
-    -------
-    Rig
-        Markers in the order of their identifiers.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
     """
     content = JsonObject.read(path)
     dictionary = content.text("dictionary", "its name")
@@ -99,17 +91,10 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 
 def read_network(path: str | os.PathLike[str]) -> Network:
-    """Read a ``network.json`` and the calibrations that it names.
+    """Read a ``network.json`` and the calibrations that it names; cameras by the order of names.
 
-    Returns
-    -------
-    Network
-        Cameras in the order of their names.
-
-    Raises
-    ------
-    GroundTruthError, camera.CameraError
-        If a file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
+    missing or impossible.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))

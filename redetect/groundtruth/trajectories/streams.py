@@ -92,16 +92,9 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
 def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
-    Parameters
-    ----------
-    path : path
-        Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#`
-        comments, which the real files do not have, are skipped.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read or a row is malformed; the message names file and line.
+    Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#` comments,
+    which the real files do not have, are skipped. Raises `GroundTruthError` if the file cannot be
+    read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
@@ -156,17 +149,10 @@ def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Read a ``.times`` file: rows ``prefix seconds``, with `#` comments.
+    """Read a ``.times`` file, rows ``prefix seconds`` with `#` comments: seconds by image prefix.
 
-    Returns
-    -------
-    dict of str to float
-        Seconds by image prefix.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, a row is malformed or a prefix is listed twice.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or a prefix is listed
+    twice.
     """
     times: dict[str, float] = {}
     for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):

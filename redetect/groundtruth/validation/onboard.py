@@ -199,19 +199,9 @@ def _median(metres: FloatArray) -> FloatArray:
 def refine_pose(
     distances: DistancePose, still: StillScans, segments: FloatArray
 ) -> ReferencePose | None:
-    """Combine what distances and walls say of a pose.
+    """Combine what distances and walls (S, 4) (m) say of a pose.
 
-    Parameters
-    ----------
-    distances : DistancePose
-        Of status `ok`, or `ambiguous`: then the walls decide, or nothing does.
-    segments : (S, 4) array
-        The building's walls (m).
-
-    Returns
-    -------
-    ReferencePose or None
-        None if several poses fit and the walls do not decide.
+    If distances are `ambiguous`, the walls decide; None if they do not.
     """
     chosen = 0
     if distances.status == "ambiguous":
@@ -280,13 +270,6 @@ _GATES_M = (0.2, 0.1, 0.05, 0.05, 0.05, 0.05)
 _LEAST_SIGMA_M = 1e-3
 
 
-class RangeErrors(NamedTuple):
-    """Errors of N readings that are on walls."""
-
-    incidence_rad: FloatArray  # (N,): between the beam and the wall's normal, 0 to pi/2
-    error_m: FloatArray  # (N,): reading minus the wall's distance along the beam
-
-
 class RefinedMounts(NamedTuple):
     """Where M scanners are on the robot."""
 
@@ -314,8 +297,14 @@ def first_walls(
     return far[rows, first], np.arccos(np.minimum(cosine, 1.0))
 
 
-def range_errors(references: Sequence[ReferencePose], segments: FloatArray) -> RangeErrors:
-    """Errors of the averaged readings at reference poses that scans refined."""
+def range_errors(
+    references: Sequence[ReferencePose], segments: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of the averaged readings at reference poses that scans refined.
+
+    Returns, of N readings that are on walls, the angle between beam and the wall's normal (N,) (0
+    to pi/2), and the reading minus the wall's distance along the beam (N,) (m).
+    """
     angles, errors = [np.zeros(0)], [np.zeros(0)]
     for reference in references:
         if reference.still is None or reference.scans != "used":
@@ -326,7 +315,7 @@ def range_errors(references: Sequence[ReferencePose], segments: FloatArray) -> R
             of_a_wall = np.abs(scan.range_m - far) < _OF_A_WALL_M
             angles.append(incidence[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])
-    return RangeErrors(np.concatenate(angles), np.concatenate(errors))
+    return np.concatenate(angles), np.concatenate(errors)
 
 
 def refine_mounts(

@@ -69,22 +69,10 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
-    """Read a ``distances.csv``.
+    """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
-    Parameters
-    ----------
-    survey : Survey
-        The file may contain only its points.
-
-    Returns
-    -------
-    list of Distance
-        In the file's order.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, a row is malformed or names a point that is not known.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names a point that
+    is not known.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
@@ -146,13 +134,7 @@ class DistancePose:
 
 
 def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[DistancePose]:
-    """Work out every pose for which distances were measured.
-
-    Returns
-    -------
-    list of DistancePose
-        In order of the poses' times.
-    """
+    """Work out every pose for which distances were measured, in order of the poses' times."""
     by_pose: dict[int, list[Distance]] = {}
     for distance in distances:
         by_pose.setdefault(distance.pose, []).append(distance)

@@ -55,12 +55,7 @@ class PoseScore:
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
     """Errors of poses whose truth is known at the same times.
 
-    Parameters
-    ----------
-    poses, truth : PlanarPoses
-        With the same times. If the truth has covariances, they count in the normalised error.
-    unmatched : int
-        Handed through.
+    If the truth has covariances, they count in the normalised error. `unmatched` is handed through.
     """
     error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
@@ -155,15 +150,8 @@ def score_relations(
 ) -> RelativeScore:
     """Hold poses against known relations; the poses are interpolated at the relations' times.
 
-    Parameters
-    ----------
-    largest_gap_s : float
-        Nothing is interpolated across longer gaps.
-
-    Raises
-    ------
-    GroundTruthError
-        If no relation has poses at both its times.
+    But not across gaps longer than `largest_gap_s`. Raises `GroundTruthError` if no relation has
+    poses at both its times.
     """
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)

@@ -194,28 +194,15 @@ class _Row(NamedTuple):
 
 
 def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGraph:
-    """Read a graph of a run.
+    """Read a graph of a run that is in some axes; the result is in the data set's.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    axes : str
-        The axes that it is in.
+    Where the file has no ``# FRAME`` comments, poses are called by their vertices' numbers and
+    qualities are unknown. Discs whose vertices all have numbers above the power of ten over the
+    poses' are counted from there, others named by the vertex.
 
-    Returns
-    -------
-    RunGraph
-        In the data set's axes. Where the file has no ``# FRAME`` comments, poses are called by
-        their vertices' numbers and qualities are unknown. Discs whose vertices all have numbers
-        above the power of ten over the poses' are counted from there, others named by the vertex.
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read, a row is malformed or names a vertex that is missing, an
-        information matrix is not positive definite, the poses are no chain from each to the next
-        number, or the file says that its axes are others; the message names file and line.
+    Raises `SlamError` if the file cannot be read, a row is malformed or names a vertex that is
+    missing, an information matrix is not positive definite, the poses are no chain from each to the
+    next number, or the file says that its axes are others; the message names file and line.
     """
     rows = _read_rows(path, axes)
     _once(path, [*rows[_POSE], *rows[_DISC]], "there is a vertex {} already")

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
-from redetect.groundtruth.markers.refinement import Floor, PoseProblem
+from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
+from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
@@ -25,6 +26,10 @@ FloatArray = NDArray[np.float64]
 #: A mild barrel distortion, so that no test passes by ignoring the lens.
 COEF = (-0.02, -0.08, 0.1, 0.1, 0.0)
 NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+#: Of the poses, without a robust loss.
+LEAST_SQUARES = PoseSettings(loss="linear")
 
 
 def lens(scale_px: float = 900.0, coef: tuple[float, ...] = COEF) -> Camera:
@@ -134,7 +139,7 @@ def pose_problem(
     noise: np.random.Generator | None = None,
     camera_covariance: FloatArray | None = None,
     marker_covariance: FloatArray | None = None,
-    floor: Floor | None = None,
+    settings: PoseSettings = LEAST_SQUARES,
     rig: Rig | None = None,
     scale_px: float = 900.0,
 ) -> PoseProblem:
@@ -150,7 +155,7 @@ def pose_problem(
     if marker_covariance is not None:
         rig = replace(rig, covariance=marker_covariance)
     network = network_of(world_from_camera, camera_covariance, scale_px)
-    return PoseProblem(network, rig, seen, view, floor)
+    return PoseProblem(network, rig, seen, view, settings)
 
 
 def network_of(
