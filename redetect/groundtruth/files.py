@@ -17,7 +17,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.bounded import read_content
 from redetect.storage.bounds import FINITE, Bounds
 from redetect.storage.messages import excerpt, one_line
@@ -180,8 +180,7 @@ def write_json(
 
     Numbers that are not finite, which JSON does not have, are null.
     """
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((_laid_out(content) + "\n").encode())
+    write_bytes(path, (_laid_out(content) + "\n").encode(), overwrite=overwrite)
 
 
 def _laid_out(value: Any, indent: str = "") -> str:

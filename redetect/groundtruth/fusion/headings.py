@@ -163,9 +163,7 @@ def pair_headings(
     if len(segment) < fewest:
         return None
     reach = largest_offset_s + largest_drift * (segment.times_s[-1] - segment.times_s[0])
-    near = (odometry.times_s >= segment.times_s[0] - 2.0 * reach) & (
-        odometry.times_s <= segment.times_s[-1] + 2.0 * reach
-    )
+    near = odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
     if np.count_nonzero(near) < fewest:
         return None
     odometry = PlanarPoses(odometry.times_s[near], odometry.poses[near])

@@ -149,7 +149,7 @@ def gather(
     for name, stream in streams.items():
         if stream.covariances is None:
             raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
-        inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
+        inside = stream.during(odometry.times_s[0], odometry.times_s[-1])
         again = inside & _repeats(stream, stream.covariances)
         repeated[name] = int(np.count_nonzero(again))
         inside &= ~again

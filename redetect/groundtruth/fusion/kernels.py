@@ -201,9 +201,7 @@ def filter_forward(
     """
     controls, nodes = odometry.controls, measured.nodes
     keep = len(history.predicted) > 0
-    predicted, predicted_covariance = history.predicted, history.predicted_covariance
-    filtered, filtered_covariance = history.filtered, history.filtered_covariance
-    transitions = history.transitions
+    predicted, predicted_covariance, filtered, filtered_covariance, transitions = history
     squared_innovations = np.zeros(len(nodes))
     accepted = np.zeros(len(nodes), np.bool_)
     restarted = np.empty(len(controls), np.int8)
@@ -280,9 +278,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
 
     Returns `states`, `covariances` (N, d), (N, d, d).
     """
-    predicted, predicted_covariance = history.predicted, history.predicted_covariance
-    filtered, filtered_covariance = history.filtered, history.filtered_covariance
-    transitions = history.transitions
+    predicted, predicted_covariance, filtered, filtered_covariance, transitions = history
     smoothed, smoothed_covariance = np.empty_like(filtered), np.empty_like(filtered_covariance)
     last = predicted.shape[0] - 1
     smoothed[last] = filtered[last]

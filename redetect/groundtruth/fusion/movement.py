@@ -442,7 +442,7 @@ def movement_problem(
     """
     names, times, measured, covariances, repaired, repeated = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
-    inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
+    inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
     controls, unseen = movements(odometry, node_times, settings)
     return MovementProblem(

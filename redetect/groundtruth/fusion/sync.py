@@ -372,9 +372,10 @@ def _refined(
     largest: tuple[float, float],
 ) -> ClockSegment:
     assert groundtruth.covariances is not None
-    here = (groundtruth.times_s >= segment.from_s) & (groundtruth.times_s <= segment.to_s)
-    robot_s = odometry.times_s - segment.offset_s
-    near = (robot_s >= segment.from_s - _MARGIN_S) & (robot_s <= segment.to_s + _MARGIN_S)
+    here = groundtruth.during(segment.from_s, segment.to_s)
+    near = odometry.during(
+        segment.from_s + segment.offset_s - _MARGIN_S, segment.to_s + segment.offset_s + _MARGIN_S
+    )
     steps = np.diff(odometry.poses[near][:, :2], axis=0)
     if (
         np.count_nonzero(here) < _FEWEST_POSES

@@ -27,7 +27,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     new_points,
 )
 from redetect.groundtruth.settings import LaserSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, compose
 
@@ -149,8 +149,7 @@ class Tracker:
             if fitted is None:
                 self.track.status[i], pose = COASTING, predicted
                 continue
-            error = fitted - predicted
-            error[2] = wrap_angle(error[2])
+            error = pose_differences(fitted, predicted)
             # At first no motion is known: it follows the poses more quickly.
             young = max(0.0, 1.0 - (i - begun) / 12.0)
             pose = predicted + (_POSE_GAIN + (1.0 - _POSE_GAIN) * young) * error
@@ -459,8 +458,7 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     middle = mean_of(times - origin)
     lead = track.poses[rows[begins]]
     moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
-    apart = moved - lead[block]
-    apart[:, 2] = wrap_angle(apart[:, 2])
+    apart = pose_differences(moved, lead[block])
     # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
     # with equal weights at the mean time an error of the motion drops out.
     mean, noise = mean_of(apart), mean_of(track.noise[rows]) / size[:, None, None]

@@ -188,11 +188,8 @@ def _chained(
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
     """The pose with the least sum of distances (m, rad) to the others."""
     stack = np.stack(poses)
-    sums = [
-        float(np.sum(np.minimum(np.linalg.norm(log_se3(inverse(pose) @ stack), axis=1), 1.0)))
-        for pose in stack
-    ]
-    return np.asarray(stack[int(np.argmin(sums))])
+    apart = np.linalg.norm(log_se3(inverse(stack)[:, None] @ stack), axis=-1)
+    return np.asarray(stack[int(np.argmin(np.minimum(apart, 1.0).sum(axis=1)))])
 
 
 def _bundle(

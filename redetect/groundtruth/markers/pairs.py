@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
     inverse,
@@ -58,15 +57,11 @@ class PairConsensus:
 
 def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     """Estimates of `a_from_b` from one time's solutions of both markers, every combination."""
-    poses, covariances, costs = [], [], []
-    for i in range(len(a.poses)):
-        a_from_reference = inverse(a.poses[i])
-        own = inverse_covariance(a.poses[i], a.covariances[i])
-        for j in range(len(b.poses)):
-            poses.append(a_from_reference @ b.poses[j])
-            covariances.append(composed_covariance(own, b.poses[j], b.covariances[j]))
-            costs.append(a.costs[i] + b.costs[j])
-    return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
+    poses = inverse(a.poses)[:, None] @ b.poses
+    own = inverse_covariance(a.poses, a.covariances)[:, None]
+    covariances = composed_covariance(own, b.poses, b.covariances)
+    costs = np.add.outer(a.costs, b.costs).ravel()
+    return MarkerPose(poses.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6), costs)
 
 
 def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
@@ -135,15 +130,17 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
 def chained_poses(
     relative: Mapping[tuple[int, int], FloatArray], parents: Sequence[int], root: int
 ) -> FloatArray:
-    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b."""
-    poses: dict[int, FloatArray] = {root: np.eye(4)}
-    while len(poses) < len(parents):
-        before = len(poses)
-        for marker, parent in enumerate(parents):
-            if marker not in poses and parent in poses:
-                known = relative.get((parent, marker))
-                step = inverse(relative[marker, parent]) if known is None else known
-                poses[marker] = poses[parent] @ step
-        if len(poses) == before:
-            raise GroundTruthError("a marker is not connected to the others")
-    return np.stack([poses[marker] for marker in range(len(parents))])
+    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b.
+
+    All are connected.
+    """
+
+    def placed(marker: int) -> FloatArray:
+        if marker == root:
+            return np.eye(4)
+        parent = parents[marker]
+        known = relative.get((parent, marker))
+        step = inverse(relative[marker, parent]) if known is None else known
+        return np.asarray(placed(parent) @ step)
+
+    return np.stack([placed(marker) for marker in range(len(parents))])

@@ -137,10 +137,7 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
     """The poses between the beginnings and ends of visits; all, if there is no visit."""
     if not visits:
         return poses
-    inside = np.zeros(len(poses), dtype=np.bool_)
-    for first, last in visits:
-        inside |= (poses.times_s >= first) & (poses.times_s <= last)
-    return poses.only(inside)
+    return poses.only(np.any([poses.during(*visit) for visit in visits], axis=0))
 
 
 def _read(

@@ -21,7 +21,7 @@ from redetect.groundtruth.files import parse_numbers, read_rows, read_table
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.messages import excerpt
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
@@ -77,6 +77,10 @@ class PlanarPoses:
         """The chosen poses, by a mask, indices or a slice."""
         covariances = None if self.covariances is None else self.covariances[chosen]
         return PlanarPoses(self.times_s[chosen], self.poses[chosen], covariances)
+
+    def during(self, from_s: float, to_s: float) -> BoolArray:
+        """(N,) which poses are of a span of time, its ends included."""
+        return np.asarray((self.times_s >= from_s) & (self.times_s <= to_s))
 
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
@@ -135,8 +139,7 @@ def write_planar_poses(
     path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
 ) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_planar_poses(poses).encode())
+    write_bytes(path, format_planar_poses(poses).encode(), overwrite=overwrite)
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
@@ -189,8 +192,7 @@ def interpolate_poses(
     known = inside & (gap <= largest_gap_s)
     before, after, gap = before[known], after[known], gap[known]
     part = np.where(gap > 0.0, (times_s[known] - poses.times_s[before]) / np.where(gap, gap, 1), 0)
-    change = poses.poses[after] - poses.poses[before]
-    change[:, 2] = wrap_angle(change[:, 2])
+    change = pose_differences(poses.poses[after], poses.poses[before])
     between = poses.poses[before] + part[:, None] * change
     covariances = None
     if poses.covariances is not None:
@@ -260,7 +262,7 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
 
 
 def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
-    """(N, 3) poses minus the truth's, headings the short way round."""
+    """(..., 3) poses minus the truth's, headings the short way round."""
     difference = poses - truth
-    difference[:, 2] = wrap_angle(difference[:, 2])
+    difference[..., 2] = wrap_angle(difference[..., 2])
     return difference

@@ -149,7 +149,7 @@ def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> F
 def composed_covariance(
     a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
 ) -> FloatArray:
-    """(6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
+    """(..., 6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
     moved = adjoint(inverse(b_from_c))
     return np.asarray(
         moved @ a_covariance @ np.swapaxes(moved, -1, -2) + b_covariance, dtype=np.float64
@@ -157,7 +157,7 @@ def composed_covariance(
 
 
 def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(6, 6) covariance of b_from_a, from that of a_from_b."""
+    """(..., 6, 6) covariance of b_from_a, from that of a_from_b."""
     moved = adjoint(a_from_b)
     return np.asarray(moved @ covariance @ np.swapaxes(moved, -1, -2), dtype=np.float64)
 

@@ -23,6 +23,7 @@ from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
@@ -219,8 +220,7 @@ def refine_pose(
         return _unrefined(distances, "undetermined", reason, chosen, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
-    apart = found.pose - prior
-    apart[2] = wrap_angle(apart[2])
+    apart = pose_differences(found.pose, prior)
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
     if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
         reason = (
@@ -361,8 +361,7 @@ def refine_mounts(
         sigma = max(float(np.sqrt(np.mean(error**2))), _LEAST_SIGMA_M)
         of_prior = np.zeros((len(used), 3, count + len(used), 3))
         of_prior[range(len(used)), :, range(count, count + len(used))] = roots
-        missing = poses - priors
-        missing[:, 2] = wrap_angle(missing[:, 2])
+        missing = pose_differences(poses, priors)
         unknowns = 3 * (count + len(used))
         of_walls = np.concatenate(rows).reshape(-1, unknowns) / sigma
         jacobian = np.concatenate([of_walls, of_prior.reshape(-1, unknowns)])

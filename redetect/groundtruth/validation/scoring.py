@@ -293,10 +293,7 @@ def reference_errors(
         References at whose time there is no ground truth.
     """
     times = np.array([r.time_s for r in references])
-    after = np.clip(np.searchsorted(poses.times_s, times), 0, len(poses) - 1)
-    before = np.maximum(after - 1, 0)
-    earlier = times - poses.times_s[before] <= np.abs(poses.times_s[after] - times)
-    nearest = np.where(earlier, before, after)
+    nearest = np.argmin(np.abs(times[:, None] - poses.times_s), axis=1)
     known = np.abs(poses.times_s[nearest] - times) <= _FARTHEST_S
     without = [
         Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")

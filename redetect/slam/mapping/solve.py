@@ -29,6 +29,8 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
 
+_MOST_STEPS = 200
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -90,7 +92,6 @@ def solve(
     weighting: Weighting,
     *,
     tolerance: float = 1e-10,
-    most_steps: int = 200,
 ) -> Solution:
     """Minimise the sum of squared (or robust) whitened errors.
 
@@ -106,7 +107,7 @@ def solve(
                 problem,
                 estimate,
                 tolerance=tolerance,
-                most_steps=most_steps,
+                most_steps=_MOST_STEPS,
                 refined=problem.with_best_positions,
             )
     except StartError:
@@ -115,7 +116,7 @@ def solve(
         ) from None
     if not found.converged:
         raise SlamError(
-            f"least squares: no minimum within {most_steps} steps: chi-squared is "
+            f"least squares: no minimum within {_MOST_STEPS} steps: chi-squared is "
             f"{found.costs[-1]:.6g} and falling"
         )
     return Solution(found.at, found.costs[-1], found.costs)
