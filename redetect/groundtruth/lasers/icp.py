@@ -174,7 +174,8 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
     n = len(p)
     middle_p, middle_q = p.sum(axis=0) / n, q.sum(axis=0) / n
     a, b = p - middle_p, q - middle_q
-    theta = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    dot = np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+    theta = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), dot)
     c, s = math.cos(theta), math.sin(theta)
     x = middle_q[0] - (c * middle_p[0] - s * middle_p[1])
     y = middle_q[1] - (s * middle_p[0] + c * middle_p[1])
