@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from detect.markers.dictionaries import MarkerDictionary
 from detect.settings import MarkerSettings
-
-FloatArray = NDArray[np.float64]
-GreyImage = NDArray[np.uint8]
+from redetect.array_types import FloatArray, GreyImage
 
 #: A disc of radius r as an octagon: half the side of its square, in r; its crosses do the rest.
 _SQUARE_SHARE = math.sqrt(2.0) - 1.0

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from camera import Camera
@@ -39,9 +38,8 @@ from detect.markers.geometry import (
 )
 from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
 from detect.settings import MarkerSettings
+from redetect.array_types import FloatArray, GreyImage, IntArray
 from redetect.landmarks import MarkerCorner, MarkerLandmark
-
-FloatArray = NDArray[np.float64]
 
 #: Fates of candidates, beside the causes of rejection.
 ACCEPTED = "accepted"
@@ -74,7 +72,6 @@ class Candidate:
 
     outline: FloatArray  # (4, 2) its rough corners, pixels of the image
     fate: str  # "accepted" or why not
-    refined: RefinedQuadrangle | None = None  # its fitted edges, if it came so far
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class MarkerDetections:
     """The N markers found in one image, by ID and place, and the rejected candidates."""
 
     dictionary: str
-    ids: NDArray[np.int64]  # (N,)
+    ids: IntArray  # (N,)
     #: (N, 4, 2) top left, top right, bottom right, bottom left as printed; pixels of the image.
     corners: FloatArray
     covariance: FloatArray  # (N, 4, 2, 2) of each corner, pixels squared
@@ -121,7 +118,7 @@ class _Marker(NamedTuple):
 
 
 def detect_markers(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     settings: MarkerSettings,
     camera: Camera | None = None,
 ) -> MarkerDetections:
@@ -180,7 +177,7 @@ def detect_markers(
         else:
             fate = ACCEPTED
             markers.append(found)
-        candidates.append(Candidate(outline, fate, refined))
+        candidates.append(Candidate(outline, fate))
 
     # Back to the image as it is.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))

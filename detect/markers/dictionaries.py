@@ -26,8 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import BoolArray, FloatArray, IntArray
 
 #: ARToolKitPlus' simple code: a number of 9 bits is written four times, each time scrambled.
 _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
@@ -48,8 +47,8 @@ class MarkerDictionary:
     """A set of markers; its name is one of `dictionary_names`."""
 
     name: str
-    ids: NDArray[np.int64]  # (N,)
-    patterns: NDArray[np.bool_]  # (N, G, G) cells, True for white; row 0 is the marker's top
+    ids: IntArray  # (N,)
+    patterns: BoolArray  # (N, G, G) cells, True for white; row 0 is the marker's top
     centres: FloatArray  # (G,) where columns and rows have their centres, in widths of the marker
     cell: float  # width of a cell, in widths of the marker
 
@@ -98,7 +97,7 @@ def marker_dictionary(name: str) -> MarkerDictionary:
     return MarkerDictionary(name, np.arange(len(patterns)), patterns, centres, 1.0 / cells)
 
 
-def simple_patterns() -> NDArray[np.bool_]:
+def simple_patterns() -> BoolArray:
     """(512, 6, 6) cells of ARToolKitPlus' simple code by number, True for white."""
     ids = np.arange(1 << _SIMPLE_BITS)
     copies = [(ids ^ mask) << (_SIMPLE_BITS * k) for k, mask in enumerate(_SIMPLE_MASKS)]
@@ -122,7 +121,7 @@ class Templates:
     blurred: tuple[NDArray[np.float32], ...]  # for each blur, less their mean, of length 1
     weakness: float  # how likely a pattern occurs by chance, from 0 (hardly ever) to 1
     decoys: NDArray[np.float32]  # (D, G * G) content of other frames: nothing, a bar, or a half
-    plain: NDArray[np.bool_]  # (T,) which of the templates are similar to these
+    plain: BoolArray  # (T,) which of the templates are similar to these
     lines: FloatArray  # (L,) where cells end, and the square, in its widths from 0 to 1
     grid: slice  # rows, and columns, of the grid among the cells between the lines
     border: float  # least thickness of the black border in widths of the marker
@@ -198,8 +197,8 @@ def _blurred(
 
 
 def _decoys(
-    varied: NDArray[np.bool_], patterns: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    varied: BoolArray, patterns: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], BoolArray]:
     """Patterns of frames, bars, panes, and which of the markers' are within two cells of them.
 
     Decoys that are as near a marker's pattern are left out: it could never be found.

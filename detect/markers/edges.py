@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from detect.markers.geometry import Picture, is_convex
 from detect.positive_definite import invert_positive, solve_positive
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Cause of rejection, as it is counted.
 NO_EDGE = "edge not found"
@@ -166,7 +165,7 @@ def refine_quadrangle(
 
 @kernel()
 def _fit_edges(
-    grey: NDArray[np.uint8],
+    grey: GreyImage,
     straight: NDArray[np.float32],
     corners: FloatArray,
     seen: FloatArray,
@@ -272,7 +271,7 @@ def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
 
 
 @kernel()
-def _pixels_along(grey: NDArray[np.uint8], straight: NDArray[np.float32], band: _Band) -> _Pixels:
+def _pixels_along(grey: GreyImage, straight: NDArray[np.float32], band: _Band) -> _Pixels:
     """Pixels near a line but not near its ends; of many, only some columns (rows)."""
     height, width = grey.shape
     start, end = band.seen_start, band.seen_end

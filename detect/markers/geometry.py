@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import FrameError
 from detect.grey_values import estimate_noise
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Rows of the image that its noise is estimated from.
 _NOISE_ROWS = 64
@@ -36,7 +35,7 @@ _STEP_PX = 0.5
 class Picture:
     """An image, its noise's standard deviation, and the camera that it was taken by, if known."""
 
-    grey: NDArray[np.uint8]  # (H, W)
+    grey: GreyImage  # (H, W)
     noise: float
     camera: Camera | None
     straight: NDArray[np.float32]  # (H, W, 2) straight position of each pixel
@@ -62,7 +61,7 @@ class Picture:
         return np.asarray(np.linalg.inv(np.stack(columns, axis=-1)))
 
 
-def picture_of(image: NDArray[np.uint8], camera: Camera | None) -> Picture:
+def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
     """An image (H, W) with its noise and the lens that it was taken through.
 
     Raises FrameError if the image has not the camera's size, or the camera sees nothing at some of
@@ -116,7 +115,7 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
 
 
 @kernel()
-def largest_quadrangle(points: FloatArray) -> NDArray[np.int64]:
+def largest_quadrangle(points: FloatArray) -> IntArray:
     """Indices (4,) of the largest quadrangle among points (N, 2), in the order of the points.
 
     Over each diagonal the highest triangles on both sides.
@@ -161,7 +160,7 @@ def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
     Others (N, 4, 2) are clockwise and convex, too.
     """
 
-    def inside(corners: FloatArray, point: FloatArray) -> NDArray[np.bool_]:
+    def inside(corners: FloatArray, point: FloatArray) -> BoolArray:
         side, to = corners[..., _NEXT, :] - corners, point[..., None, :] - corners
         return np.asarray(np.all(side[..., 0] * to[..., 1] > side[..., 1] * to[..., 0], axis=-1))
 

@@ -12,7 +12,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.markers.dictionaries import Templates
 from detect.markers.edges import LEAST_NOISE, OUTLIER, RefinedQuadrangle, robust_sigma
@@ -37,8 +36,7 @@ from detect.markers.pattern_model import (
     linearise,
     pattern_of,
 )
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray, IntArray
 
 #: Width of the seam round the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
@@ -216,7 +214,7 @@ def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
     return float(np.sqrt(np.diag(covariance).max()))
 
 
-def _inflation(pixel: NDArray[np.int64], left: Linearised) -> float:
+def _inflation(pixel: IntArray, left: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
     A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically

@@ -13,12 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: The parameters of a model: homography from the unit square to straight positions, whose last
 #: entry is 1; white and black, grey levels (factors of 1, x, y, x^2, xy, y^2 in sizes of the
@@ -51,7 +49,7 @@ class Pattern(NamedTuple):
 class Samples(NamedTuple):
     """Pixels to which a marker is fitted, row by row."""
 
-    pixel: NDArray[np.int64]  # (N, 2) u, v
+    pixel: IntArray  # (N, 2) u, v
     straight: FloatArray  # (N, 2) without distortion, from the marker's middle, pixels
     grey: FloatArray  # (N,)
     light: FloatArray  # (6, N) 1, x, y, x^2, xy, y^2 in sizes of the marker

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
-from redetect.storage import write_whole
-from redetect.storage.bounded import read_bounded
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.storage import write_bytes
+from redetect.storage.bounded import read_content
 from redetect.storage.bounds import FINITE, Bounds
 from redetect.storage.messages import excerpt, one_line
 
@@ -32,10 +32,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a file that holds a JSON object.
 
-    Raises
-    ------
-    GroundTruthError
-        If it cannot be read or is none.
+    Raises `GroundTruthError` if it cannot be read or is none.
     """
     text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
@@ -183,8 +180,7 @@ def write_json(
 
     Numbers that are not finite, which JSON does not have, are null.
     """
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((_laid_out(content) + "\n").encode())
+    write_bytes(path, (_laid_out(content) + "\n").encode(), overwrite=overwrite)
 
 
 def _laid_out(value: Any, indent: str = "") -> str:
@@ -207,22 +203,18 @@ def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -
     `largest_bytes`: a larger file is refused. `expected`: what should be in it, for the message
     about a file that is no text.
     """
+    content = read_content(path, largest_bytes, "file", GroundTruthError)
     try:
-        content = read_bounded(path, largest_bytes)
         if Path(path).suffix == ".gz":
             # Never more than is wanted, however well it is packed.
             content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(largest_bytes + 1)
             if len(content) > largest_bytes:
-                raise StreamError(path, None, f"unpacked, it has more than {largest_bytes} bytes")
+                raise GroundTruthError(f"{path}: unpacked, it has more than {largest_bytes} bytes")
         return content.decode("utf-8-sig")
-    except FileNotFoundError:
-        raise StreamError(path, None, "no such file") from None
     except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise StreamError(path, None, "is no complete gzip file") from None
+        raise GroundTruthError(f"{path}: is no complete gzip file") from None
     except UnicodeDecodeError:
-        raise StreamError(path, None, f"is no text: expected {expected}") from None
-    except OSError as error:
-        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
+        raise GroundTruthError(f"{path}: is no text: expected {expected}") from None
 
 
 def read_rows(
@@ -251,17 +243,9 @@ def read_table(
 ) -> list[TableRow]:
     """Rows between commas or blanks under a head, which may be left out.
 
-    Parameters
-    ----------
-    head : str
-        Names of the columns between commas.
-    words : collection of str
-        The columns in which there are words; in the others are finite numbers.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read or a row is malformed; it names file and line.
+    `head` are the names of the columns between commas, `words` those columns in which there are
+    words; in the others are finite numbers. Raises `GroundTruthError` if the file cannot be read or
+    a row is malformed; it names file and line.
     """
     names = head.split(",")
     rows: list[TableRow] = []
@@ -269,7 +253,7 @@ def read_table(
         if not rows and found == names:
             continue
         if len(found) != len(names):
-            raise StreamError(path, line, f"{len(found)} words: expected {head}")
+            raise GroundTruthError(f"{path}:{line}: {len(found)} words: expected {head}")
         texts = [word for name, word in zip(names, found) if name in words]
         numbers = [word for name, word in zip(names, found) if name not in words]
         rows.append(TableRow(line, texts, parse_numbers(path, line, numbers)))
@@ -279,7 +263,9 @@ def read_table(
 def known_name(path: str | os.PathLike[str], line: int, name: str, known: Collection[str]) -> str:
     """A word of a row, which must be one of those known."""
     if name not in known:
-        raise StreamError(path, line, f"{excerpt(name)}: expected one of {', '.join(known)}")
+        raise GroundTruthError(
+            f"{path}:{line}: {excerpt(name)}: expected one of {', '.join(known)}"
+        )
     return name
 
 
@@ -294,4 +280,4 @@ def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> 
     except ValueError:
         pass
     wrong = next(w for w in words if not (_NUMBER.fullmatch(w) and math.isfinite(float(w))))
-    raise StreamError(path, line, f"{excerpt(wrong)}: expected a finite number")
+    raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected a finite number")

@@ -30,10 +30,7 @@ _ODDS = Bounds("more than 1", 1.0, above=True, below=True)
 class _Bounded:
     """Settings whose numbers are within the bounds that annotate them.
 
-    Raises
-    ------
-    GroundTruthError
-        If a number is not.
+    Raises `GroundTruthError` if a number is not.
     """
 
     def __post_init__(self) -> None:
@@ -159,6 +156,11 @@ class SyncSettings(_Bounded):
     segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).
     # Refine the estimate by headings with the whole movement if the ground truth has covariances.
     use_movement: bool = True
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """Bounds of the offset (s) and the drift."""
+        return self.largest_offset_s, self.largest_drift
 
 
 @dataclass(frozen=True)

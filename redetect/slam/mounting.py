@@ -12,32 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from camera.calibration.model import cross_matrices
+from camera.calibration.model import cross_matrices, left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
-
-
-def rotation_exp(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations exp([v]x) of rotation vectors, by Rodrigues' formula, and their left Jacobians J.
-
-    To first order in d, ``exp([v + d]x) = exp([J d]x) exp([v]x)``. Takes (..., 3), radians; returns
-    two arrays (..., 3, 3).
-    """
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    # sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, all defined at a = 0.
-    sine = np.sinc(angle / np.pi)
-    versine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    small = angle < 1e-2
-    safe = np.where(small, 1.0, angle)
-    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    k = cross_matrices(vectors)
-    k2 = k @ k
-    return np.eye(3) + sine * k + versine * k2, np.eye(3) + versine * k + third * k2
-
-
-def nominal_mounting(camera: Camera) -> FloatArray:
-    """(3, 4) robot_from_camera as calibrated."""
-    return np.column_stack([camera.rotation, camera.centre])
 
 
 def rows_through_mounting(
@@ -95,8 +72,8 @@ def rows_as_recorded(
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
     from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
-    turn, left = rotation_exp(np.column_stack([tilt, np.zeros(len(tilt))]))
-    level = np.swapaxes(turn, 1, 2)
+    vectors = np.column_stack([tilt, np.zeros(len(tilt))])
+    level, left = np.swapaxes(rotation_of(vectors), 1, 2), left_jacobian(vectors)
     untilted = np.einsum("nij,nj->ni", level, from_centre)
     height = float(camera.centre[2])
     slope, by_ray = _on_floor(untilted @ unturn.T, height)

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from redetect.slam.models import OdometryNoise
+from redetect.slam.settings import AddedNoise, AssociateSettings
 
 # For `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
@@ -17,32 +18,17 @@ MaybeStr = Optional[str]  # noqa: UP045
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """Options of all commands that read the landmarks of a run.
+    """Options of all commands that read the landmarks of a run."""
 
-    Parameters
-    ----------
-    run : Path
-        Run folder, or a .circles or .lines file.
-    circles : bool
-        Use the discs; the default if neither kind is given.
-    lines : bool
-        Use the vertical lines.
-    stem : str
-        Name of the landmark files in the folder; by default map, else detected.
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines need one).
-    force : bool
-        Replace existing files.
-    odometry_noise : OdometryNoise
-        Of the steps that state no covariance.
-    """
-
-    run: Positional[Path]
-    circles: bool = False
-    lines: bool = False
+    run: Positional[Path]  # Run folder, or a .circles or .lines file.
+    circles: bool = False  # Use the discs; the default if neither kind is given.
+    lines: bool = False  # Use the vertical lines.
+    # Name of the landmark files in the folder; by default map, else detected.
     stem: MaybeStr = None
+    # Calibration, if it is not the one in the run folder (lines need one).
     camera: MaybePath = None
-    force: bool = False
+    force: bool = False  # Replace existing files.
+    # Of the steps that state no covariance.
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
     @property
@@ -53,14 +39,9 @@ class RunFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class RunsFlags(RunFlags):
-    """Options of commands that take several runs.
+    """Options of commands that take several runs."""
 
-    Parameters
-    ----------
-    more : several paths
-        Further runs of the same building, each from wherever it started.
-    """
-
+    # Further runs of the same building, each from wherever it started.
     more: Positional[tuple[Path, ...]] = ()
 
     @property
@@ -76,45 +57,28 @@ class Map(RunsFlags):
     Of several, identifiers have to agree, and the map is in the frame of the first one's start.
 
     Example: slam map images/e --circles --lines -o /tmp/e-map
-
-    Parameters
-    ----------
-    camera : Path
-        Calibration, if it is not the one in the run folder (lines and --calibrate need one).
-    calibrate : bool
-        Estimate the camera's mounting (rotation and height) as well.
-    row_errors : str
-        With --calibrate, where rows are compared with discs: `corrected`, on the floor as the
-        camera as mounted sees it; `recorded`, as the rows were written, where their covariances
-        belong.
-    tilt_deg : float
-        Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
-        recorded.
-    solver : str
-        `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
-        (extra [slam]).
-    loss : str
-        `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
-    loss_scale : float
-        Standard deviations from which on they do.
-    start : three floats
-        Pose at the start in the map (m, m, rad).
-    output : Path
-        Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
-        pictures; by default `slam` in the run folder.
-    interactive : bool
-        Show the pictures in windows as well.
     """
 
-    calibrate: bool = False
+    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
+    camera: MaybePath = None
+    calibrate: bool = False  # Estimate the camera's mounting (rotation and height) as well.
+    # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
+    # as mounted sees it; `recorded`, as the rows were written, where their covariances belong.
     row_errors: Literal["corrected", "recorded"] = "corrected"
+    # Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
+    # recorded.
     tilt_deg: float = 0.0
+    # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
+    # (extra [slam]).
     solver: Literal["separable", "gtsam"] = "separable"
+    # `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
-    loss_scale: float = 3.0
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    loss_scale: float = 3.0  # Standard deviations from which on they do.
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
+    # Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
+    # pictures; by default `slam` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False
+    interactive: bool = False  # Show the pictures in windows as well.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,55 +86,32 @@ class Audit(RunFlags):
     """Find discs whose identifiers contradict the rest of the run, and write the run without them.
 
     Example: slam audit images/e -o /tmp/audited.circles
-
-    Parameters
-    ----------
-    calibrate : bool
-        Estimate the camera's mounting as well.
-    gate : float
-        Squared error of a row, in units of its covariance, from which on it contradicts.
-    apply : str
-        `mend`: rows get the identifier of the landmark that they show, -1 where none explains
-        them; `drop`: their lines are left out.
-    pictures : Path
-        Folder for pictures of what the rows show.
-    images : Path
-        Folder of the run's images; by default that of the rows.
-    output : Path
-        The landmark file to write; by default audited.circles in the run folder. The list goes
-        into a .csv beside.
     """
 
-    calibrate: bool = False
+    calibrate: bool = False  # Estimate the camera's mounting as well.
+    # Squared error of a row, in units of its covariance, from which on it contradicts.
     gate: float = 100.0
+    # `mend`: rows get the identifier of the landmark that they show, -1 where none explains
+    # them; `drop`: their lines are left out.
     apply: Literal["mend", "drop"] = "mend"
-    pictures: MaybePath = None
-    images: MaybePath = None
+    pictures: MaybePath = None  # Folder for pictures of what the rows show.
+    images: MaybePath = None  # Folder of the run's images; by default that of the rows.
+    # The landmark file to write; by default audited.circles in the run folder. The list goes
+    # into a .csv beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFlags(RunFlags):
-    """Options of both filters.
-
-    Parameters
-    ----------
-    gate_probability : float
-        Share of right rows that pass the gate; with known association nothing is gated.
-    start : three floats
-        Pose at the start in the map (m, m, rad).
-    reference : Path
-        A path.csv to measure the distance from.
-    interactive : bool
-        Show the pictures in windows as well.
-    """
+    """Options of both filters."""
 
     association: Literal["known", "nearest", "joint"] = "known"
+    # Share of right rows that pass the gate; with known association nothing is gated.
     gate_probability: float = 0.999
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    reference: MaybePath = None
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
+    reference: MaybePath = None  # A path.csv to measure the distance from.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False
+    interactive: bool = False  # Show the pictures in windows as well.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,32 +119,23 @@ class Localize(FilterFlags):
     """Localise in a known map with an extended Kalman filter.
 
     Example: slam localize images/e --map /tmp/e-map/map.csv
-
-    Parameters
-    ----------
-    map : Path
-        The map (written by `slam map`).
-    association : str
-        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-        out, by Mahalanobis distance of one row at a time or of a frame's rows together.
-    map_errors : str
-        `considered`: the map's covariances are errors that stay the same each time a landmark is
-        seen; `white`: errors that are new each time; `ignored`: the map is exact. By default
-        (`auto`) considered with known association, else ignored.
-    start_sigma : three floats
-        Standard deviations of the pose at the start.
-    lost : bool
-        Nothing is known of the pose at the start: it is found by the discs of the first frames,
-        whatever their identifiers. Without these, with `--association joint`.
-    output : Path
-        Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run
-        folder.
     """
 
-    map: Path
+    map: Path  # The map (written by `slam map`).
+    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
+    association: Literal["known", "nearest", "joint"] = "known"
+    # `considered`: the map's covariances are errors that stay the same each time a landmark is
+    # seen; `white`: errors that are new each time; `ignored`: the map is exact. By default (`auto`)
+    # considered with known association, else ignored.
     map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
+    # Standard deviations of the pose at the start.
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Nothing is known of the pose at the start: it is found by the discs of the first frames,
+    # whatever their identifiers. Without these, with `--association joint`.
     lost: bool = False
+    # Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run folder.
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,26 +143,18 @@ class Ekf(FilterFlags):
     """Map and localise at once with an extended Kalman filter (EKF-SLAM, landmarks by their IDs).
 
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
-
-    Parameters
-    ----------
-    association : str
-        `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-        out.
-    jacobians : str
-        Where the models are linearised: at the `first` estimate of each landmark, so that the
-        filter gains no spurious information about its heading from landmarks that it has placed
-        itself; or at the `latest`, as the textbook filter does, which is inconsistent at large
-        heading errors.
-    reference_map : Path
-        A map.csv to measure the distance of the landmarks from.
-    output : Path
-        Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run
-        folder.
     """
 
+    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+    # out.
+    association: Literal["known", "nearest", "joint"] = "known"
+    # Where the models are linearised: at the `first` estimate of each landmark, so that the filter
+    # gains no spurious information about its heading from landmarks that it has placed itself; or
+    # at the `latest`, as the textbook filter does, which is inconsistent at large heading errors.
     jacobians: Literal["first", "latest"] = "first"
-    reference_map: MaybePath = None
+    reference_map: MaybePath = None  # A map.csv to measure the distance of the landmarks from.
+    # Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run folder.
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,46 +164,17 @@ class Associate(RunsFlags):
     Where the file has IDs of its own they are not used, but the result is scored against them.
 
     Example: slam associate images/e --method joint --map-level
-
-    Parameters
-    ----------
-    method : str
-        `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
-        frame's rows (JCBB).
-    map_level : bool
-        Then search loops by fitting local maps of landmarks to each other.
-    gate_probability : float
-        Share of right rows that pass the gate.
-    sigma_scale : float
-        Factor on the discs' standard deviations: a robot that sways moves them by more than the
-        file says.
-    tilt_sigma_deg : float
-        Standard deviation of the robot's sway, which moves all discs of a frame together.
-    kept_probability : float
-        Share of a disc's right rows that keep its ID at the map level, by their covariances as the
-        file states them; rows farther from its place in the map get -1.
-    fewest_rows : int
-        Discs of fewer such rows are taken for clutter: their rows get -1.
-    noise : several floats
-        Score again with noise added to the measurements (factors on their standard deviation).
-    seed : int
-        Of that noise.
-    output : Path
-        The landmark file to write; by default associated.circles (or .lines) in the run folder.
-        With both kinds two files, which differ in the suffix; of several runs found_1.circles,
-        found_2.circles, ... for found.circles. The scores go into a .json beside.
     """
 
-    method: Literal["nearest", "joint"] = "joint"
-    map_level: bool = True
-    gate_probability: float = 0.999
-    sigma_scale: float = 1.4
-    tilt_sigma_deg: float = 0.2
-    kept_probability: float = 0.99
-    fewest_rows: int = 3
+    # Score again with noise added to the measurements (factors on their standard deviation).
     noise: tuple[float, ...] = ()
-    seed: int = 1
+    seed: int = 1  # Of that noise.
+    # The landmark file to write; by default associated.circles (or .lines) in the run folder. With
+    # both kinds two files, which differ in the suffix; of several runs found_1.circles,
+    # found_2.circles, ... for found.circles. The scores go into a .json beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+    # How a run is associated.
+    settings: OmitArgPrefixes[AssociateSettings] = field(default_factory=AssociateSettings)
 
 
 @dataclass(frozen=True)
@@ -287,41 +182,15 @@ class Noise:
     """Add white Gaussian noise to a run; its covariances are raised to match.
 
     Example: slam noise images/e --sigma 0.05 -o /tmp/noisy.circles
-
-    Parameters
-    ----------
-    run : Path
-        Run folder, or a .circles, .lines or .txt file.
-    sigma : float
-        Standard deviation added to disc positions along x and y (m).
-    bearing_sigma : float
-        Standard deviation added to bearings of lines (rad).
-    step_sigma : float
-        Standard deviation added to dx and dy of each step (m).
-    turn_sigma : float
-        Standard deviation added to dphi of each step (rad).
-    lines : bool
-        Of a run folder take the .lines file instead of the .circles.
-    stem : str
-        Name of the landmark file in the folder; by default map, else detected.
-    seed : int
-        Everything random follows from it.
-    output : Path
-        The file to write.
-    force : bool
-        Replace an existing file.
     """
 
-    run: Positional[Path]
-    sigma: float = 0.0
-    bearing_sigma: float = 0.0
-    step_sigma: float = 0.0
-    turn_sigma: float = 0.0
-    lines: bool = False
+    run: Positional[Path]  # Run folder, or a .circles, .lines or .txt file.
+    lines: bool = False  # Of a run folder take the .lines file instead of the .circles.
+    # Name of the landmark file in the folder; by default map, else detected.
     stem: MaybeStr = None
-    seed: int = 1
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    force: bool = False
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None  # The file to write.
+    force: bool = False  # Replace an existing file.
+    noise: OmitArgPrefixes[AddedNoise] = field(default_factory=AddedNoise)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,30 +198,21 @@ class Export(RunFlags):
     """Write a run (and a map of it) in the formats of other tools.
 
     Example: slam export images/e --to g2o -o /tmp/e.g2o
-
-    Parameters
-    ----------
-    run : Path
-        Run folder, or a .circles or .lines file; for --to tum a path.csv as well.
-    to : str
-        `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
-        odometry and measurements as tables for GTSAM or MRPT.
-    solution : Path
-        Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
-        default odometry's and first sight's.
-    times : Path
-        For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside
-        the run that has them all; where there is none, t counts the steps.
-    axes : str
-        `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
-    output : Path
-        The file to write; for csv a folder.
     """
 
-    output: Annotated[Path, arg(aliases=["-o"])]
+    # Run folder, or a .circles or .lines file; for --to tum a path.csv as well.
+    run: Positional[Path]
+    output: Annotated[Path, arg(aliases=["-o"])]  # The file to write; for csv a folder.
+    # `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
+    # odometry and measurements as tables for GTSAM or MRPT.
     to: Literal["g2o", "tum", "csv"] = "g2o"
+    # Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
+    # default odometry's and first sight's.
     solution: MaybePath = None
+    # For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside the
+    # run that has them all; where there is none, t counts the steps.
     times: MaybePath = None
+    # `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
     axes: Literal["robotics", "dataset"] = "robotics"
 
 
@@ -361,32 +221,20 @@ class Import:
     """Read other tools' and data sets' files into this project's.
 
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
-
-    Parameters
-    ----------
-    file : Path
-        A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the
-        UTIAS data set (MRCLAM), or aa3_dr.mat of Victoria Park.
-    axes : str
-        The axes that the graph or trajectory is in; see `slam export`.
-    range_sigma : float
-        Standard deviation of a data set's ranges (m).
-    bearing_sigma : float
-        Standard deviation of a data set's bearings (rad).
-    output : Path
-        Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates;
-        of a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of
-        true landmarks the map.csv.
-    force : bool
-        Replace an existing file.
     """
 
+    # A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
+    # data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     file: Positional[Path]
+    # Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates; of
+    # a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of true
+    # landmarks the map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
+    # The axes that the graph or trajectory is in; see `slam export`.
     axes: Literal["robotics", "dataset"] = "robotics"
-    range_sigma: float = 0.1
-    bearing_sigma: float = 0.03
-    force: bool = False
+    range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
+    bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).
+    force: bool = False  # Replace an existing file.
 
 
 Command = Map | Audit | Localize | Ekf | Associate | Noise | Export | Import

@@ -60,7 +60,7 @@ class CircleRows:
         """(n,) which rows say what disc they show."""
         return np.asarray(self.ids != UNKNOWN_ID)
 
-    def only(self, chosen: BoolArray) -> CircleRows:
+    def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""
         return CircleRows(
             self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
@@ -96,13 +96,13 @@ class LineRows:
         """(n,) which rows say what lines they show."""
         return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
 
-    def only(self, chosen: BoolArray) -> LineRows:
+    def only(self, chosen: BoolArray | Sequence[int] | slice) -> LineRows:
         """The chosen rows."""
         return LineRows(
             self.frame[chosen],
             self.bearing_rad[chosen],
             self.sigma_rad[chosen],
-            tuple(self.ids[k] for k in np.flatnonzero(chosen)),
+            tuple(self.ids[k] for k in np.arange(len(self))[chosen]),
         )
 
     @classmethod
@@ -249,10 +249,6 @@ def read_recording(
         Name of the files in the folder without suffix; see `landmark_files`.
     noise : OdometryNoise
         Of the steps that state no covariance.
-
-    Returns
-    -------
-    Recording
 
     Raises
     ------

@@ -9,6 +9,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.slam.filters.frames import FrameRows
 from redetect.slam.filters.localizer import Localizer
+from redetect.slam.recording import CircleRows, LineRows
 
 CAMERA_XY = np.array([0.0179777, -0.0808609])
 
@@ -20,25 +21,13 @@ def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
 
 
 def rows_of(discs: list[tuple[int, FloatArray, FloatArray]]) -> FrameRows:
-    return FrameRows(
-        disc_ids=tuple(number for number, _, _ in discs),
-        disc_xy=np.array([xy for _, xy, _ in discs]),
-        disc_covariance=np.array([c for _, _, c in discs]),
-        line_ids=(),
-        bearing_rad=np.zeros(0),
-        sigma_rad=np.zeros(0),
-    )
+    rows = CircleRows.of((0, xy, covariance, number) for number, xy, covariance in discs)
+    return FrameRows(rows, LineRows.of())
 
 
 def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
-    return FrameRows(
-        disc_ids=(),
-        disc_xy=np.zeros((0, 2)),
-        disc_covariance=np.zeros((0, 2, 2)),
-        line_ids=tuple(numbers for numbers, _, _ in lines),
-        bearing_rad=np.array([bearing for _, bearing, _ in lines]),
-        sigma_rad=np.array([sigma for _, _, sigma in lines]),
-    )
+    rows = LineRows.of((0, bearing, sigma, numbers) for numbers, bearing, sigma in lines)
+    return FrameRows(CircleRows.of(), rows)
 
 
 def localizer(pose: ArrayLike, discs: ArrayLike, lines: ArrayLike) -> Localizer:

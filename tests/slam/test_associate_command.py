@@ -91,11 +91,13 @@ def test_existing_files_and_settings_without_sense_are_refused(
         (["--tilt-sigma-deg", "-1"], "tilt_sigma_deg is -1"),
         (["--kept-probability", "0"], "kept_probability is 0"),
         (["--fewest-rows", "0"], "fewest_rows is 0"),
-        (["--noise", "-1"], "noise is -1: expected 0 or more"),
     ):
-        assert main(["associate", run, "-o", str(target), *setting]) == 1
+        with pytest.raises(SystemExit, match="2"):
+            main(["associate", run, "-o", str(target), *setting])
         assert message in capsys.readouterr().err
         assert not target.exists()
+    assert main(["associate", run, "-o", str(target), "--noise", "-1"]) == 1
+    assert "noise is -1: expected 0 or more" in capsys.readouterr().err
 
 
 def test_relative_noise_is_that_multiple_of_the_rows_own(project_root: Path) -> None:

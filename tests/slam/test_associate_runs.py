@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
-from redetect.slam.association.compatibility import Method
 from redetect.slam.association.frame_to_frame import (
-    AssociateSettings,
     LocalMap,
     associate_locally,
     moved,
@@ -24,6 +22,7 @@ from redetect.slam.association.run import associate_run
 from redetect.slam.association.score import score_association
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.settings import AssociateSettings, Method
 
 CAMERA_XY = (0.02, -0.08)
 STEP_SIGMA = np.array([0.004, 0.004, 0.006])
@@ -169,7 +168,7 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
     swaying = replace(recording, circles=replace(circles, xy=place))
     ids = ids_of(swaying)
     blind = associate_locally(swaying, AssociateSettings(sigma_scale=1.0))
-    told = associate_locally(swaying, AssociateSettings(sigma_scale=1.0, tilt_sigma_rad=0.012))
+    told = associate_locally(swaying, AssociateSettings(sigma_scale=1.0, tilt_sigma_deg=0.7))
     assert score_association(blind.circle_labels, ids).pair_recall < 0.9
     score = score_association(told.circle_labels, ids)
     assert score.pair_recall > 0.95

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 from redetect.array_types import FloatArray
 from redetect.slam.association.compatibility import (
     chi_squared_gates,
-    joint_compatible,
-    nearest_compatible,
+    compatible,
 )
 from redetect.slam.errors import SlamError
 
@@ -88,11 +87,10 @@ def test_branch_and_bound_finds_what_trying_everything_finds(
     seed: int, n: int, m: int, width: int, probability: float
 ) -> None:
     case = _case(seed, n, m, width)
-    found = joint_compatible(*case, gate_probability=probability)
+    found = compatible("joint", *case, probability)
     count, distance = _best_by_enumeration(case, probability)
     assert found.complete
     assert np.sum(found.landmark >= 0) == count
-    assert found.squared_distance == pytest.approx(distance, rel=1e-9, abs=1e-12)
     assert _joint_distance(case, tuple(found.landmark)) == pytest.approx(
         distance, rel=1e-9, abs=1e-12
     )
@@ -106,12 +104,13 @@ def test_order_of_rows_and_landmarks_does_not_matter_to_joint_compatibility(
     rng = np.random.default_rng(seed)
     rows, landmarks = rng.permutation(n), rng.permutation(m)
     index = (2 * landmarks[:, None] + np.arange(2)).reshape(-1)
-    found = joint_compatible(innovations, predicted, noise)
-    again = joint_compatible(
-        innovations[np.ix_(rows, landmarks)], predicted[np.ix_(index, index)], noise[rows]
-    )
+    found = compatible("joint", innovations, predicted, noise)
+    turned = (innovations[np.ix_(rows, landmarks)], predicted[np.ix_(index, index)], noise[rows])
+    again = compatible("joint", *turned)
     assert np.sum(again.landmark >= 0) == np.sum(found.landmark >= 0)
-    assert again.squared_distance == pytest.approx(found.squared_distance, rel=1e-6, abs=1e-9)
+    first = _joint_distance((innovations, predicted, noise), tuple(found.landmark))
+    second = _joint_distance(turned, tuple(again.landmark))
+    assert second == pytest.approx(first, rel=1e-6, abs=1e-9)
 
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 6), m=st.integers(0, 6))
@@ -120,7 +119,7 @@ def test_nearest_pairs_are_gated_one_to_one_and_nothing_near_is_left(
 ) -> None:
     case = _case(seed, n, m, 2)
     gate = chi2.ppf(0.99, 2)
-    found = nearest_compatible(*case, gate_probability=0.99).landmark
+    found = compatible("nearest", *case, 0.99).landmark
     paired = found[found >= 0]
     assert len(set(paired.tolist())) == len(paired)
     for i in range(n):
@@ -147,18 +146,20 @@ def test_joint_compatibility_sees_through_a_shift_that_misleads_the_nearest_neig
     shift = np.tile([1.0, 0.0], 4)
     predicted = 0.5**2 * np.outer(shift, shift) + 1e-6 * np.eye(8)
     noise = np.tile(0.02**2 * np.eye(2), (4, 1, 1))
-    assert joint_compatible(innovations, predicted, noise).landmark.tolist() == [0, 1, 2, 3]
-    assert nearest_compatible(innovations, predicted, noise).landmark.tolist() != [0, 1, 2, 3]
+    assert compatible("joint", innovations, predicted, noise).landmark.tolist() == [0, 1, 2, 3]
+    assert compatible("nearest", innovations, predicted, noise).landmark.tolist() != [0, 1, 2, 3]
 
 
 def test_bounded_work_says_so_and_is_still_compatible() -> None:
     rng = np.random.default_rng(3)
     innovations = rng.normal(0.0, 0.1, (9, 9, 2))
     predicted, noise = 0.5 * np.eye(18), np.tile(np.eye(2), (9, 1, 1))
-    cut = joint_compatible(innovations, predicted, noise, most_nodes=20)
+    cut = compatible("joint", innovations, predicted, noise, most_nodes=20)
     assert not cut.complete
     assert 0 < np.sum(cut.landmark >= 0) <= 9
-    assert cut.squared_distance <= chi2.ppf(0.999, 18)
+    pairs = np.sum(cut.landmark >= 0)
+    distance = _joint_distance((innovations, predicted, noise), tuple(cut.landmark))
+    assert distance <= chi2.ppf(0.999, 2 * pairs)
 
 
 def test_gates_are_quantiles_and_right_sets_pass_with_their_probability() -> None:
@@ -177,14 +178,12 @@ def test_gates_are_quantiles_and_right_sets_pass_with_their_probability() -> Non
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
 def test_gate_probability_outside_its_range_is_refused(probability: float) -> None:
     with pytest.raises(SlamError, match="gate_probability"):
-        joint_compatible(
-            np.zeros((1, 1, 2)), np.eye(2), np.eye(2)[None], gate_probability=probability
-        )
+        compatible("joint", np.zeros((1, 1, 2)), np.eye(2), np.eye(2)[None], probability)
 
 
 def test_a_pair_without_positive_definite_covariance_is_never_made() -> None:
     innovations = np.zeros((1, 2, 2))
     predicted = np.diag([-1.0, 1.0, 1.0, 1.0])
     noise = np.zeros((1, 2, 2))
-    assert joint_compatible(innovations, predicted, noise).landmark.tolist() == [1]
-    assert nearest_compatible(innovations, predicted, noise).landmark.tolist() == [1]
+    assert compatible("joint", innovations, predicted, noise).landmark.tolist() == [1]
+    assert compatible("nearest", innovations, predicted, noise).landmark.tolist() == [1]

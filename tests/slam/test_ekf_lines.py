@@ -180,10 +180,7 @@ def test_a_row_of_several_lines_measures_the_mean_of_their_bearings() -> None:
     noise_xy = spd(np.random.default_rng(8), 2, 0.1)
     robot = localizer([0.3, -0.2, 0.4], [[-1.0, -2.0]], [[1.0, -3.0], [0.8, -3.2]])
     discs, lines = rows_of([(0, np.zeros(2), noise_xy)]), bearings_of([((0, 1), 0.5, 0.01)])
-    rows = FrameRows(
-        discs.disc_ids, discs.disc_xy, discs.disc_covariance,
-        lines.line_ids, lines.bearing_rad, lines.sigma_rad,
-    )  # fmt: skip
+    rows = FrameRows(discs.circles, lines.lines)
     error, jacobian, index, noise = innovation_of(rows, robot, robot.state)
     pose, disc, places = robot.state[:3], robot.state[3:5], robot.state[5:].reshape(2, 2)
     bearings = bearing_of_vertical(pose, places, CAMERA_XY)

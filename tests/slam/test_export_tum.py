@@ -90,5 +90,5 @@ def test_damaged_files_are_read_or_refused(
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(SlamError, match="cannot be read: No such file"):
+    with pytest.raises(SlamError, match="no such file"):
         read_tum(tmp_path / "p.tum")

@@ -17,12 +17,11 @@ from redetect.plane import between, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o import (
     RunGraph,
-    end_covariance,
     first_disc_vertex,
     frames_of_graph,
     graph_of_frames,
+    in_turned_axes,
     read_g2o,
-    start_covariance,
     write_g2o,
 )
 from redetect.slam.formats.text import Axes
@@ -126,7 +125,7 @@ def test_the_graphs_error_is_that_of_the_models(tmp_path: Path, axes: Axes) -> N
     swapped = graph.recording.step_covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
     wrong = replace(graph, recording=replace(graph.recording, step_covariance=swapped))
     assert abs(chi2(wrong) / expected - 1.0) > 1e-3
-    unturned = start_covariance(graph.recording.steps, graph.recording.step_covariance)
+    unturned = in_turned_axes(graph.recording.step_covariance, -graph.recording.steps[:, 2])
     wrong = replace(graph, recording=replace(graph.recording, step_covariance=unturned))
     assert abs(chi2(wrong) / expected - 1.0) > 1e-4
 
@@ -156,9 +155,9 @@ def test_covariances_at_the_steps_end_are_those_of_samples() -> None:
     at_end = noise.copy()
     at_end[:, :2] = noise[:, :2] @ rotation(step[2])  # R^T to each
     expected = np.cov(at_end.T)
-    turned = end_covariance(step[None], np.cov(noise.T)[None])
+    turned = in_turned_axes(np.cov(noise.T)[None], step[None, 2])
     np.testing.assert_allclose(turned[0], expected, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(start_covariance(step[None], turned)[0], np.cov(noise.T))
+    np.testing.assert_allclose(in_turned_axes(turned, -step[None, 2])[0], np.cov(noise.T))
 
 
 def decimals(low: float, high: float, digits: int) -> st.SearchStrategy[float]:

@@ -100,14 +100,14 @@ def dense(
         P = F @ P @ F.T
         P[:3, :3] += by_step @ recording.step_covariance[k] @ by_step.T
         H, v, R = [], [], []
-        for j, number in enumerate(rows.disc_ids):
+        for j, number in enumerate(rows.circles.ids.tolist()):
             i = number - 10
             own = np.zeros((2, size))
             own[:, :3], own[:, 3 + 2 * i : 5 + 2 * i] = disc_jacobians(pose, places[i])
             H.append(own)
-            v.append(rows.disc_xy[j] - disc_in_robot(pose, places[i]))
-            R.append(rows.disc_covariance[j])
-        for j, numbers in enumerate(rows.line_ids):
+            v.append(rows.circles.xy[j] - disc_in_robot(pose, places[i]))
+            R.append(rows.circles.covariance[j])
+        for j, numbers in enumerate(rows.lines.ids):
             own, innovation = np.zeros((1, size)), np.zeros(1)
             for number in numbers:
                 i = len(some.discs) + number - 10
@@ -115,10 +115,10 @@ def dense(
                 own[0, :3] += first / len(numbers)
                 own[0, 3 + 2 * i : 5 + 2 * i] += second / len(numbers)
                 bearing = bearing_of_vertical(pose, places[i], CAMERA_XY)
-                innovation += wrap_angle(rows.bearing_rad[j] - bearing) / len(numbers)
+                innovation += wrap_angle(rows.lines.bearing_rad[j] - bearing) / len(numbers)
             H.append(own)
             v.append(innovation)
-            R.append(np.array([[rows.sigma_rad[j] ** 2]]))
+            R.append(np.array([[rows.lines.sigma_rad[j] ** 2]]))
         stacked = np.concatenate(H)
         noise = np.zeros((len(stacked), len(stacked)))
         at = 0

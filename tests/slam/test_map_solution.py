@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from camera.calibration.model import rotation_of
 from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
 from redetect.slam.errors import SlamError
@@ -19,7 +20,7 @@ from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models import move
-from redetect.slam.mounting import rotation_exp, rows_through_mounting
+from redetect.slam.mounting import rows_through_mounting
 from redetect.slam.recording import LineRows, Recording, read_recording, recording_of_frames
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
@@ -155,7 +156,7 @@ def test_a_loss_withstands_wrong_identifiers(loss: str) -> None:
 @pytest.mark.parametrize("row_errors", ["corrected", "recorded"])
 def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_errors: str) -> None:
     true = np.array([-0.03, 0.012, 0.005, -0.03])
-    turn, _ = rotation_exp(true[:3])
+    turn = rotation_of(true[:3])
     # The rows that this camera would write, mounted otherwise than the file says.
     run = small_run(7, noise=0.0, steps=90)
     circles = run.recording.circles
@@ -182,7 +183,7 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
 def test_verticals_tell_a_camera_turned_to_the_left(published_camera: Camera) -> None:
     camera = _with_camera_place(published_camera)
     run = small_run(7, noise=0.0, steps=90)
-    turn, _ = rotation_exp(np.array([0.0, 0.0, 0.02]))
+    turn = rotation_of(np.array([0.0, 0.0, 0.02]))
     mounting = np.column_stack([turn @ camera.rotation, camera.centre])
     circles, lines = run.recording.circles, run.recording.lines
     nominal = np.column_stack([camera.rotation, camera.centre])

@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, read_frames, read_rows
 from redetect.slam.cli import main
 from redetect.slam.errors import SlamError
-from redetect.slam.noise import AddedNoise, noisy_rows
+from redetect.slam.noise import noisy_rows
+from redetect.slam.settings import AddedNoise
 
 STEP = Step("a.0", 0.01, -0.2, 0.05, 2e-5, 1e-7, 3e-5, 4e-5, 5e-8, 3e-4)
 DISC = CircleLandmark(0.5, -2.0, 0.9, 0.002, 0.0003, 0.003, (7,))
 LINE = LineLandmark(0.1, -0.5, 0.12, 0.3, 3.14, 0.01, 0.0, 0.002, (4, 5))
-NOISE = AddedNoise(disc_m=0.03, bearing_rad=0.01, step_m=0.005, turn_rad=0.02, seed=3)
+NOISE = AddedNoise(sigma=0.03, bearing_sigma=0.01, step_sigma=0.005, turn_sigma=0.02, seed=3)
 
 
 def _added(count: int) -> list[Row]:
@@ -100,7 +101,7 @@ def test_same_seed_same_rows_and_every_row_can_be_read_back(
 
 
 @pytest.mark.parametrize("bad", [-1e-9, float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["disc_m", "bearing_rad", "step_m", "turn_rad"])
+@pytest.mark.parametrize("name", ["sigma", "bearing_sigma", "step_sigma", "turn_sigma"])
 def test_a_sigma_that_is_none_is_refused(name: str, bad: float) -> None:
     with pytest.raises(SlamError, match=name):
         replace(AddedNoise(), **{name: bad})  # type: ignore[arg-type]
@@ -160,6 +161,7 @@ def test_command_refuses_to_overwrite_and_negative_noise(
     run = str(project_root / "images" / "e")
     assert main(["noise", run, "--sigma", "0.1", "-o", str(target)]) == 1
     assert target.read_bytes() == b"mine"
-    assert main(["noise", run, "--sigma=-0.1", "-o", str(target), "--force"]) == 1
-    assert "disc_m is -0.1" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["noise", run, "--sigma=-0.1", "-o", str(target), "--force"])
+    assert "sigma is -0.1" in capsys.readouterr().err
     assert target.read_bytes() == b"mine"

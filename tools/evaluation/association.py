@@ -14,7 +14,6 @@ from tyro.conf import Positional
 
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.slam.association.frame_to_frame import AssociateSettings
 from redetect.slam.association.placing import wake_up
 from redetect.slam.association.run import associate_run
 from redetect.slam.commands.associate import score_run
@@ -23,6 +22,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import first_poses, joined, read_recording
+from redetect.slam.settings import AssociateSettings
 from tools.evaluation.tables import Table
 
 

@@ -28,7 +28,7 @@ from redetect.groundtruth.lasers.tracking import (
 )
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 
 #: A set is disturbed by this many readings that hide the robot or are of objects beside it.
 _DISTURBED = 3
@@ -47,8 +47,7 @@ def perform(options: Laser) -> int:
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
-    with write_whole(account, overwrite=options.force) as stream:
-        stream.write(("\n".join(account_lines(track)) + "\n").encode())
+    write_bytes(account, ("\n".join(account_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
     content = {**provenance(options.settings, files), "sets_per_pose": options.average, **described}

@@ -19,8 +19,8 @@ from redetect.groundtruth.lasers.scanners import (
     write_scanners,
 )
 from redetect.groundtruth.report.pictures import draw_alignment
-from redetect.landmarks import wrap_angle
-from redetect.storage import write_whole
+from redetect.groundtruth.trajectories.streams import pose_differences
+from redetect.storage import write_bytes
 
 #: Scanners this many standard deviations from their measured pose are reported.
 _FAR_OFF_SIGMA = 5.0
@@ -66,15 +66,18 @@ def perform(options: Lasers) -> int:
         icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
         for cloud, scanner in zip(points, measured)
     ]
-    with write_whole(picture, overwrite=options.force) as stream:
-        stream.write(draw_alignment(measured, alignment, points, building, by_step))
+    write_bytes(
+        picture,
+        draw_alignment(measured, alignment, points, building, by_step),
+        overwrite=options.force,
+    )
 
     for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
-        shift = after.pose - before.pose
+        shift = pose_differences(after.pose, before.pose)
         sigma = np.sqrt(np.diag(after.covariance))
         print(
             f"{after.name}: moved by {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
-            f"{np.degrees(wrap_angle(shift[2])):.3f} deg; sigma {1e3 * sigma[0]:.2f}, "
+            f"{np.degrees(shift[2]):.3f} deg; sigma {1e3 * sigma[0]:.2f}, "
             f"{1e3 * sigma[1]:.2f} mm, {np.degrees(sigma[2]):.4f} deg; {alignment.matched[k]} "
             f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
         )
@@ -95,8 +98,7 @@ def perform(options: Lasers) -> int:
 
 def _sigmas(before: Scanner, after: Scanner) -> float:
     """How far a scanner is from where it was measured, in the measurement's standard deviations."""
-    shift = after.pose - before.pose
-    shift[2] = wrap_angle(shift[2])
+    shift = pose_differences(after.pose, before.pose)
     covariance = before.covariance + after.covariance
     if not np.any(before.covariance):
         return 0.0

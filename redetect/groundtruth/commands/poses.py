@@ -25,7 +25,7 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.markers.track import report_entry, track_robot
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
 
 
@@ -53,10 +53,8 @@ def perform(command: Poses) -> int:
     if left_out:
         print(f"{left_out} markers do not fit the others of their time: left out")
     if command.report is not None:
-        with write_whole(command.report, overwrite=command.force) as stream:
-            for tracked in track.times:
-                line = json.dumps(report_entry(tracked, network), allow_nan=False)
-                stream.write(f"{line}\n".encode())
+        lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
+        write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
     if not len(poses):
         print("error: no pose", file=sys.stderr)
         return EXIT_ERROR
@@ -76,8 +74,7 @@ def perform(command: Poses) -> int:
         text = format_tum(
             poses.times_s, np.stack([pose.world_from_robot for _, pose in track.posed])
         )
-        with write_whole(command.tum, overwrite=command.force) as stream:
-            stream.write(text.encode())
+        write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0
 

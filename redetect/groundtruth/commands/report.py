@@ -9,7 +9,7 @@ from redetect.groundtruth.commands.options import Report
 from redetect.groundtruth.commands.outputs import check_outputs
 from redetect.groundtruth.report.inputs import gather
 from redetect.groundtruth.report.page import report_page
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 
 
 def perform(options: Report) -> int:
@@ -18,8 +18,7 @@ def perform(options: Report) -> int:
     check_outputs([output], options.force)
     inputs = gather(options.session, options.truth)
     page = report_page(inputs, __version__)
-    with write_whole(output, overwrite=options.force) as stream:
-        stream.write(page)
+    write_bytes(output, page, overwrite=options.force)
     for problem in inputs.problems:
         print(f"warning: {problem}", file=sys.stderr)
     shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]

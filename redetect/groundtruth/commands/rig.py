@@ -37,7 +37,7 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 
 
 def perform(command: RigCommand) -> int:
@@ -84,8 +84,7 @@ def perform(command: RigCommand) -> int:
     }
     drawn = draw_rig(estimate)
     write_rig(command.output, rig, extra, overwrite=command.force)
-    with write_whole(picture, overwrite=command.force) as stream:
-        stream.write(drawn)
+    write_bytes(picture, drawn, overwrite=command.force)
     for marker, reason in estimate.left_out.items():
         print(f"marker {marker}: left out: {reason}")
     print_table(table)

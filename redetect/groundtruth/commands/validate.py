@@ -48,7 +48,7 @@ from redetect.groundtruth.validation.scoring import (
     sigma_of,
     stream_of,
 )
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 
 #: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.json")
@@ -123,8 +123,7 @@ def perform(options: Validate) -> int:
     write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
-        with write_whole(outputs[name], overwrite=options.force) as stream:
-            stream.write(data)
+        write_bytes(outputs[name], data, overwrite=options.force)
     for line in account(references, refused, score, content["distances"]):
         print(line)
     print(f"{folder}: written")

@@ -26,9 +26,9 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_content
 from redetect.storage.bounds import NOT_NEGATIVE, from_to, inside
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
@@ -116,10 +116,8 @@ def _extended(
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
 
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read or a value is missing or impossible; the message names it.
+    Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
+    message names it.
     """
     rows = JsonObject.read(path).rows("segments")
     segments = tuple(map(_segment, rows))
@@ -234,15 +232,13 @@ class PtpdLog:
 def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     """Read a log of ptpd.
 
-    Raises
-    ------
-    StreamError
-        If the file cannot be read, or no line of it reports an offset from the master.
+    Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
+    the master.
     """
     rows = list(_rows(Path(path)))
     if not rows:
-        raise StreamError(
-            path, None, "no line reports an offset from master: expected a log of ptpd"
+        raise GroundTruthError(
+            f"{path}: no line reports an offset from master: expected a log of ptpd"
         )
     table = np.array(rows, dtype=np.float64)
     return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
@@ -252,7 +248,8 @@ def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
     """Time, offset (s) and drift (ppb) of each report."""
     columns: dict[str, int] = {}
     pending: tuple[float, float] | None = None
-    for line in _lines(path):
+    content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)
+    for line in content.decode(errors="replace").splitlines():
         lowered = line.lower()
         message = _OFFSET_MESSAGE.search(lowered)
         seconds = _OFFSET_SECONDS.search(lowered)
@@ -265,12 +262,13 @@ def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
             else:
                 assert seconds is not None
                 offset = float(seconds[1])
-            pending = (_leading_time(line), offset)
+            leading = _LEADING_TIME.match(line)
+            pending = (float(leading[1]) if leading else math.nan, offset)
         elif drift:
             if pending is not None:
                 yield (*pending, float(drift[1]))
             pending = None
-        elif "offset from master" in lowered and "," in lowered:
+        elif _OFFSET in lowered and "," in lowered:
             names = [name.strip(" #\t") for name in lowered.split(",")]
             found = {name: k for k, name in enumerate(names)}
             columns = found if _OFFSET in found else {}
@@ -285,37 +283,21 @@ def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
 def _table_row(line: str, columns: dict[str, int]) -> tuple[float, float, float] | None:
     """A row of the comma-separated layout; None for states in which there is no offset."""
     words = [word.strip() for word in line.split(",")]
-    at = columns[_OFFSET]
-    if at >= len(words) or not re.fullmatch(_NUMBER, words[at]):
-        return None
-    time_at = columns.get("timestamp", len(words))
-    time = _calendar_time(words[time_at]) if time_at < len(words) else math.nan
-    drift_at = columns.get("observed drift", columns.get("drift"))
-    drift = math.nan
-    if drift_at is not None and drift_at < len(words) and re.fullmatch(_NUMBER, words[drift_at]):
-        drift = float(words[drift_at])
-    return time, float(words[at]), drift
+    named = {name: words[at] for name, at in columns.items() if at < len(words)}
+    offset = _number(named.get(_OFFSET, ""))
+    drift = _number(named.get("observed drift", named.get("drift", "")))
+    return None if math.isnan(offset) else (_time(named.get("timestamp", "")), offset, drift)
 
 
-def _leading_time(line: str) -> float:
-    found = _LEADING_TIME.match(line)
-    return float(found[1]) if found else math.nan
+def _number(word: str) -> float:
+    return float(word) if re.fullmatch(_NUMBER, word) else math.nan
 
 
-def _calendar_time(text: str) -> float:
-    if re.fullmatch(_NUMBER, text):
-        return float(text)
+def _time(text: str) -> float:
+    """Seconds since 1970 of a number, or of a date and time; NaN for anything else."""
     for layout in _CALENDAR:
         try:
             return datetime.strptime(text, layout).replace(tzinfo=UTC).timestamp()
         except ValueError:
             continue
-    return math.nan
-
-
-def _lines(path: Path) -> Iterator[str]:
-    try:
-        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", errors="replace")
-    except OSError as error:
-        raise StreamError(path, None, f"cannot be read: {error.strerror}") from None
-    yield from text.splitlines()
+    return _number(text)

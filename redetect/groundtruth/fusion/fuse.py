@@ -218,7 +218,7 @@ def fuse(
     chosen = settings or FuseSettings()
     problem = movement_problem(odometry, streams, chosen)
     first, last = problem.times_s[0], problem.times_s[-1]
-    inside = odometry.times_s[(odometry.times_s >= first) & (odometry.times_s <= last)]
+    inside = odometry.times_s[odometry.during(first, last)]
     if not len(inside):
         raise GroundTruthError(
             f"no sample of odometry from the first measured pose ({first:.3f} s) to the last "
@@ -313,27 +313,14 @@ def leave_out(
 ) -> tuple[LeftOut, ...]:
     """Leave each segment of the ground truth between two others out, and predict it.
 
-    Parameters
-    ----------
-    odometry, streams, settings
-        As of `redetect.groundtruth.fusion.fuse.fuse`. Segments are those of the first stream; the
-        others are left out at the same times.
-
-    Returns
-    -------
-    tuple of LeftOut
-        In order of time. The first segment and the last are not among them, since a fused path goes
-        from the first measured pose to the last.
-
-    Raises
-    ------
-    GroundTruthError
-        If there are fewer than three segments within the odometry's time.
+    Takes what `fuse` takes. Segments are those of the first stream; the others are left out at the
+    same times. The first segment and the last are not among the results, since a fused path goes
+    from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
+    three segments within the odometry's time.
     """
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)
-    inside = (truth.times_s >= own.times_s[0]) & (truth.times_s <= own.times_s[-1])
-    truth = truth.only(inside)
+    truth = truth.only(truth.during(own.times_s[0], own.times_s[-1]))
     parts = [truth.times_s[s] for s in segments_between_gaps(truth.times_s, _SEGMENT_GAP_S)]
     if len(parts) < 3:
         raise GroundTruthError(
@@ -356,10 +343,10 @@ def _left_out(
 ) -> LeftOut:
     fusion = fuse(
         odometry,
-        {name: one.only(~_during(one, from_s, to_s)) for name, one in streams.items()},
+        {name: one.only(~one.during(from_s, to_s)) for name, one in streams.items()},
         settings,
     )
-    here = _during(truth, from_s, to_s)
+    here = truth.during(from_s, to_s)
     segment, others = truth.only(here), truth.only(~here)
     predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
     error = pose_differences(predicted.poses, segment.only(known).poses)
@@ -377,10 +364,6 @@ def _left_out(
         float(np.mean(squared_mahalanobis(error, covariances)) / 3.0),
         *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
     )
-
-
-def _during(poses: PlanarPoses, from_s: float, to_s: float) -> BoolArray:
-    return np.asarray((poses.times_s >= from_s) & (poses.times_s <= to_s))
 
 
 def _rms(difference: FloatArray) -> tuple[float, float]:

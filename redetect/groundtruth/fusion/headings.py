@@ -7,6 +7,7 @@ as a turn that odometry takes for a share longer than it was.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -150,22 +151,19 @@ class HeadingPair:
 def pair_headings(
     odometry: PlanarPoses,
     segment: PlanarPoses,
-    *,
-    largest_offset_s: float,
-    largest_drift: float,
+    largest: tuple[float, float],
     fewest: int,
 ) -> HeadingPair | None:
     """The comparable part of two streams, fixed for a whole search of offset and drift.
 
-    The segment is ground truth without long pauses. None if the other stream covers fewer samples
-    than `fewest` in the whole search range.
+    The segment is ground truth without long pauses; `largest` are the offset (s) and the drift that
+    are searched to. None if the other stream covers fewer samples than `fewest` in that range.
     """
+    largest_offset_s, largest_drift = largest
     if len(segment) < fewest:
         return None
     reach = largest_offset_s + largest_drift * (segment.times_s[-1] - segment.times_s[0])
-    near = (odometry.times_s >= segment.times_s[0] - 2.0 * reach) & (
-        odometry.times_s <= segment.times_s[-1] + 2.0 * reach
-    )
+    near = odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
     if np.count_nonzero(near) < fewest:
         return None
     odometry = PlanarPoses(odometry.times_s[near], odometry.poses[near])
@@ -372,14 +370,14 @@ def find_jump(pair: HeadingPair, offset_s: float, drift: float) -> float | None:
     instead, _ = _gains(without_drift, steps, jacobian[:, :1], wandering)
     beside, size = _gains(without_drift, steps, jacobian, wandering)
     best = int(np.argmax(instead))
-    split = _relocate(pair, wandering, places, best, offset_s)
-    gained = wandering.squared(differences) - split.squared_error
-    if gained < _INSTEAD_OF_DRIFT or abs(split.jump_s) < _LEAST_JUMP_S:
+    time_s, jump_s, error = _relocate(pair, wandering, places, best, offset_s)
+    gained = wandering.squared(differences) - error
+    if gained < _INSTEAD_OF_DRIFT or abs(jump_s) < _LEAST_JUMP_S:
         best = int(np.argmax(beside))
         if beside[best] < _BEYOND_DRIFT or abs(size[best]) < _LEAST_JUMP_S:
             return None
-        split = _relocate(pair, wandering, places, best, offset_s)
-    return split.time_s if pair.sign > 0 else split.time_s - offset_s
+        time_s, _, _ = _relocate(pair, wandering, places, best, offset_s)
+    return time_s if pair.sign > 0 else time_s - offset_s
 
 
 def _gains(
@@ -396,20 +394,14 @@ def _gains(
     return size**2 * power, size
 
 
-@dataclass(frozen=True)
-class _Split:
-    """Two offsets, one before and one after a time of the pair's clock."""
-
-    time_s: float
-    jump_s: float
-    squared_error: float
-
-
 def _relocate(
     pair: HeadingPair, wandering: Wandering, places: FloatArray, best: int, near_s: float
-) -> _Split:
-    """The place that fits best if each side has its own offset, without drift."""
-    split = None
+) -> tuple[float, float, float]:
+    """Where the offset jumps, fits best if each side has its own, without drift.
+
+    Returns the time, on the pair's clock, by how much it jumps there (s), and the squared error.
+    """
+    time_s, jump_s, error = math.nan, math.nan, math.inf
     for _ in range(_RELOCATIONS):
         before = pair.times_s < places[best]
         sides = [_side_offset(pair.kept(which), wandering, near_s) for which in (before, ~before)]
@@ -418,12 +410,11 @@ def _relocate(
             wandering.squared(np.where(pair.times_s < place, first, second)) for place in places
         ]
         moved = int(np.argmin(errors))
-        split = _Split(float(places[moved]), sides[1] - sides[0], errors[moved])
+        time_s, jump_s, error = float(places[moved]), sides[1] - sides[0], errors[moved]
         if moved == best:
             break
         best = moved
-    assert split is not None
-    return split
+    return time_s, jump_s, error
 
 
 def _side_offset(side: HeadingPair, wandering: Wandering, near_s: float) -> float:

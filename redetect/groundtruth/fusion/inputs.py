@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +37,10 @@ def noise_of(settings: FuseSettings) -> FloatArray:
     )
 
 
-# A robot at rest may still move a little; without this noise, rest would give singular covariances.
-_CREEP_M2_PER_S = (1e-4) ** 2
-_CREEP_RAD2_PER_S = (1e-4) ** 2
+#: A robot at rest may still move a little; without this noise, rest would give singular
+#: covariances.
+CREEP_M2_PER_S = (1e-4) ** 2
+CREEP_RAD2_PER_S = (1e-4) ** 2
 # A turn is distinct if, from a second before to a second after, odometry turned by more than so
 # many of its standard deviations.
 _DISTINCT_OVER_S = 1.0
@@ -111,7 +112,7 @@ def _distinct(
     variance = (
         settings.turn_sigma**2 * np.abs(turned)
         + settings.turn_per_metre_sigma**2 * driven
-        + _CREEP_RAD2_PER_S * passed
+        + CREEP_RAD2_PER_S * passed
     )
     return np.asarray(turned**2 > _DISTINCT_SIGMAS**2 * variance)
 
@@ -134,41 +135,6 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
     return hidden
 
 
-def variances_of(
-    times_s: FloatArray,
-    controls: FloatArray,
-    unseen: FloatArray,
-    noise: Sequence[float] | FloatArray,
-    settings: FuseSettings,
-) -> FloatArray:
-    """(N, 3) noise of movements to nodes: along the way, across it (m^2), of the turn (rad^2).
-
-    All of it is proportional to way, turn and time, so that it adds up over parts of a movement;
-    but for what pauses hide: there odometry's systematic bend has a way to act on that is not
-    known, and what a wrong heading leads aside is taken to be that of a way out and back.
-
-    `controls` (N, 4) and `unseen` (N, 2) are those of `movements`, `noise` (4,) that of
-    `noise_of`.
-    """
-    along, across, by_turn, by_way = np.square(noise)
-    way = np.hypot(controls[:, 0], controls[:, 1])
-    passed = np.concatenate([[0.0], np.diff(times_s)])
-    hidden_way, hidden_turn = unseen.T
-    hidden = (
-        by_turn * hidden_turn
-        + by_way * hidden_way
-        + np.square(settings.turn_bias_per_metre_sigma * hidden_way)
-    )
-    aside = hidden * hidden_way**2 / 12.0
-    return np.column_stack(
-        [
-            along * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
-            across * (way + hidden_way) + aside + _CREEP_M2_PER_S * passed,
-            by_turn * np.abs(controls[:, 2]) + by_way * way + hidden + _CREEP_RAD2_PER_S * passed,
-        ]
-    )
-
-
 def gather(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
 ) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
@@ -183,7 +149,7 @@ def gather(
     for name, stream in streams.items():
         if stream.covariances is None:
             raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
-        inside = (stream.times_s >= odometry.times_s[0]) & (stream.times_s <= odometry.times_s[-1])
+        inside = stream.during(odometry.times_s[0], odometry.times_s[-1])
         again = inside & _repeats(stream, stream.covariances)
         repeated[name] = int(np.count_nonzero(again))
         inside &= ~again

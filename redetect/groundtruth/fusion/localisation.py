@@ -75,14 +75,20 @@ class LocalisationErrors:
     heading_offset: float
 
 
+class Differences(NamedTuple):
+    """Measured poses less those of aligned odometry."""
+
+    times_s: FloatArray  # (M,)
+    poses: FloatArray  # (M, 3): NaN where nothing was measured, or grossly wrong
+    covariances: FloatArray  # (M, 3, 3): of the measured poses
+    offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
+
+
 class LocalisationProblem(NamedTuple):
     """Measured poses beside odometry's, aligned."""
 
     odometry: PlanarPoses  # Aligned rigidly with the measured poses
-    times_s: FloatArray  # (M,)
-    differences: FloatArray  # (M, 3): measured poses minus odometry's at their times
-    covariances: FloatArray  # (M, 3, 3): of the measured poses
-    offsets: FloatArray  # (M, 2): odometry's positions less the centroid (m)
+    measured: Differences
     centroid: FloatArray  # (2,)
     gate: float  # Largest squared normalised innovation
 
@@ -109,10 +115,9 @@ def localisation_problem(
     centroid = beside.poses[:, :2].mean(axis=0)
     return LocalisationProblem(
         moved_poses(odometry, motion),
-        measured.times_s,
-        differences,
-        measured.covariances,
-        beside.poses[:, :2] - centroid,
+        Differences(
+            measured.times_s, differences, measured.covariances, beside.poses[:, :2] - centroid
+        ),
         centroid,
         gate,
     )
@@ -126,25 +131,16 @@ def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]
     """
     start = np.array(_START)
     bound = math.log(_LARGEST_FACTOR)
-    stride = max(1, len(problem.times_s) // _MOST_TO_LEARN_FROM)
+    stride = max(1, len(problem.measured.times_s) // _MOST_TO_LEARN_FROM)
+    some = Differences(*(values[::stride] for values in problem.measured))
 
-    def surprise(logarithms: FloatArray, stride: int = stride) -> float:
+    def surprise(logarithms: FloatArray, measured: Differences) -> float:
         errors = start * np.exp(np.clip(logarithms, -bound, bound))
-        return float(
-            _filter(
-                problem.times_s[::stride],
-                problem.differences[::stride],
-                problem.covariances[::stride],
-                problem.offsets[::stride],
-                errors,
-                np.array(_ALIGNMENT_SIGMAS),
-                problem.gate,
-                empty_history(0, _STATE),
-            )[1]
-        )
+        return float(_filter(measured, errors, problem.gate, empty_history(0, _STATE))[1])
 
     def with_prior(logarithms: FloatArray) -> float:
-        return surprise(logarithms) + float(np.sum((logarithms[2:] / _LOG_CORRELATION_SIGMA) ** 2))
+        prior = float(np.sum((logarithms[2:] / _LOG_CORRELATION_SIGMA) ** 2))
+        return surprise(logarithms, some) + prior
 
     found = minimize(
         with_prior,
@@ -157,30 +153,24 @@ def learn_localisation(problem: LocalisationProblem) -> tuple[FloatArray, float]
         },
     )
     errors = start * np.exp(np.clip(found.x, -bound, bound))
-    return np.asarray(errors), surprise(found.x, 1)
+    return np.asarray(errors), surprise(found.x, problem.measured)
 
 
 @kernel()
 def _filter(
-    times_s: FloatArray,
-    differences: FloatArray,
-    covariances: FloatArray,
-    offsets: FloatArray,
-    errors: FloatArray,
-    alignment_sigmas: FloatArray,
-    gate: float,
-    history: FilterHistory,
+    measured: Differences, errors: FloatArray, gate: float, history: FilterHistory
 ) -> tuple[FloatArray, float]:
     """Kalman filter over the errors; differences that are NaN are not measured.
 
     `history`: filled, unless it is of no nodes. Returns the squared normalised innovations (M,) and
     minus twice the logarithm of the measurements' likelihood.
     """
+    times_s, differences, covariances, offsets = measured
     count = len(times_s)
     x = np.zeros(_STATE)
     p = np.zeros((_STATE, _STATE))
     for i in range(_STATE):
-        p[i, i] = _variance(errors, i) if i < POSE else alignment_sigmas[i - POSE] ** 2
+        p[i, i] = _variance(errors, i) if i < POSE else _ALIGNMENT_SIGMAS[i - POSE] ** 2
     kept = len(history.predicted) > 0
     squared = np.zeros(count)
     surprise = 0.0
@@ -249,26 +239,22 @@ def smooth_localisation(
     normalised innovations of the measurements (M,), and the heading's offset (rad).
     """
     there, _ = interpolate_poses(problem.odometry, times_s)
-    all_times = np.concatenate([times_s, problem.times_s])
-    order = np.argsort(all_times, kind="stable")
-    none = np.full((len(times_s), POSE), np.nan)
-    offsets = np.concatenate([there.poses[:, :2] - problem.centroid, problem.offsets])[order]
-    history = empty_history(len(order), _STATE)
-    squared, _ = _filter(
-        all_times[order],
-        np.concatenate([none, problem.differences])[order],
-        np.concatenate([np.zeros((len(times_s), POSE, POSE)), problem.covariances])[order],
-        offsets,
-        errors,
-        np.array(_ALIGNMENT_SIGMAS),
-        problem.gate,
-        history,
+    none = Differences(
+        times_s,
+        np.full((len(times_s), POSE), np.nan),
+        np.zeros((len(times_s), POSE, POSE)),
+        there.poses[:, :2] - problem.centroid,
     )
+    both = [np.concatenate(pair) for pair in zip(none, problem.measured)]
+    order = np.argsort(both[0], kind="stable")
+    merged = Differences(*(values[order] for values in both))
+    history = empty_history(len(order), _STATE)
+    squared, _ = _filter(merged, errors, problem.gate, history)
     states, spreads = smooth_backward(history)
     own = np.flatnonzero(order < len(times_s))
     h = np.zeros((len(own), POSE, _STATE))
     h[:, [0, 0, 1, 1, 2, 2, 2], [0, 3, 1, 4, 2, 5, 6]] = 1.0
-    h[:, 0, 5], h[:, 1, 5] = -offsets[own, 1], offsets[own, 0]
+    h[:, 0, 5], h[:, 1, 5] = -merged.offsets[own, 1], merged.offsets[own, 0]
     poses = there.poses + np.einsum("nij,nj->ni", h, states[own])
     poses[:, 2] = wrap_angle(poses[:, 2])
     covariances = h @ spreads[own] @ np.swapaxes(h, 1, 2)

@@ -22,10 +22,11 @@ from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion.inputs import (
+    CREEP_M2_PER_S,
+    CREEP_RAD2_PER_S,
     gather,
     movements,
     systematic_sigmas,
-    variances_of,
 )
 from redetect.groundtruth.fusion.kernels import (
     AFTER_REJECTIONS,
@@ -56,16 +57,6 @@ _CLEAR_LEAD = 2.0 * math.log(100.0)
 _TURN_PER_METRE = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Bridge:
-    """The likeliest path over a gap."""
-
-    # (N, 6): states from the gap's begin to its end; headings have no jumps. None if more than one
-    # number of whole turns may be, or if none explains the end.
-    path: FloatArray | None
-    looser: float  # By what factor odometry's variances had to be raised to explain it, 1 or more
-
-
 def bridge(
     odometry: Odometry,
     forward: FloatArray,
@@ -73,13 +64,17 @@ def bridge(
     end: FloatArray,
     end_spread: FloatArray,
     gate: float,
-) -> Bridge:
+) -> tuple[FloatArray | None, float]:
     """Find the likeliest path between two known ends.
 
     `odometry` leads to the N nodes of the gap. `forward` (N - 1, 6) is where it leads from the
     first node, whose covariance is `spread` (6, 6). `end` (3,) is the pose at the last node, with
     `end_spread` (3, 3). Beyond the `gate`, a squared normalised distance of the end, odometry is
     taken to err more in this gap than elsewhere.
+
+    Returns states (N, 6) from the gap's begin to its end, whose headings have no jumps, or None if
+    more than one number of whole turns may be, or none explains the end; and by how much odometry's
+    variances had to be raised to explain it, 1 or more.
     """
     looser = 1.0
     for _ in range(_MOST_LOOSENINGS):
@@ -97,9 +92,9 @@ def bridge(
         surprise, squared, path = tried[0]
         if squared <= gate:
             clear = len(tried) == 1 or tried[1][0] - surprise >= _CLEAR_LEAD
-            return Bridge(path if clear else None, looser)
+            return (path if clear else None), looser
         looser *= max(squared / POSE, 1.5)
-    return Bridge(None, looser)
+    return None, looser
 
 
 def _bent(controls: FloatArray, forward: FloatArray, end: FloatArray, turns: int) -> FloatArray:
@@ -316,9 +311,8 @@ class MovementProblem:
         points = states.copy()
         cuts[:] = False
         for begin, end in gaps:
-            found = self._bridge(begin, end, as_sampled, points, covariances)
-            cuts[end] = found.path is None
-            variances[begin + 1 : end + 1] *= max(1.0, found.looser / looser_in_gaps)
+            cuts[end], looser = self._bridge(begin, end, as_sampled, points, covariances)
+            variances[begin + 1 : end + 1] *= max(1.0, looser / looser_in_gaps)
         # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
         # too far off on its way for its derivatives to hold.
         for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
@@ -349,13 +343,14 @@ class MovementProblem:
         variances: FloatArray,
         points: FloatArray,
         covariances: FloatArray,
-    ) -> Bridge:
-        """Bridge a gap that was cut with points, if possible.
+    ) -> tuple[bool, float]:
+        """Bridge a gap that was cut with points, if possible; else it stays cut.
 
-        The number of whole turns by which headings differ is that with the least noise.
+        The number of whole turns by which headings differ is that with the least noise. Returns
+        whether it stays cut, and by how much odometry's variances are to be raised in it.
         """
         gap = slice(begin, end + 1)
-        found = bridge(
+        path, looser = bridge(
             Odometry(self.controls[gap], variances[gap]),
             points[begin:end],
             covariances[begin],
@@ -363,13 +358,13 @@ class MovementProblem:
             covariances[end, :POSE, :POSE],
             self.gate(),
         )
-        if found.path is None:
-            return found
-        points[begin:end] = found.path[:-1]
+        if path is None:
+            return True, looser
+        points[begin:end] = path[:-1]
         # Whole turns, so that headings continue without a jump.
-        turns = np.round((found.path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
+        turns = np.round((path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
         points[end:, 2] += 2.0 * math.pi * turns
-        return found
+        return False, looser
 
     def _anchor(
         self,
@@ -394,8 +389,23 @@ class MovementProblem:
         return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
 
     def _variances(self, noise: FloatArray) -> FloatArray:
-        """(N, 3) what odometry's random errors sum up to."""
-        return variances_of(self.times_s, self.controls, self.unseen, noise, self.settings)
+        """(N, 3) noise of movements to nodes: along the way, across it (m^2), of the turn (rad^2).
+
+        `noise` (4,): see `redetect.groundtruth.fusion.inputs.noise_of`. All of it is proportional
+        to way, turn and time, so that it adds up over parts of a movement; but for what pauses
+        hide: there odometry's systematic bend has a way to act on that is not known, and what a
+        wrong heading leads aside is taken to be that of a way out and back.
+        """
+        along, across, by_turn, by_way = np.square(noise)
+        way, turn = np.hypot(self.controls[:, 0], self.controls[:, 1]), np.abs(self.controls[:, 2])
+        passed = np.concatenate([[0.0], np.diff(self.times_s)])
+        hidden_way, hidden_turn = self.unseen.T
+        bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_way)
+        hidden = by_turn * hidden_turn + by_way * hidden_way + bend
+        aside = hidden * hidden_way**2 / 12.0 + CREEP_M2_PER_S * passed
+        rest = by_turn * turn + by_way * way + hidden + CREEP_RAD2_PER_S * passed
+        way = way + hidden_way
+        return np.column_stack([along * way + aside, across * way + aside, rest])
 
     def _forward(
         self,
@@ -434,7 +444,7 @@ def movement_problem(
     """
     names, times, measured, covariances, repaired, repeated = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
-    inside = odometry.times_s[(odometry.times_s >= times[0]) & (odometry.times_s <= times[-1])]
+    inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
     controls, unseen = movements(odometry, node_times, settings)
     return MovementProblem(

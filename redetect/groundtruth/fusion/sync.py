@@ -102,17 +102,16 @@ def synchronise(
             )
     by_headings: list[ClockSegment] = []
     by_movement: list[ClockSegment] = []
-    limits = (bounds.largest_offset_s, bounds.largest_drift)
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
         segment = groundtruth.only(part)
         if not bounds.use_movement:
             segment = replace(segment, covariances=None)
         own = _segment(odometry, segment, bounds, _MOST_JUMPS)
-        refined = refine_by_movement(own, odometry, segment, limits)
+        refined = refine_by_movement(own, odometry, segment, bounds.largest)
         if len(refined) > 1 and not _differ(refined):
             # Headings suggested a jump of the clock that the whole movement does not confirm.
             own = _segment(odometry, segment, bounds, 0)
-            refined = refine_by_movement(own, odometry, segment, limits)
+            refined = refine_by_movement(own, odometry, segment, bounds.largest)
         by_headings.extend(own)
         by_movement.extend(refined)
     if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in by_headings):
@@ -141,13 +140,7 @@ def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, jumps_left: int
 ) -> list[ClockSegment]:
     """One segment's clock; several parts where the clock was set within it."""
-    pair = pair_headings(
-        odometry,
-        segment,
-        largest_offset_s=bounds.largest_offset_s,
-        largest_drift=bounds.largest_drift,
-        fewest=_FEWEST_SAMPLES,
-    )
+    pair = pair_headings(odometry, segment, bounds.largest, _FEWEST_SAMPLES)
     turned = float(np.sum(np.abs(np.diff(_smoothed(continuous_headings(segment))))))
     if pair is None:
         return [_undetermined(segment, 0.0, "no odometry")]
@@ -185,9 +178,8 @@ def _segment(
                     else part
                     for part in parts
                 ]
-    status: Status = "ok"
-    if abs(offset) > 0.999 * bounds.largest_offset_s or abs(drift) > 0.999 * bounds.largest_drift:
-        status = "at a bound"
+    found, largest = np.abs([offset, drift]), np.array(bounds.largest)
+    status: Status = "at a bound" if np.any(found > _AT_A_BOUND * largest) else "ok"
     level, level_sigma = wandering.level(
         without_turns(pair.differences(offset, drift), keep_mean=True)
     )
@@ -249,7 +241,7 @@ def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:
     stride = max(1, len(pair.times_s) // _MOST_COARSE_SAMPLES)
     coarse = pair.kept(np.arange(len(pair.times_s)) % stride == 0)
     box = Bounds([-1.0, -1.0], [1.0, 1.0])
-    scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
+    scale = np.array(bounds.largest)
     found = direct(lambda x: _sum_of_squares(coarse, *(x * scale)), box, maxfun=1500, maxiter=1000)
     best = _minimum(lambda x: _sum_of_squares(pair, *(x * scale)), found.x, 1e-6, 1e-14)
     offset, drift = best * scale
@@ -278,7 +270,7 @@ def _refine(
     unknowns: int = 2,
 ) -> tuple[float, float]:
     """Least whitened squares near a result of the global search; of one unknown, the offset."""
-    scale = np.array([bounds.largest_offset_s, bounds.largest_drift])
+    scale = np.array(bounds.largest)
     best = np.clip(np.array(start) / scale, -1.0, 1.0)
 
     def squared(x: FloatArray) -> float:
@@ -310,7 +302,7 @@ def _sigmas(
 ) -> FloatArray:
     """(2,) deviations of offset and drift by the information in the segment's turns."""
     # In deviations before anything was measured, which differ much: even between the bounds.
-    prior = np.array([bounds.largest_offset_s, bounds.largest_drift]) / math.sqrt(3.0)
+    prior = np.array(bounds.largest) / math.sqrt(3.0)
     jacobian = (pair.sensitivities(offset_s, drift) * prior)[:, :unknowns]
     information = jacobian.T @ wandering.whiten(jacobian) + np.eye(unknowns)
     prior[:unknowns] *= np.sqrt(np.diag(np.linalg.inv(information)))
@@ -380,9 +372,9 @@ def _refined(
     largest: tuple[float, float],
 ) -> ClockSegment:
     assert groundtruth.covariances is not None
-    here = (groundtruth.times_s >= segment.from_s) & (groundtruth.times_s <= segment.to_s)
-    near = (odometry.times_s >= segment.from_s + segment.offset_s - _MARGIN_S) & (
-        odometry.times_s <= segment.to_s + segment.offset_s + _MARGIN_S
+    here = groundtruth.during(segment.from_s, segment.to_s)
+    near = odometry.during(
+        segment.from_s + segment.offset_s - _MARGIN_S, segment.to_s + segment.offset_s + _MARGIN_S
     )
     steps = np.diff(odometry.poses[near][:, :2], axis=0)
     if (

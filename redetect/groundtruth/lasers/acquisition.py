@@ -134,14 +134,13 @@ def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> Fix
     )
 
 
-def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> ScanSets:
-    """Put the scans of scanners that run independently into sets.
+def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
+    """Put the scans of scanners that run independently, by scanner, into sets.
 
     Going through all scans in the order of time, a set ends where a scanner would come a second
-    time, or where its first scan is more than the window ago. So each scan is in one set, and
-    scanners that run slightly faster than others occasionally have a set of their own.
-
-    `scans`: per scanner. `window_s`: by default the median time between a scanner's scans.
+    time, or where its first scan is longer ago than the median time between a scanner's scans. So
+    each scan is in one set, and scanners that run slightly faster than others occasionally have a
+    set of their own.
     """
     total = sum(len(one) for one in scans)
     if total == 0:
@@ -151,30 +150,23 @@ def sets_of_scans(scans: Sequence[Scans], window_s: float | None = None) -> Scan
     first = np.cumsum([0, *(len(one) for one in scans)])
     for begin, one in zip(first, scans):
         ranges[begin : begin + len(one), : one.ranges_mm.shape[1]] = one.ranges_mm
-    if window_s is None:
-        steps = [float(np.median(np.diff(one.times_s))) for one in scans if len(one) > 1]
-        window_s = min(steps) if steps else 0.0
+    steps = [float(np.median(np.diff(one.times_s))) for one in scans if len(one) > 1]
+    window_s = min(steps, default=0.0)
     times = np.concatenate([one.times_s for one in scans])
     owner = np.concatenate([np.full(len(one), i) for i, one in enumerate(scans)])
     order = np.lexsort((owner, times))
-    rows = _group(order, owner, times, len(scans), window_s)
+    sets: list[list[int]] = []
+    begun = -np.inf
+    for i, scanner, t in zip(order.tolist(), owner[order].tolist(), times[order].tolist()):
+        if not sets or sets[-1][scanner] >= 0 or t - begun > window_s:
+            sets.append([-1] * len(scans))
+            begun = t
+        sets[-1][scanner] = i
+    rows = np.array(sets, dtype=np.int64)
     seen = rows >= 0
     at = np.where(seen, times[rows], 0.0)
     when = at.sum(axis=1) / seen.sum(axis=1)
     return ScanSets(when, rows, np.where(seen, when[:, None] - at, 0.0), ranges)
-
-
-def _group(
-    order: IntArray, owner: IntArray, times: FloatArray, scanners: int, window_s: float
-) -> IntArray:
-    rows: list[list[int]] = []
-    begun = -np.inf
-    for i, scanner, t in zip(order.tolist(), owner[order].tolist(), times[order].tolist()):
-        if not rows or rows[-1][scanner] >= 0 or t - begun > window_s:
-            rows.append([-1] * scanners)
-            begun = t
-        rows[-1][scanner] = i
-    return np.array(rows, dtype=np.int64).reshape(-1, scanners)
 
 
 def load_session(
@@ -182,10 +174,7 @@ def load_session(
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
     """Read fixed scanners, robot, scans, and learn the background.
 
-    Raises
-    ------
-    GroundTruthError
-        If a file is missing or does not fit the others.
+    Raises `GroundTruthError` if a file is missing or does not fit the others.
     """
     scanners = read_scanners(calibration)
     robot = read_robot(folder / "robot.json")
@@ -199,12 +188,8 @@ def load_session(
 def outline_faces(outline: ArrayLike) -> FloatArray:
     """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    Of corners (k, 2) in order, either way round (m).
-
-    Raises
-    ------
-    GroundTruthError
-        If two corners that follow each other are one, faces cross, or the outline encloses nothing.
+    Of corners (k, 2) in order, either way round (m). Raises `GroundTruthError` if two corners that
+    follow each other are one, faces cross, or the outline encloses nothing.
     """
     corners = np.asarray(outline, dtype=np.float64)
     following = np.roll(corners, -1, axis=0)

@@ -19,7 +19,7 @@ from ezdxf.filemanagement import readfile
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_content
 from redetect.storage.messages import one_line
 
 #: Curved walls are cut into straight pieces no farther from the curve than this (m).
@@ -78,8 +78,8 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
 
 def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
     pieces: list[tuple[float, float, float, float]] = []
+    read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
     try:
-        read_bounded(path, _LARGEST_FILE_BYTES)
         drawing = readfile(os.fspath(path))
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
         unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
@@ -89,10 +89,6 @@ def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
             pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
             if len(pieces) > MOST_SEGMENTS:
                 raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror or error}") from None
     except GroundTruthError:
         raise
     except Exception as error:  # a damaged drawing may fail anywhere within the library

@@ -168,43 +168,26 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
 
     The plane's closed form of the fit by singular values (Arun, Huang, Blostein 1987).
     """
-    n = 0
-    px = py = qx = qy = 0.0
-    for i in range(points.shape[0]):
-        if used[i]:
-            n += 1
-            px += points[i, 0]
-            py += points[i, 1]
-            qx += target[i, 0]
-            qy += target[i, 1]
-    pose = np.full(3, np.nan)
-    if n == 0:
-        return pose
-    px, py, qx, qy = px / n, py / n, qx / n, qy / n
-    dot = cross = 0.0
-    for i in range(points.shape[0]):
-        if used[i]:
-            ax, ay = points[i, 0] - px, points[i, 1] - py
-            bx, by = target[i, 0] - qx, target[i, 1] - qy
-            dot += ax * bx + ay * by
-            cross += ax * by - ay * bx
-    theta = math.atan2(cross, dot)
+    if not np.any(used):
+        return np.full(3, np.nan)
+    p, q = points[used], target[used]
+    n = len(p)
+    middle_p, middle_q = p.sum(axis=0) / n, q.sum(axis=0) / n
+    a, b = p - middle_p, q - middle_q
+    dot = np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+    theta = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), dot)
     c, s = math.cos(theta), math.sin(theta)
-    pose[0] = qx - (c * px - s * py)
-    pose[1] = qy - (s * px + c * py)
-    pose[2] = theta
-    return pose
+    x = middle_q[0] - (c * middle_p[0] - s * middle_p[1])
+    y = middle_q[1] - (s * middle_p[0] + c * middle_p[1])
+    return np.array([x, y, theta])
 
 
 @kernel()
 def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points taken by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    out = np.empty_like(points)
-    for i in range(points.shape[0]):
-        out[i, 0] = pose[0] + c * points[i, 0] - s * points[i, 1]
-        out[i, 1] = pose[1] + s * points[i, 0] + c * points[i, 1]
-    return out
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack((pose[0] + c * x - s * y, pose[1] + s * x + c * y))
 
 
 @kernel()
@@ -223,8 +206,7 @@ def fit_outline(
     """
     pose = start.copy()
     before = np.inf
-    rms, count, step = np.inf, 0, 0
-    used = np.zeros(points.shape[0], dtype=np.bool_)
+    step = 0
     while True:
         c, s = math.cos(pose[2]), math.sin(pose[2])
         back = np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
@@ -235,13 +217,9 @@ def fit_outline(
             return pose, np.inf, within.size
         within.sort()
         limit = within[math.ceil(kept * within.size) - 1]
-        total, count = 0.0, 0
-        for i in range(points.shape[0]):
-            used[i] = squared[i] <= limit
-            if used[i]:
-                total += squared[i]
-                count += 1
-        rms = math.sqrt(total / count)
+        used = squared <= limit
+        count = int(np.count_nonzero(used))
+        rms = math.sqrt(squared[used].sum() / count)
         if abs(before - rms) < threshold_m or step == most_steps:
             return pose, rms, count
         before = rms

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.storage.bounded import read_plain_array
 from redetect.storage.bounds import (
@@ -48,10 +48,7 @@ _MILLIMETRE = 1e-3
 class Scanner:
     """A laser scanner.
 
-    Raises
-    ------
-    GroundTruthError
-        If a shape or value is impossible.
+    Raises `GroundTruthError` if a shape or value is impossible.
     """
 
     name: str  # Its scans are in ``<name>.scans.npz``
@@ -112,10 +109,8 @@ class Robot:
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
     """Read a ``scanners.json``: the scanners, in the file's order.
 
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or an entry is missing, impossible or of a name given twice.
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing, impossible or of a
+    name given twice.
     """
     return _scanners(JsonObject.read(path))
 
@@ -135,10 +130,7 @@ def write_scanners(
 def read_robot(path: str | os.PathLike[str]) -> Robot:
     """Read a ``robot.json``.
 
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
     """
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
@@ -190,10 +182,7 @@ _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 class Scans:
     """Scans of one scanner over time.
 
-    Raises
-    ------
-    GroundTruthError
-        If shapes or types disagree or a time is not finite.
+    Raises `GroundTruthError` if shapes or types disagree or a time is not finite.
     """
 
     # (N,): seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In
@@ -219,10 +208,7 @@ class Scans:
 def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
     """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
 
-    Raises
-    ------
-    GroundTruthError
-        If there is none, or more than one.
+    Raises `GroundTruthError` if there is none, or more than one.
     """
     found = [path for end in _ENDINGS if (path := Path(folder) / (name + end)).is_file()]
     if len(found) != 1:
@@ -266,7 +252,7 @@ def read_scans(
     try:
         scans = Scans(times, ranges)
     except GroundTruthError as error:
-        raise StreamError(path, None, str(error)) from None
+        raise GroundTruthError(f"{path}: {error}") from None
     if readings is not None and scans.ranges_mm.shape[1] != readings:
         raise GroundTruthError(
             f"{path}: {scans.ranges_mm.shape[1]} readings per scan: expected {readings}"
@@ -337,12 +323,12 @@ def _read_rows(
         columns = columns or len(values)
         if len(values) != columns or columns < 2:
             wanted = "a time and readings" if columns < 2 else f"{columns}: time and readings"
-            raise StreamError(path, line, f"{len(words)} numbers: expected {wanted}")
+            raise GroundTruthError(f"{path}:{line}: {len(words)} numbers: expected {wanted}")
         if np.any(values[1:] < 0.0):
-            raise StreamError(path, line, "a reading below 0: expected metres")
+            raise GroundTruthError(f"{path}:{line}: a reading below 0: expected metres")
         rows.append(values)
     if not rows:
-        raise StreamError(path, None, "no scans in it")
+        raise GroundTruthError(f"{path}: no scans in it")
     table = np.stack(rows)
     millimetres = np.rint(np.minimum(table[:, 1:], _FARTHEST_M) / _MILLIMETRE)
     ranges = np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16)

@@ -27,7 +27,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     new_points,
 )
 from redetect.groundtruth.settings import LaserSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, compose
 
@@ -149,8 +149,7 @@ class Tracker:
             if fitted is None:
                 self.track.status[i], pose = COASTING, predicted
                 continue
-            error = fitted - predicted
-            error[2] = wrap_angle(error[2])
+            error = pose_differences(fitted, predicted)
             # At first no motion is known: it follows the poses more quickly.
             young = max(0.0, 1.0 - (i - begun) / 12.0)
             pose = predicted + (_POSE_GAIN + (1.0 - _POSE_GAIN) * young) * error
@@ -382,11 +381,8 @@ def track_without_suspects(
     """Follow the robot, leaving out scanners whose readings do not fit the others'.
 
     One at a time, the worst first, and only while three scanners or more are left to say so.
-
-    Returns
-    -------
-    left_out : dict of str to (2, 3) float64
-        By scanner, the shift that its readings suggest and its standard deviations.
+    Returns the track and, of those left out, the shift that their readings suggest and its standard
+    deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
     track = track_robot(sets, fixed, robot, settings)
@@ -422,28 +418,16 @@ LARGEST_GAP_S = 0.05
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
-    """Poses of a track, each from `sets_per_pose` consecutive sets.
+    """Poses of a track, each from `sets_per_pose` consecutive sets; 1: every set by itself.
 
-    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set
-    is in one pose only, so that the readings' errors in different poses are independent; those of
-    the scanners' poses are common to all and are not averaged away.
+    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set is
+    in one pose only, so that the readings' errors in different poses are independent; those of the
+    scanners' poses are common to all and are not averaged away. A block is shorter at the end of a
+    visit, and where sets have no determined pose.
 
-    Parameters
-    ----------
-    sets_per_pose : int
-        1: every set by itself. A block is shorter at the end of a visit, and where sets have no
-        determined pose.
-
-    Returns
-    -------
-    PlanarPoses
-        Sets with an undetermined direction come as poses of their own, with the covariance that
-        says so; those whose front is unknown do not come at all.
-
-    Raises
-    ------
-    GroundTruthError
-        If `sets_per_pose` is not positive.
+    Sets with an undetermined direction come as poses of their own, with the covariance that says
+    so; those whose front is unknown do not come at all. Raises `GroundTruthError` if
+    `sets_per_pose` is not positive.
     """
     if sets_per_pose < 1:
         raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
@@ -461,26 +445,24 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
         | ~determined[rows[:-1]]
     )
     first = np.flatnonzero(parted)
-    run = np.cumsum(parted) - 1
-    within = (np.arange(len(rows)) - first[run]) // sets_per_pose
-    begins = parted | np.concatenate([[True], np.diff(within) != 0])
-    block = np.cumsum(begins) - 1
-    count = int(block[-1]) + 1
+    within = np.arange(len(rows)) - first[np.cumsum(parted) - 1]
+    begins = np.flatnonzero(within % sets_per_pose == 0)
+    size = np.diff(begins, append=len(rows))
+    block = np.repeat(np.arange(len(begins)), size)
 
-    size = np.bincount(block, minlength=count).astype(np.float64)
+    def mean_of(values: FloatArray) -> FloatArray:
+        """Means of the sets of each block."""
+        return np.asarray((np.add.reduceat(values, begins).T / size).T)
+
     origin = times[0]
-    middle = np.bincount(block, times - origin, minlength=count) / size
-    lead = track.poses[rows[np.flatnonzero(begins)]]
+    middle = mean_of(times - origin)
+    lead = track.poses[rows[begins]]
     moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
-    apart = moved - lead[block]
-    apart[:, 2] = wrap_angle(apart[:, 2])
+    apart = pose_differences(moved, lead[block])
     # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
     # with equal weights at the mean time an error of the motion drops out.
-    noise, shared = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
-    mean = np.zeros((count, 3))
-    np.add.at(mean, block, apart / size[block][:, None])
-    np.add.at(noise, block, track.noise[rows] / (size**2)[block][:, None, None])
-    np.add.at(shared, block, (track.covariances - track.noise)[rows] / size[block][:, None, None])
+    mean, noise = mean_of(apart), mean_of(track.noise[rows]) / size[:, None, None]
+    shared = mean_of((track.covariances - track.noise)[rows])
     poses = lead + mean
     poses[:, 2] = wrap_angle(poses[:, 2])
     covariances = noise + shared

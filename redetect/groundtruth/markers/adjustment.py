@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
+from camera.calibration.model import cross_matrices
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
-    hat,
     inverse,
     log_se3,
     right_jacobian,
@@ -67,59 +67,51 @@ class ChainPoints:
         return ChainPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
-@dataclass(frozen=True, eq=False)
-class ChainProjection:
+class Chain(NamedTuple):
+    """Cameras, bodies and their parts, as the points of a `ChainPoints` name them."""
+
+    cameras: Sequence[Camera]  # Their lenses; the mounting that a `Camera` holds is not used
+    world_from_camera: FloatArray  # (C, 4, 4)
+    world_from_body: FloatArray  # (B, 4, 4)
+    body_from_part: FloatArray  # (P, 4, 4)
+
+
+class ChainProjection(NamedTuple):
     """Pixels of points and how they move with right perturbations of the three poses."""
 
-    # (N, 2): naN where a point is not in front of its camera or past the distortion's fold
+    # (N, 2): NaN where a point is not in front of its camera or past the distortion's fold
     pixels: FloatArray
     by_camera: FloatArray  # (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_body: FloatArray
     by_part: FloatArray
 
 
-def project_chain(
-    cameras: Sequence[Camera],
-    world_from_camera: FloatArray,
-    world_from_body: FloatArray,
-    body_from_part: FloatArray,
-    seen: ChainPoints,
-) -> FloatArray:
-    """(N, 2) pixels at which the points would be seen (see `ChainProjection.pixels`).
-
-    `cameras`: their lenses; the mounting that a `Camera` holds is not used. `world_from_camera`,
-    `world_from_body`, `body_from_part` (C | B | P, 4, 4). `seen`: its pixels are not used.
-    """
-    in_body = apply(body_from_part[seen.part], seen.points)
-    in_world = apply(world_from_body[seen.body], in_body)
-    in_camera = apply(inverse(world_from_camera)[seen.camera], in_world)
+def project_chain(chain: Chain, seen: ChainPoints) -> FloatArray:
+    """(N, 2) pixels at which the points would be seen (see `ChainProjection.pixels`)."""
+    in_body = apply(chain.body_from_part[seen.part], seen.points)
+    in_world = apply(chain.world_from_body[seen.body], in_body)
+    in_camera = apply(inverse(chain.world_from_camera)[seen.camera], in_world)
     pixels = np.empty((len(seen), 2))
     for index in np.unique(seen.camera):
         chosen = seen.camera == index
-        pixels[chosen] = cameras[index].project(in_camera[chosen])
+        pixels[chosen] = chain.cameras[index].project(in_camera[chosen])
     return pixels
 
 
-def project_chain_with_jacobians(
-    cameras: Sequence[Camera],
-    world_from_camera: FloatArray,
-    world_from_body: FloatArray,
-    body_from_part: FloatArray,
-    seen: ChainPoints,
-) -> ChainProjection:
+def project_chain_with_jacobians(chain: Chain, seen: ChainPoints) -> ChainProjection:
     """Pixels and Jacobians; parameters as in `project_chain`."""
-    camera_from_world = inverse(world_from_camera)[seen.camera]
-    camera_from_body = camera_from_world @ world_from_body[seen.body]
-    in_body = apply(body_from_part[seen.part], seen.points)
+    camera_from_world = inverse(chain.world_from_camera)[seen.camera]
+    camera_from_body = camera_from_world @ chain.world_from_body[seen.body]
+    in_body = apply(chain.body_from_part[seen.part], seen.points)
     in_camera = apply(camera_from_body, in_body)
     pixels = np.empty((len(seen), 2))
     by_point = np.empty((len(seen), 2, 3))
     for index in np.unique(seen.camera):
         chosen = seen.camera == index
-        pixels[chosen] = cameras[index].project(in_camera[chosen])
-        by_point[chosen] = cameras[index].project_jacobian(in_camera[chosen])
+        pixels[chosen] = chain.cameras[index].project(in_camera[chosen])
+        by_point[chosen] = chain.cameras[index].project_jacobian(in_camera[chosen])
     by_body_point = by_point @ camera_from_body[:, :3, :3]
-    by_part_point = by_body_point @ body_from_part[seen.part][:, :3, :3]
+    by_part_point = by_body_point @ chain.body_from_part[seen.part][:, :3, :3]
     return ChainProjection(
         pixels,
         -_by_tangent(by_point, in_camera),
@@ -130,7 +122,7 @@ def project_chain_with_jacobians(
 
 def _by_tangent(by_point: FloatArray, points: FloatArray) -> FloatArray:
     """Chain d(u, v) / d(point) with d(point) / d(v, w) = [I, -[point]x]."""
-    return np.concatenate([by_point, -(by_point @ hat(points))], axis=-1)
+    return np.concatenate([by_point, -(by_point @ cross_matrices(points))], axis=-1)
 
 
 # Of the first pass, which only has to come near: points farther off than this pull less.
@@ -195,15 +187,15 @@ class Bundle:
         steps[self.free] = step.reshape(-1, 6)
         return replace(self, poses=self.poses @ exp_se3(steps))
 
+    @property
+    def chain(self) -> Chain:
+        """Its cameras and poses."""
+        poses = (self.world_from_camera, self.world_from_body, self.body_from_part)
+        return Chain(self.cameras, *poses)
+
     def pixels(self) -> FloatArray:
         """(N, 2) pixels at which the points are expected; NaN where they cannot be seen."""
-        return project_chain(
-            self.cameras,
-            self.world_from_camera,
-            self.world_from_body,
-            self.body_from_part,
-            self.seen,
-        )
+        return project_chain(self.chain, self.seen)
 
     def prior_error(self, prior: PosePrior) -> FloatArray:
         """(6,) right perturbation that leads from the prior's pose to the bundle's."""
@@ -246,17 +238,9 @@ def adjust_bundle(
 ) -> AdjustedBundle:
     """Adjust all free poses: robustly first, then by least squares without the wrong views.
 
-    Parameters
-    ----------
-    bundle : Bundle
-        Its poses are the start.
-    outlier_sigma, outlier_px : float
-        A view is wrong if its normalised error and its residuals (px) are larger than these.
-
-    Raises
-    ------
-    GeometryError
-        If the start has a point behind its camera, or the points do not determine the poses.
+    The bundle's poses are the start. A view is wrong if its normalised error and its residuals (px)
+    are larger than `outlier_sigma` and `outlier_px`. Raises `GeometryError` if the start has a
+    point behind its camera, or the points do not determine the poses.
     """
     everything = np.ones(len(bundle.seen), dtype=np.bool_)
     bundle = _minimised(bundle, everything, _ROBUST, _NEAR)
@@ -284,13 +268,7 @@ def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
     Residuals are in standard deviations: those of the points, then those of the priors.
     """
     seen, free = bundle.seen, bundle.free
-    projection = project_chain_with_jacobians(
-        bundle.cameras,
-        bundle.world_from_camera,
-        bundle.world_from_body,
-        bundle.body_from_part,
-        seen,
-    )
+    projection = project_chain_with_jacobians(bundle.chain, seen)
     unknown = np.where(free, 6 * (np.cumsum(free) - 1), -1)
     white = whitening(seen.covariances)
     derivatives = [

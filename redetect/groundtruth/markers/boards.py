@@ -45,10 +45,8 @@ _WINDOW = 0.4
 def checkerboard(columns: int, rows: int, square_m: float) -> Board:
     """A board by its numbers of inner corners, one even and one odd, and the side of a square.
 
-    Raises
-    ------
-    GroundTruthError
-        If the board is symmetric under rotation by 180 degrees, or is too small.
+    Raises `GroundTruthError` if the board is symmetric under rotation by 180 degrees, or is too
+    small.
     """
     try:
         board = Board("checkerboard", columns, rows, square_m)
@@ -77,10 +75,8 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class DoubleBoard:
-    """Two boards held together."""
+    """The boards `FIRST` and `SECOND`, held together."""
 
-    first: str
-    second: str
     offset: FloatArray | None  # (4, 4): `first_from_second`; None if it is to be estimated.
     covariance: FloatArray  # (6, 6): of its right perturbation; zeros if it is exactly known.
 
@@ -109,17 +105,10 @@ class BoardsFile:
 
 
 def read_boards(path: Path) -> BoardsFile:
-    """Read a ``boards.json`` and the calibrations of its cameras.
+    """Read a ``boards.json``, or that of a folder, and the calibrations of its cameras.
 
-    Parameters
-    ----------
-    path : path
-        The file, or its folder.
-
-    Raises
-    ------
-    GroundTruthError, camera.CameraError
-        If a file cannot be read or an entry is missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
+    missing or impossible.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
     content = JsonObject.read(path)
@@ -133,7 +122,7 @@ def read_boards(path: Path) -> BoardsFile:
     world = parse_pose(content.inner("world_from_board"))
     double = None
     if FIRST in boards:
-        double = DoubleBoard(FIRST, SECOND, None, np.zeros((6, 6)))
+        double = DoubleBoard(None, np.zeros((6, 6)))
         if content.values.get("first_from_second") is not None:
             entry = content.inner("first_from_second")
             double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))
@@ -153,10 +142,8 @@ def read_boards(path: Path) -> BoardsFile:
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """The corners of the board in an image.
 
-    Raises
-    ------
-    GroundTruthError
-        If the image cannot be read, has another size than the calibration, or shows no board.
+    Raises `GroundTruthError` if the image cannot be read, has another size than the calibration, or
+    shows no board.
     """
     if image.corners is not None:
         return BoardView(image.camera, image.board, image.corners)

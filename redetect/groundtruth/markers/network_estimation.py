@@ -22,7 +22,7 @@ from redetect.groundtruth.markers.adjustment import (
     PosePrior,
     adjust_bundle,
 )
-from redetect.groundtruth.markers.boards import BoardView, DoubleBoard
+from redetect.groundtruth.markers.boards import FIRST, SECOND, BoardView, DoubleBoard
 from redetect.groundtruth.markers.pairs import chained_poses, spanning_tree
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
@@ -70,8 +70,8 @@ def estimate_network(
     offset = None
     parts = dict(world_from_board)
     if double is not None:
-        offset = double.offset if double.offset is not None else _estimated_offset(seen, double)
-        parts[double.first], parts[double.second] = np.eye(4), offset
+        offset = double.offset if double.offset is not None else _estimated_offset(seen)
+        parts[FIRST], parts[SECOND] = np.eye(4), offset
     poses, bodies = _chained(names, seen, world_from_board, parts)
     bundle, views = _bundle(
         cameras, boards, world_from_board, parts, double, seen, (poses, bodies), settings
@@ -83,7 +83,7 @@ def estimate_network(
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
     if double is not None:
-        offset = adjusted.bundle.body_from_part[sorted(parts).index(double.second)]
+        offset = adjusted.bundle.body_from_part[sorted(parts).index(SECOND)]
     return NetworkEstimate(
         names,
         adjusted.bundle.world_from_camera,
@@ -108,7 +108,7 @@ def _camera_from_board(
         raise GroundTruthError(f"camera {view.camera}, board {view.board}: {error}") from None
 
 
-def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
+def _estimated_offset(seen: _Seen) -> FloatArray:
     """`first_from_second`, from shots in which two cameras, or one, see both faces.
 
     With A_k the pose of the first face in one camera and B_k that of the second in another, both
@@ -118,7 +118,7 @@ def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
     for shot in seen:
         for view_a, a in shot:
             for view_b, b in shot:
-                if (view_a.board, view_b.board) == (double.first, double.second):
+                if (view_a.board, view_b.board) == (FIRST, SECOND):
                     if view_a.camera == view_b.camera:
                         return np.asarray(inverse(a) @ b)
                     together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
@@ -130,7 +130,7 @@ def _estimated_offset(seen: _Seen, double: DoubleBoard) -> FloatArray:
     axes = np.array([log_se3(motion)[3:] for motion in left]).reshape(-1, 3)
     if len(left) < 2 or np.linalg.svd(axes, compute_uv=False)[1] < 0.05:
         raise GroundTruthError(
-            f"the offset of boards {double.first} and {double.second} cannot be estimated: "
+            f"the offset of boards {FIRST} and {SECOND} cannot be estimated: "
             "expected 3 or more shots of two cameras with the boards turned about different axes"
         )
     return hand_eye(np.stack(left), np.stack(right))
@@ -188,11 +188,8 @@ def _chained(
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
     """The pose with the least sum of distances (m, rad) to the others."""
     stack = np.stack(poses)
-    sums = [
-        float(np.sum(np.minimum(np.linalg.norm(log_se3(inverse(pose) @ stack), axis=1), 1.0)))
-        for pose in stack
-    ]
-    return np.asarray(stack[int(np.argmin(sums))])
+    apart = np.linalg.norm(log_se3(inverse(stack)[:, None] @ stack), axis=-1)
+    return np.asarray(stack[int(np.argmin(np.minimum(apart, 1.0).sum(axis=1)))])
 
 
 def _bundle(
@@ -231,8 +228,8 @@ def _bundle(
     free = np.arange(len(names) + len(order) + 1 + len(bodies)) != len(names) + len(order)
     free[len(names) : len(names) + len(order)] = False
     priors: tuple[PosePrior, ...] = ()
-    if double is not None and any(view.board == double.second for view in views):
-        second = len(names) + order.index(double.second)
+    if double is not None and any(view.board == SECOND for view in views):
+        second = len(names) + order.index(SECOND)
         free[second] = double.offset is None or bool(np.any(double.covariance))
         if free[second] and double.offset is not None:
             # Exactly known poses beside uncertain ones are held to a micrometre.

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
     inverse,
@@ -43,7 +42,6 @@ class MarkerPose:
 class PairConsensus:
     """The pose of one marker relative to another."""
 
-    pair: tuple[int, int]  # (int, int): indices a, b
     a_from_b: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
@@ -59,49 +57,53 @@ class PairConsensus:
 
 def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     """Estimates of `a_from_b` from one time's solutions of both markers, every combination."""
-    poses, covariances, costs = [], [], []
-    for i in range(len(a.poses)):
-        a_from_reference = inverse(a.poses[i])
-        own = inverse_covariance(a.poses[i], a.covariances[i])
-        for j in range(len(b.poses)):
-            poses.append(a_from_reference @ b.poses[j])
-            covariances.append(composed_covariance(own, b.poses[j], b.covariances[j]))
-            costs.append(a.costs[i] + b.costs[j])
-    return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
+    poses = inverse(a.poses)[:, None] @ b.poses
+    own = inverse_covariance(a.poses, a.covariances)[:, None]
+    covariances = composed_covariance(own, b.poses, b.covariances)
+    costs = np.add.outer(a.costs, b.costs).ravel()
+    return MarkerPose(poses.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6), costs)
 
 
-def pair_consensus(pair: tuple[int, int], times: Sequence[MarkerPose]) -> PairConsensus:
+def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     """The transform that most times agree with.
 
-    `pair` (int, int). `times`: from `pair_estimates`, one for each time that shows both markers.
+    `times`: from `pair_estimates`, one for each time that shows both markers.
     """
-    poses, covariances, costs, owner = _stacked(times)
+    poses = np.concatenate([time.poses for time in times])
+    covariances = np.concatenate([time.covariances for time in times])
+    costs = np.concatenate([time.costs - time.costs.min() for time in times])
+    owner = np.repeat(np.arange(len(times)), [len(time.poses) for time in times])
+
+    def nearest(pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Each time's estimate nearest to a pose: squared normalised distance, and which it is."""
+        apart = log_se3(inverse(pose) @ poses)
+        distance = squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
+        order = np.lexsort((distance, owner))
+        best = order[np.searchsorted(owner[order], np.arange(len(times)))]
+        return distance[best], best
+
     # The surest estimates are hypotheses: those of a marker seen large and aslant.
     spread = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
     surest = np.argsort(spread, kind="stable")[:_HYPOTHESES]
     totals = []
     for hypothesis in surest:
-        distance = _distances(poses[hypothesis], covariances[hypothesis], poses, covariances, costs)
-        totals.append(np.sum(np.minimum(_least(distance, owner, len(times))[0], _AGREES)))
+        distance, _ = nearest(poses[hypothesis], covariances[hypothesis])
+        totals.append(np.sum(np.minimum(distance, _AGREES)))
     chosen = surest[int(np.argmin(totals))]
     consensus, covariance = poses[chosen], covariances[chosen]
     for _ in range(10):
-        distance, best = _least(
-            _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
-        )
+        distance, best = nearest(consensus, covariance)
         agreeing = best[distance < _AGREES]
         if not len(agreeing):  # not even the hypothesis: its own covariance is the floor's
             agreeing = np.array([chosen])
-        new, covariance, _ = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
+        new, covariance = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
         moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
         consensus = new
         if moved < 1e-10:
             break
-    distance, best = _least(
-        _distances(consensus, covariance, poses, covariances, costs), owner, len(times)
-    )
+    distance, best = nearest(consensus, covariance)
     first = np.array([costs[b] <= costs[owner == t].min() for t, b in enumerate(best)])
-    return PairConsensus(pair, consensus, covariance, poses[best], distance < _AGREES, first)
+    return PairConsensus(consensus, covariance, poses[best], distance < _AGREES, first)
 
 
 def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
@@ -128,44 +130,17 @@ def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -
 def chained_poses(
     relative: Mapping[tuple[int, int], FloatArray], parents: Sequence[int], root: int
 ) -> FloatArray:
-    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b."""
-    poses: dict[int, FloatArray] = {root: np.eye(4)}
-    while len(poses) < len(parents):
-        before = len(poses)
-        for marker, parent in enumerate(parents):
-            if marker not in poses and parent in poses:
-                known = relative.get((parent, marker))
-                step = inverse(relative[marker, parent]) if known is None else known
-                poses[marker] = poses[parent] @ step
-        if len(poses) == before:
-            raise GroundTruthError("a marker is not connected to the others")
-    return np.stack([poses[marker] for marker in range(len(parents))])
+    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b.
 
+    All are connected.
+    """
 
-def _stacked(times: Sequence[MarkerPose]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    return (
-        np.concatenate([time.poses for time in times]),
-        np.concatenate([time.covariances for time in times]),
-        np.concatenate([time.costs - time.costs.min() for time in times]),
-        np.repeat(np.arange(len(times)), [len(time.poses) for time in times]),
-    )
+    def placed(marker: int) -> FloatArray:
+        if marker == root:
+            return np.eye(4)
+        parent = parents[marker]
+        known = relative.get((parent, marker))
+        step = inverse(relative[marker, parent]) if known is None else known
+        return np.asarray(placed(parent) @ step)
 
-
-def _distances(
-    consensus: FloatArray,
-    covariance: FloatArray,
-    poses: FloatArray,
-    covariances: FloatArray,
-    costs: FloatArray,
-) -> FloatArray:
-    """Squared normalised distances of all estimates, and what they cost in the image."""
-    apart = log_se3(inverse(consensus) @ poses)
-    return squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
-
-
-def _least(distance: FloatArray, owner: IntArray, times: int) -> tuple[FloatArray, IntArray]:
-    """Each time's smallest distance and which estimate that is."""
-    order = np.lexsort((distance, owner))
-    first = np.searchsorted(owner[order], np.arange(times))
-    best = order[first]
-    return distance[best], best
+    return np.stack([placed(marker) for marker in range(len(parents))])

@@ -262,35 +262,27 @@ class PoseEstimate:
         return len(self.candidates) > 1
 
 
-def estimate_pose(problem: PoseProblem, settings: PoseSettings) -> PoseEstimate:
+def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     """All poses of a robot that its markers' corners allow.
 
-    Parameters
-    ----------
-    problem : PoseProblem
-        With at least one view.
-
-    Raises
-    ------
-    GeometryError
-        If no pose explains any of the views.
+    Raises `GeometryError` if there is no view, or no pose explains any of them.
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
-    everything = np.ones(problem.views, dtype=np.bool_)
-    found = _refined(problem, _starts(problem, settings)[:1], settings)
+    everything, settings = np.ones(problem.views, dtype=np.bool_), problem.settings
+    found = _refined(problem, _starts(problem)[:1])
     # Least squares may not have reached the right minimum from the solver's start.
     if not (found and _all_agree(found[0], settings)):
-        found = _refined(problem, _starts(problem, settings) + _own_poses(problem), settings)
+        found = _refined(problem, _starts(problem) + _own_poses(problem))
     if found and _all_agree(found[0], settings):
         sets, contradiction = [(everything, found)], False
     else:
-        sets, contradiction = _consensus(problem, settings)
+        sets, contradiction = _consensus(problem)
     candidates: list[PoseCandidate] = []
     for views, refined in sets:
         alone = problem.only(views)
-        starts = _starts(alone, settings)[:1] + _mirrored(alone)
-        minima = _distinct(refined + _refined(alone, starts, settings))
+        starts = _starts(alone)[:1] + _mirrored(alone)
+        minima = _distinct(refined + _refined(alone, starts))
         candidates += [
             PoseCandidate(**vars(pose), views=views) for pose in _likely(minima, settings)
         ]
@@ -313,9 +305,9 @@ def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:
     )
 
 
-def _starts(problem: PoseProblem, settings: PoseSettings) -> list[FloatArray]:
+def _starts(problem: PoseProblem) -> list[FloatArray]:
     try:
-        return solve_robot(problem, settings.solver)
+        return solve_robot(problem, problem.settings.solver)
     except GeometryError:
         return []
 
@@ -336,16 +328,12 @@ def _mirrored(problem: PoseProblem) -> list[FloatArray]:
     return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
 
 
-def _refined(
-    problem: PoseProblem, starts: Sequence[FloatArray], settings: PoseSettings
-) -> list[RefinedPose]:
+def _refined(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
     """Distinct minima below the starts, the best first."""
     minima = []
     for start in starts:
         try:
-            minima.append(
-                refine_pose(problem, start, loss=settings.loss, loss_scale=settings.loss_scale)
-            )
+            minima.append(refine_pose(problem, start))
         except GeometryError:
             continue
     return _distinct(minima)
@@ -389,7 +377,7 @@ def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
 
 
 def _consensus(
-    problem: PoseProblem, settings: PoseSettings
+    problem: PoseProblem,
 ) -> tuple[list[tuple[BoolArray, list[RefinedPose]]], bool]:
     """The largest sets of views that agree, and whether there are several of one size."""
     count = problem.views
@@ -400,7 +388,7 @@ def _consensus(
         (view, start) for view in np.argsort(extents)[::-1] for start in view_poses(problem, view)
     )
     for view, start in hypotheses:
-        explained = _explained(problem, np.arange(count) == view, start, settings)
+        explained = _explained(problem, np.arange(count) == view, start)
         if explained is None:
             continue
         views, refined = explained
@@ -421,18 +409,16 @@ def _consensus(
 
 
 def _explained(
-    problem: PoseProblem, views: BoolArray, start: FloatArray, settings: PoseSettings
+    problem: PoseProblem, views: BoolArray, start: FloatArray
 ) -> tuple[BoolArray, RefinedPose] | None:
     """Views that agree with a hypothesis, grown and pruned until they stay; None if none does."""
     pose = start
     for _ in range(6):
         try:
-            refined = refine_pose(
-                problem.only(views), pose, loss=settings.loss, loss_scale=settings.loss_scale
-            )
+            refined = refine_pose(problem.only(views), pose)
         except GeometryError:
             return None
-        wrong = _disagreeing(refined, settings)
+        wrong = _disagreeing(refined, problem.settings)
         if np.any(wrong):
             if views.sum() == 1:
                 return None
@@ -443,7 +429,7 @@ def _explained(
             continue
         pose = refined.world_from_robot
         predicted = predicted_errors(problem, pose, refined.covariance)
-        grown = views | (predicted < settings.outlier_sigma)
+        grown = views | (predicted < problem.settings.outlier_sigma)
         if np.array_equal(grown, views):
             return views, refined
         views = grown

@@ -23,13 +23,14 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     UNDETERMINED,
+    Chain,
     ChainPoints,
     inverted_information,
     project_chain,
     project_chain_with_jacobians,
 )
 from redetect.groundtruth.markers.session import Network, Rig, View
-from redetect.groundtruth.settings import Loss, PoseSettings
+from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, roll_pitch
 from redetect.landmarks import squared_mahalanobis
 
@@ -49,7 +50,7 @@ class PoseProblem:
     seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
     # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
     view: IntArray
-    floor: Floor | None = None
+    settings: PoseSettings
 
     @property
     def views(self) -> int:
@@ -63,13 +64,12 @@ class PoseProblem:
 
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
-        return project_chain(
-            self.network.cameras,
-            self.network.world_from_camera,
-            world_from_robot[None],
-            self.rig.robot_from_marker,
-            self.seen,
-        )
+        return project_chain(self.chain(world_from_robot), self.seen)
+
+    def chain(self, world_from_robot: FloatArray) -> Chain:
+        """Cameras, robot and markers, the robot at a pose."""
+        network, parts = self.network, self.rig.robot_from_marker
+        return Chain(network.cameras, network.world_from_camera, world_from_robot[None], parts)
 
     def extent_px(self, view: int) -> float:
         """Width and height of a marker in an image, together."""
@@ -109,31 +109,18 @@ class _Corners(NamedTuple):
     common: FloatArray  # (2 N, 2 N), G C G^T
 
 
-def refine_pose(
-    problem: PoseProblem, start: FloatArray, *, loss: Loss = "linear", loss_scale: float = 2.0
-) -> RefinedPose:
+def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
     """Go down from a start to the nearest minimum.
 
-    Parameters
-    ----------
-    start : (4, 4) array
-        A pose `world_from_robot` in which all corners are in front of their cameras.
-    loss : str
-        How views that fit badly are weighted: `linear` (least squares), `huber`, `cauchy`. A
-        marker's four corners are weighted together.
-    loss_scale : float
-        Normalised error of a view at which the weights begin to fall.
-
-    Raises
-    ------
-    GeometryError
-        If the corners do not determine a pose, or `start` has one behind its camera.
+    A marker's four corners are weighted together, by the settings' loss. `start` (4, 4) is a pose
+    `world_from_robot`. Raises `GeometryError` if a corner is behind its camera there, or the
+    corners do not determine a pose.
     """
     if _corners(problem, start) is None:
         raise GeometryError("the start has a corner behind its camera or outside its lens")
 
     pose, damping = start, _DAMPING
-    now = _linearised(problem, pose, loss, loss_scale)
+    now = _linearised(problem, pose)
     for _ in range(_MOST_STEPS):
         added = damping * np.diagonal(now.normal)
         try:
@@ -150,7 +137,7 @@ def refine_pose(
             if settled:
                 break
             damping = max(0.1 * damping, _LEAST_DAMPING)
-            now = _linearised(problem, pose, loss, loss_scale)
+            now = _linearised(problem, pose)
         elif settled or damping > _MOST_DAMPING:
             break
         else:
@@ -161,9 +148,9 @@ def refine_pose(
     count = np.bincount(problem.view, minlength=problem.views)
     return RefinedPose(
         pose,
-        inverted_information(_linearised(problem, pose, loss, loss_scale).normal),
+        inverted_information(_linearised(problem, pose).normal),
         _cost(problem, pose, _covariance(problem, here, np.ones(problem.views))),
-        len(here.residuals) + (0 if problem.floor is None else 3) - 6,
+        len(here.residuals) + (3 if problem.settings.floor else 0) - 6,
         _view_errors(problem, here),
         np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
     )
@@ -179,16 +166,14 @@ class _Linearised(NamedTuple):
     covariance: FloatArray
 
 
-def _linearised(
-    problem: PoseProblem, pose: FloatArray, loss: Loss, loss_scale: float
-) -> _Linearised:
+def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
     here = _corners(problem, pose)
     assert here is not None
-    covariance = _covariance(problem, here, _view_weights(problem, here, loss, loss_scale))
+    covariance = _covariance(problem, here, _view_weights(problem, here))
     stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
     products = stacked.T @ np.linalg.solve(covariance, stacked)
-    if problem.floor is not None:
-        missing, by_pose = floor_residuals(pose, problem.floor)
+    if problem.settings.floor:
+        missing, by_pose = floor_residuals(pose, problem.settings)
         of_floor = np.concatenate([missing[:, None], -by_pose], axis=1)
         products += of_floor.T @ of_floor
     normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
@@ -216,9 +201,7 @@ def predicted_errors(
 def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
     """None if one cannot be seen."""
     network, rig, seen = problem.network, problem.rig, problem.seen
-    projection = project_chain_with_jacobians(
-        network.cameras, network.world_from_camera, pose[None], rig.robot_from_marker, seen
-    )
+    projection = project_chain_with_jacobians(problem.chain(pose), seen)
     residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
         return None
@@ -260,8 +243,8 @@ def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> flo
     if not np.all(np.isfinite(residuals)):
         return np.inf
     cost = float(squared_mahalanobis(residuals, covariance))
-    if problem.floor is not None:
-        cost += float(np.sum(floor_residuals(pose, problem.floor)[0] ** 2))
+    if problem.settings.floor:
+        cost += float(np.sum(floor_residuals(pose, problem.settings)[0] ** 2))
     return cost
 
 
@@ -277,34 +260,25 @@ def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
     return np.asarray(np.sqrt(squared_mahalanobis(residuals, own) / _ROWS))
 
 
-def _view_weights(
-    problem: PoseProblem, here: _Corners, loss: Loss, loss_scale: float
-) -> FloatArray:
+def _view_weights(problem: PoseProblem, here: _Corners) -> FloatArray:
+    loss = problem.settings.loss
     if loss == "linear":
         return np.ones(problem.views)
-    relative = _view_errors(problem, here) / loss_scale
+    relative = _view_errors(problem, here) / problem.settings.loss_scale
     if loss == "huber":
         return np.asarray(1.0 / np.maximum(relative, 1.0))
     return np.asarray(1.0 / (1.0 + relative**2))
 
 
-@dataclass(frozen=True)
-class Floor:
-    """z, roll and pitch of a robot on the floor, with standard deviations."""
-
-    z_m: float
-    sigma_z_m: float
-    sigma_tilt_rad: float
-
-
-def floor_residuals(pose: FloatArray, floor: Floor) -> tuple[FloatArray, FloatArray]:
+def floor_residuals(pose: FloatArray, floor: PoseSettings) -> tuple[FloatArray, FloatArray]:
     """Deviation of a pose from the floor's z, roll, pitch: (3,) normalised, and (3, 6) Jacobian.
 
     The Jacobian is that of the normalised z, roll and pitch by the pose's right perturbation.
     """
-    sigmas = np.array([floor.sigma_z_m, floor.sigma_tilt_rad, floor.sigma_tilt_rad])
+    tilt = np.radians(floor.floor_sigma_tilt_deg)
+    sigmas = np.array([floor.floor_sigma_z_m, tilt, tilt])
     roll, pitch = roll_pitch(pose)
-    missing = np.array([floor.z_m - pose[2, 3], -roll, -pitch])
+    missing = np.array([floor.floor_z_m - pose[2, 3], -roll, -pitch])
     up = pose[2, :3]  # the world's vertical in the robot's axes; it turns by up x w
     jacobian = np.zeros((3, 6))
     jacobian[0, :3] = up
@@ -344,12 +318,5 @@ def pose_problem(
     views: Sequence[View], rig: Rig, network: Network, settings: PoseSettings
 ) -> PoseProblem:
     """The problem of the robot's pose at one time."""
-    tilt = float(np.radians(settings.floor_sigma_tilt_deg))
-    floor = Floor(settings.floor_z_m, settings.floor_sigma_z_m, tilt) if settings.floor else None
-    return PoseProblem(
-        network,
-        rig,
-        chain_points(views, rig, settings.corner_floor_px),
-        np.repeat(np.arange(len(views)), 4),
-        floor,
-    )
+    points = chain_points(views, rig, settings.corner_floor_px)
+    return PoseProblem(network, rig, points, np.repeat(np.arange(len(views)), 4), settings)

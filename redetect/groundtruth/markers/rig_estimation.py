@@ -17,6 +17,7 @@ from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     AdjustedBundle,
     Bundle,
+    Chain,
     PosePrior,
     adjust_bundle,
     project_chain,
@@ -32,7 +33,7 @@ from redetect.groundtruth.markers.pairs import (
 from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
-from redetect.groundtruth.settings import RigSettings
+from redetect.groundtruth.settings import PoseSettings, RigSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
 
@@ -49,7 +50,6 @@ class RigEstimate:
     rig: Rig
     reference: int  # The marker whose frame it is
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
-    parents: tuple[int, ...]  # The tree: each marker's index of the marker that it was chained to
     adjusted: AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
     times: int  # How many times (images, without a network) were used
@@ -104,9 +104,9 @@ def estimate_rig(
     kept = [i for i in range(len(ids)) if parents[i] >= 0]
     left_out = _reasons(ids, parents, seen, settings)
     renumbered = {old: new for new, old in enumerate(kept)}
-    tree = tuple(renumbered[parents[i]] for i in kept)
+    tree = [renumbered[parents[i]] for i in kept]
     pairs = {
-        (renumbered[a], renumbered[b]): replace(c, pair=(renumbered[a], renumbered[b]))
+        (renumbered[a], renumbered[b]): c
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
@@ -120,16 +120,7 @@ def estimate_rig(
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
     adjusted, rig = _adjusted(bundle, rig, settings)
-    return RigEstimate(
-        rig,
-        ids[root],
-        pairs,
-        tree,
-        adjusted,
-        views,
-        times,
-        left_out,
-    )
+    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
 
 
 def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[AdjustedBundle, Rig]:
@@ -163,6 +154,7 @@ def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) ->
         rig,  # with identities: the marker itself is the body
         chain_points([view], rig, settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
+        PoseSettings(loss="linear"),
     )
     found = []
     for start in view_poses(problem, 0):
@@ -190,7 +182,7 @@ def _consensus_of_pairs(
                 pair = (view_a.rig_index, view_b.rig_index)
                 if a is not None and b is not None and pair[0] < pair[1]:
                     estimates.setdefault(pair, []).append(pair_estimates(a, b))
-    return {pair: pair_consensus(pair, times) for pair, times in sorted(estimates.items())}
+    return {pair: pair_consensus(times) for pair, times in sorted(estimates.items())}
 
 
 def _root(
@@ -295,9 +287,8 @@ def _best_start(
     best, least = None, np.inf
     for view, solutions in own:
         for pose in solutions.poses @ inverse(start[view.rig_index]):
-            pixels = project_chain(
-                network.cameras, network.world_from_camera, pose[None], start, points
-            )
+            chain = Chain(network.cameras, network.world_from_camera, pose[None], start)
+            pixels = project_chain(chain, points)
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue
@@ -316,16 +307,8 @@ _REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
 def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSettings) -> RigEstimate:
     """Put a rig into the frame in which some of its markers are known.
 
-    Parameters
-    ----------
-    known : Rig
-        One or more of its markers in the robot's frame; their covariances, apart from each other,
-        are their priors'.
-
-    Raises
-    ------
-    GroundTruthError
-        If the rig has none of them.
+    `known` has one or more of its markers in the robot's frame; their covariances, apart from each
+    other, are their priors'. Raises `GroundTruthError` if the rig has none of them.
     """
     ids = estimate.rig.ids
     common = [marker for marker in ids if marker in known.ids]
@@ -338,33 +321,17 @@ def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSetting
         cameras = len(estimate.adjusted.bundle.cameras)
         priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
         starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
-    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings)
 
 
 def rig_by_reference_poses(
     estimate: RigEstimate, reference: PlanarPoses, settings: RigSettings
 ) -> tuple[RigEstimate, int]:
-    """Put a rig into the frame of a robot whose poses are known at some times.
+    """Put a rig into the frame of a robot whose poses, standing level, are known at some times.
 
-    Parameters
-    ----------
-    estimate : RigEstimate
-        Made with a network, whose world is that of the poses.
-    reference : PlanarPoses
-        The robot standing level.
-    settings : RigSettings
-        With the tolerance between a pose's time and an image's.
-
-    Returns
-    -------
-    int
-        How many times have a known pose.
-
-    Raises
-    ------
-    GroundTruthError
-        If none has one.
+    The estimate was made with a network, whose world is that of the poses. Returns how many times
+    have a known pose as well; raises `GroundTruthError` if none has one.
     """
     bundle = estimate.adjusted.bundle
     body_of_view = bundle.seen.body[np.searchsorted(bundle.view, np.arange(len(estimate.views)))]
@@ -383,7 +350,7 @@ def rig_by_reference_poses(
         raise GroundTruthError(
             "no images show two markers of the rig at the time of any reference pose"
         )
-    start, _, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return _readjusted(estimate, start, tuple(priors), settings), len(priors)
 
 

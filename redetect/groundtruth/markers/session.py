@@ -7,6 +7,7 @@ each camera; both may say how uncertain that is (see docs/groundtruth.md).
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,17 +70,9 @@ def marker_corners(width_m: float) -> FloatArray:
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read a ``rig.json``.
+    """Read a ``rig.json``; its markers come in the order of their identifiers.
 
-    Returns
-    -------
-    Rig
-        Markers in the order of their identifiers.
-
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
     """
     content = JsonObject.read(path)
     dictionary = content.text("dictionary", "its name")
@@ -98,17 +91,10 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 
 def read_network(path: str | os.PathLike[str]) -> Network:
-    """Read a ``network.json`` and the calibrations that it names.
+    """Read a ``network.json`` and the calibrations that it names; cameras by the order of names.
 
-    Returns
-    -------
-    Network
-        Cameras in the order of their names.
-
-    Raises
-    ------
-    GroundTruthError, camera.CameraError
-        If a file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
+    missing or impossible.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))
@@ -218,7 +204,7 @@ DETECTED_NAME = "detected.markers"
 NETWORK_NAME = "network.json"
 RIG_NAME = "rig.json"
 
-_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
+_IMAGE_SUFFIX = re.compile(r"\.(?:jpe?g|png|p[gp]m|tiff?|bmp)\Z", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -326,7 +312,4 @@ def _times_by_name(path: Path) -> dict[str, float]:
 def _image_name(prefix: str) -> str:
     """An image's name without folder and ending, by which rows and times belong together."""
     name = prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
-    for suffix in _IMAGE_SUFFIXES:
-        if name.lower().endswith(suffix):
-            return name[: -len(suffix)]
-    return name
+    return _IMAGE_SUFFIX.sub("", name)

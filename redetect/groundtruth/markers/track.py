@@ -100,11 +100,8 @@ def track_robot(
 ) -> Track:
     """Work out the robot's poses from the markers found in a session's images.
 
-    Parameters
-    ----------
-    groups : iterable of tuples of MarkerFrame
-        The images of each time (`redetect.groundtruth.markers.session.group_by_time`), their
-        cameras' indices those of `network`.
+    `groups` are the images of each time (`redetect.groundtruth.markers.session.group_by_time`),
+    their cameras' indices those of `network`.
     """
     tracked: list[TrackedTime] = []
     unknown = 0
@@ -179,7 +176,7 @@ def _estimated(
     if not views:
         return TrackedTime(time_s, group, views, "unseen")
     try:
-        estimate = estimate_pose(pose_problem(views, rig, network, settings), settings)
+        estimate = estimate_pose(pose_problem(views, rig, network, settings))
     except GeometryError as error:
         return TrackedTime(time_s, group, views, "failed", reason=str(error))
     return TrackedTime(time_s, group, views, "unresolved", estimate)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,7 +35,7 @@ from redetect.groundtruth.validation.reference_poses import (
     read_survey,
     survey_fiducials,
 )
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_content
 
 T = TypeVar("T")
 
@@ -134,10 +137,7 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
     """The poses between the beginnings and ends of visits; all, if there is no visit."""
     if not visits:
         return poses
-    inside = np.zeros(len(poses), dtype=np.bool_)
-    for first, last in visits:
-        inside |= (poses.times_s >= first) & (poses.times_s <= last)
-    return poses.only(inside)
+    return poses.only(np.any([poses.during(*visit) for visit in visits], axis=0))
 
 
 def _read(
@@ -173,34 +173,26 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
 
 def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
     """How many sets there are of each status, and stretches of those that are not determined."""
-    counts: dict[str, int] = {}
-    intervals: list[Interval] = []
-    before = ""
+    entries: list[tuple[str, float]] = []
     lines = read_text(path, _MOST_LINES_BYTES, "lines of JSON").splitlines()
     for number, line in enumerate(lines, 1):
         try:
             entry = json.loads(line)
-            status, time = str(entry["status"]), float(entry["t"])
+            entries.append((str(entry["status"]), float(entry["t"])))
         except (ValueError, TypeError, KeyError, RecursionError):
             raise GroundTruthError(
                 f"{path}:{number}: expected an object with t and status"
             ) from None
-        counts[status] = counts.get(status, 0) + 1
+    intervals = []
+    for status, stretch in groupby(entries, key=itemgetter(0)):
+        times = [time for _, time in stretch]
         if status not in ("ok", "reacquired"):
-            if status == before:
-                last = intervals[-1]
-                intervals[-1] = Interval(status, last.from_s, time, last.sets + 1)
-            else:
-                intervals.append(Interval(status, time, time, 1))
-        before = status
-    return counts, intervals
+            intervals.append(Interval(status, times[0], times[-1], len(times)))
+    return dict(Counter(status for status, _ in entries)), intervals
 
 
 def _picture(path: Path) -> bytes:
-    try:
-        content = read_bounded(path, _MOST_PICTURE_BYTES)
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_content(path, _MOST_PICTURE_BYTES, "picture", GroundTruthError)
     if not content.startswith(_PNG):
         raise GroundTruthError(f"{path}: is no PNG")
     return content
@@ -208,15 +200,14 @@ def _picture(path: Path) -> bytes:
 
 def _visits(inputs: Inputs) -> list[tuple[float, float]]:
     """When ground truth was measured, pauses left out; what was fused goes on through them."""
-    measured = [inputs.streams[name].times_s for name in ("laser", "camera") if name in
-                inputs.streams]  # fmt: skip
-    if not measured and inputs.truth is not None:
-        measured = [inputs.truth.times_s]
-    if not measured and "fused" in inputs.streams:
-        measured = [inputs.streams["fused"].times_s]
+    streams = inputs.streams
+    measured = [streams[name] for name in ("laser", "camera") if name in streams]
+    for stream in (inputs.truth, streams.get("fused")):
+        if not measured and stream is not None:
+            measured = [stream]
     if not measured:
         return []
-    times = np.sort(np.concatenate(measured))
+    times = np.sort(np.concatenate([stream.times_s for stream in measured]))
     parts = [times[s] for s in segments_between_gaps(times, _GAP_S)]
     return [(float(part[0]), float(part[-1])) for part in parts]
 

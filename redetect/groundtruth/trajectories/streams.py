@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import parse_numbers, read_rows, read_table
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 from redetect.storage.messages import excerpt
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
@@ -35,10 +35,7 @@ _COVARIANCE_COLUMNS = 13
 class PlanarPoses:
     """Poses of a robot on the floor over time.
 
-    Raises
-    ------
-    GroundTruthError
-        If shapes disagree, a number is not finite or times descend.
+    Raises `GroundTruthError` if shapes disagree, a number is not finite or times descend.
     """
 
     times_s: FloatArray  # (N,): seconds, not descending
@@ -81,6 +78,10 @@ class PlanarPoses:
         covariances = None if self.covariances is None else self.covariances[chosen]
         return PlanarPoses(self.times_s[chosen], self.poses[chosen], covariances)
 
+    def during(self, from_s: float, to_s: float) -> BoolArray:
+        """(N,) which poses are of a span of time, its ends included."""
+        return np.asarray((self.times_s >= from_s) & (self.times_s <= to_s))
+
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     """Keep only the last of all poses with the same time.
@@ -95,31 +96,25 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
 def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
-    Parameters
-    ----------
-    path : path
-        Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#`
-        comments, which the real files do not have, are skipped.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read or a row is malformed; the message names file and line.
+    Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#` comments,
+    which the real files do not have, are skipped. Raises `GroundTruthError` if the file cannot be
+    read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
     for line, words in read_rows(path):
         if len(words) not in allowed:
             expected = f"{' or '.join(map(str, allowed))}: t, x, y, theta and 9 of covariance"
-            raise StreamError(path, line, f"{len(words)} numbers: expected {expected}")
+            raise GroundTruthError(f"{path}:{line}: {len(words)} numbers: expected {expected}")
         allowed = (len(words),)
         rows.append(parse_numbers(path, line, words))
         if len(rows) > 1 and rows[-1][0] < rows[-2][0]:
-            raise StreamError(
-                path, line, f"time {rows[-1][0]:.6f} s is before the row above: expected in order"
+            raise GroundTruthError(
+                f"{path}:{line}: time {rows[-1][0]:.6f} s is before the row above: expected in "
+                "order"
             )
     if not rows:
-        raise StreamError(path, None, "no poses in it")
+        raise GroundTruthError(f"{path}: no poses in it")
     table = np.array(rows)
     covariances = table[:, 4:].reshape(-1, 3, 3) if allowed == (_COVARIANCE_COLUMNS,) else None
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
@@ -144,8 +139,7 @@ def write_planar_poses(
     path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
 ) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_planar_poses(poses).encode())
+    write_bytes(path, format_planar_poses(poses).encode(), overwrite=overwrite)
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
@@ -158,22 +152,17 @@ def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Read a ``.times`` file: rows ``prefix seconds``, with `#` comments.
+    """Read a ``.times`` file, rows ``prefix seconds`` with `#` comments: seconds by image prefix.
 
-    Returns
-    -------
-    dict of str to float
-        Seconds by image prefix.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read, a row is malformed or a prefix is listed twice.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or a prefix is listed
+    twice.
     """
     times: dict[str, float] = {}
     for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):
         if prefix in times:
-            raise StreamError(path, line, f"prefix {excerpt(prefix)} is listed a second time")
+            raise GroundTruthError(
+                f"{path}:{line}: prefix {excerpt(prefix)} is listed a second time"
+            )
         times[prefix] = seconds
     return times
 
@@ -203,8 +192,7 @@ def interpolate_poses(
     known = inside & (gap <= largest_gap_s)
     before, after, gap = before[known], after[known], gap[known]
     part = np.where(gap > 0.0, (times_s[known] - poses.times_s[before]) / np.where(gap, gap, 1), 0)
-    change = poses.poses[after] - poses.poses[before]
-    change[:, 2] = wrap_angle(change[:, 2])
+    change = pose_differences(poses.poses[after], poses.poses[before])
     between = poses.poses[before] + part[:, None] * change
     covariances = None
     if poses.covariances is not None:
@@ -274,7 +262,7 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
 
 
 def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
-    """(N, 3) poses minus the truth's, headings the short way round."""
+    """(..., 3) poses minus the truth's, headings the short way round."""
     difference = poses - truth
-    difference[:, 2] = wrap_angle(difference[:, 2])
+    difference[..., 2] = wrap_angle(difference[..., 2])
     return difference

@@ -18,19 +18,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from camera.calibration.model import cross_matrices, left_jacobian, rotation_of
 from redetect.array_types import FloatArray
-
-#: Below this angle (rad) closed forms lose more digits than their series.
-_SMALL_ANGLE_RAD = 1e-2
-
-
-def hat(vectors: ArrayLike) -> FloatArray:
-    """(..., 3, 3) matrices [w]x with [w]x p = w x p, of (..., 3) vectors."""
-    w = np.asarray(vectors, dtype=np.float64)
-    matrix = np.zeros((*w.shape[:-1], 3, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
-    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = w[..., 2], -w[..., 1], w[..., 0]
-    return matrix
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
@@ -80,8 +69,7 @@ def exp_se3(tangents: ArrayLike) -> FloatArray:
     """(..., 4, 4) transforms of (..., 6) tangents (v, w)."""
     xi = np.asarray(tangents, dtype=np.float64)
     w = xi[..., 3:]
-    rotation = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
-    return transform(rotation, (_left_jacobian_so3(w) @ xi[..., :3, None])[..., 0])
+    return transform(rotation_of(w), (left_jacobian(w) @ xi[..., :3, None])[..., 0])
 
 
 def log_se3(transforms: ArrayLike) -> FloatArray:
@@ -89,7 +77,7 @@ def log_se3(transforms: ArrayLike) -> FloatArray:
     t = np.asarray(transforms, dtype=np.float64)
     w = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
     w = w.reshape(*t.shape[:-2], 3)
-    v = np.linalg.solve(_left_jacobian_so3(w), t[..., :3, 3:])[..., 0]
+    v = np.linalg.solve(left_jacobian(w), t[..., :3, 3:])[..., 0]
     return np.concatenate([v, w], axis=-1)
 
 
@@ -99,13 +87,13 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
     rotation = t[..., :3, :3]
     matrix = np.zeros((*t.shape[:-2], 6, 6))
     matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation
-    matrix[..., :3, 3:] = hat(t[..., :3, 3]) @ rotation
+    matrix[..., :3, 3:] = cross_matrices(t[..., :3, 3]) @ rotation
     return matrix
 
 
 def right_jacobian(tangent: ArrayLike) -> FloatArray:
     """(6, 6) matrix J with exp(xi + d) = exp(xi) exp(J d) for small d, of a (6,) tangent xi."""
-    v, w = hat(np.reshape(tangent, (2, 3)))
+    v, w = cross_matrices(np.reshape(np.asarray(tangent, dtype=np.float64), (2, 3)))
     # The integral of exp(-s ad) over s from 0 to 1, with ad = [[w, v], [0, w]].
     block = np.zeros((12, 12))
     block[:3, :3] = block[3:6, 3:6] = -w
@@ -135,25 +123,6 @@ def roll_pitch(transforms: ArrayLike) -> FloatArray:
     return np.stack([roll, pitch], axis=-1)
 
 
-def _left_jacobian_so3(w: FloatArray) -> FloatArray:
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    a, b = _coefficients(angle)
-    cross = hat(w)
-    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
-
-
-def _coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(1 - cos t) / t^2 and (t - sin t) / t^3."""
-    square = angle * angle
-    small = angle < _SMALL_ANGLE_RAD
-    t = np.where(small, 1.0, angle)
-    a = np.where(
-        small, 0.5 - square / 24.0 * (1.0 - square / 30.0), 2.0 * np.sin(t / 2) ** 2 / t**2
-    )
-    b = np.where(small, 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0), (t - np.sin(t)) / t**3)
-    return a, b
-
-
 def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
     """(..., 3, 6) derivative of (x, y, theta) by the right perturbation of (..., 4, 4) poses."""
     rotation = np.asarray(world_from_robot, dtype=np.float64)[..., :3, :3]
@@ -180,7 +149,7 @@ def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> F
 def composed_covariance(
     a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
 ) -> FloatArray:
-    """(6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
+    """(..., 6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
     moved = adjoint(inverse(b_from_c))
     return np.asarray(
         moved @ a_covariance @ np.swapaxes(moved, -1, -2) + b_covariance, dtype=np.float64
@@ -188,19 +157,18 @@ def composed_covariance(
 
 
 def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(6, 6) covariance of b_from_a, from that of a_from_b."""
+    """(..., 6, 6) covariance of b_from_a, from that of a_from_b."""
     moved = adjoint(a_from_b)
     return np.asarray(moved @ covariance @ np.swapaxes(moved, -1, -2), dtype=np.float64)
 
 
 def mean_pose(
     poses: Sequence[FloatArray] | FloatArray, covariances: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
+) -> tuple[FloatArray, FloatArray]:
     """Weighted mean of poses on SE(3) that are close to each other.
 
     Of (N, 4, 4) poses and (N, 6, 6) covariances of their right perturbations. Returns the mean (4,
-    4), its covariance (6, 6) if the poses' errors are independent, and the squared normalised
-    deviations over degrees of freedom; 1 for a single pose.
+    4), and its covariance (6, 6) if the poses' errors are independent.
     """
     stack = np.asarray(poses, dtype=np.float64)
     mean, information = stack[0], np.linalg.inv(covariances)
@@ -211,6 +179,4 @@ def mean_pose(
         mean = mean @ exp_se3(step)
         if np.abs(step).max() < 1e-13:
             break
-    apart = log_se3(inverse(mean) @ stack)
-    squares = float(np.einsum("ni,nij,nj->", apart, information, apart))
-    return mean, covariance, squares / (6 * (len(stack) - 1)) if len(stack) > 1 else 1.0
+    return mean, covariance

@@ -23,6 +23,7 @@ from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
@@ -199,19 +200,9 @@ def _median(metres: FloatArray) -> FloatArray:
 def refine_pose(
     distances: DistancePose, still: StillScans, segments: FloatArray
 ) -> ReferencePose | None:
-    """Combine what distances and walls say of a pose.
+    """Combine what distances and walls (S, 4) (m) say of a pose.
 
-    Parameters
-    ----------
-    distances : DistancePose
-        Of status `ok`, or `ambiguous`: then the walls decide, or nothing does.
-    segments : (S, 4) array
-        The building's walls (m).
-
-    Returns
-    -------
-    ReferencePose or None
-        None if several poses fit and the walls do not decide.
+    If distances are `ambiguous`, the walls decide; None if they do not.
     """
     chosen = 0
     if distances.status == "ambiguous":
@@ -229,8 +220,7 @@ def refine_pose(
         return _unrefined(distances, "undetermined", reason, chosen, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
-    apart = found.pose - prior
-    apart[2] = wrap_angle(apart[2])
+    apart = pose_differences(found.pose, prior)
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
     if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
         reason = (
@@ -280,13 +270,6 @@ _GATES_M = (0.2, 0.1, 0.05, 0.05, 0.05, 0.05)
 _LEAST_SIGMA_M = 1e-3
 
 
-class RangeErrors(NamedTuple):
-    """Errors of N readings that are on walls."""
-
-    incidence_rad: FloatArray  # (N,): between the beam and the wall's normal, 0 to pi/2
-    error_m: FloatArray  # (N,): reading minus the wall's distance along the beam
-
-
 class RefinedMounts(NamedTuple):
     """Where M scanners are on the robot."""
 
@@ -314,8 +297,14 @@ def first_walls(
     return far[rows, first], np.arccos(np.minimum(cosine, 1.0))
 
 
-def range_errors(references: Sequence[ReferencePose], segments: FloatArray) -> RangeErrors:
-    """Errors of the averaged readings at reference poses that scans refined."""
+def range_errors(
+    references: Sequence[ReferencePose], segments: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of the averaged readings at reference poses that scans refined.
+
+    Returns, of N readings that are on walls, the angle between beam and the wall's normal (N,) (0
+    to pi/2), and the reading minus the wall's distance along the beam (N,) (m).
+    """
     angles, errors = [np.zeros(0)], [np.zeros(0)]
     for reference in references:
         if reference.still is None or reference.scans != "used":
@@ -326,7 +315,7 @@ def range_errors(references: Sequence[ReferencePose], segments: FloatArray) -> R
             of_a_wall = np.abs(scan.range_m - far) < _OF_A_WALL_M
             angles.append(incidence[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])
-    return RangeErrors(np.concatenate(angles), np.concatenate(errors))
+    return np.concatenate(angles), np.concatenate(errors)
 
 
 def refine_mounts(
@@ -372,8 +361,7 @@ def refine_mounts(
         sigma = max(float(np.sqrt(np.mean(error**2))), _LEAST_SIGMA_M)
         of_prior = np.zeros((len(used), 3, count + len(used), 3))
         of_prior[range(len(used)), :, range(count, count + len(used))] = roots
-        missing = poses - priors
-        missing[:, 2] = wrap_angle(missing[:, 2])
+        missing = pose_differences(poses, priors)
         unknowns = 3 * (count + len(used))
         of_walls = np.concatenate(rows).reshape(-1, unknowns) / sigma
         jacobian = np.concatenate([of_walls, of_prior.reshape(-1, unknowns)])

@@ -26,7 +26,7 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, known_name, read_table
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, fitted, rotation
@@ -60,10 +60,7 @@ class Distance:
 def read_survey(path: str | os.PathLike[str]) -> Survey:
     """Read a ``fiducials.json``.
 
-    Raises
-    ------
-    GroundTruthError
-        If the file cannot be read, or an entry is missing or impossible.
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
     """
     content = JsonObject.read(path)
     content.demand_version()
@@ -72,27 +69,17 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
-    """Read a ``distances.csv``.
+    """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
-    Parameters
-    ----------
-    survey : Survey
-        The file may contain only its points.
-
-    Returns
-    -------
-    list of Distance
-        In the file's order.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read, a row is malformed or names a point that is not known.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names a point that
+    is not known.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
         if pose < 0.0 or pose % 1.0 or not 0.0 <= distance_m < _FARTHEST_M:
-            raise StreamError(path, line, "expected a whole pose and a distance of 0 or more")
+            raise GroundTruthError(
+                f"{path}:{line}: expected a whole pose and a distance of 0 or more"
+            )
         point = known_name(path, line, names[0], survey.robot_points)
         fiducial = known_name(path, line, names[1], survey.fiducials)
         rows.append(Distance(int(pose), time_s, point, fiducial, distance_m))
@@ -147,13 +134,7 @@ class DistancePose:
 
 
 def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[DistancePose]:
-    """Work out every pose for which distances were measured.
-
-    Returns
-    -------
-    list of DistancePose
-        In order of the poses' times.
-    """
+    """Work out every pose for which distances were measured, in order of the poses' times."""
     by_pose: dict[int, list[Distance]] = {}
     for distance in distances:
         by_pose.setdefault(distance.pose, []).append(distance)
@@ -402,12 +383,8 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
     """Work the places of fiducials out from the distances between them, by least squares.
 
     Distances leave a rigid motion open: the places are moved onto those of the drawing, and the
-    deviations are those of a free network (of least trace).
-
-    Raises
-    ------
-    GroundTruthError
-        If the distances leave more than that open.
+    deviations are those of a free network (of least trace). Raises `GroundTruthError` if the
+    distances leave more than that open.
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -55,12 +55,7 @@ class PoseScore:
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
     """Errors of poses whose truth is known at the same times.
 
-    Parameters
-    ----------
-    poses, truth : PlanarPoses
-        With the same times. If the truth has covariances, they count in the normalised error.
-    unmatched : int
-        Handed through.
+    If the truth has covariances, they count in the normalised error. `unmatched` is handed through.
     """
     error = pose_differences(poses.poses, truth.poses)
     distance = np.hypot(error[:, 0], error[:, 1])
@@ -140,16 +135,12 @@ class RelativeScore:
 def read_relations(path: str | os.PathLike[str]) -> Relations:
     """Read a file of relations: rows t_i, t_j, x, y, z, roll, pitch, yaw between blanks or commas.
 
-    Of these x, y and yaw count: poses are on a floor.
-
-    Raises
-    ------
-    StreamError
-        If the file cannot be read or a row is malformed; the message names file and line.
+    Of these x, y and yaw count: poses are on a floor. Raises `GroundTruthError` if the file cannot
+    be read or a row is malformed; the message names file and line.
     """
     rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
     if not rows:
-        raise StreamError(path, None, "no relations in it")
+        raise GroundTruthError(f"{path}: no relations in it")
     table = np.array([row.numbers for row in rows])
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 
@@ -159,15 +150,8 @@ def score_relations(
 ) -> RelativeScore:
     """Hold poses against known relations; the poses are interpolated at the relations' times.
 
-    Parameters
-    ----------
-    largest_gap_s : float
-        Nothing is interpolated across longer gaps.
-
-    Raises
-    ------
-    GroundTruthError
-        If no relation has poses at both its times.
+    But not across gaps longer than `largest_gap_s`. Raises `GroundTruthError` if no relation has
+    poses at both its times.
     """
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
@@ -309,10 +293,7 @@ def reference_errors(
         References at whose time there is no ground truth.
     """
     times = np.array([r.time_s for r in references])
-    after = np.clip(np.searchsorted(poses.times_s, times), 0, len(poses) - 1)
-    before = np.maximum(after - 1, 0)
-    earlier = times - poses.times_s[before] <= np.abs(poses.times_s[after] - times)
-    nearest = np.where(earlier, before, after)
+    nearest = np.argmin(np.abs(times[:, None] - poses.times_s), axis=1)
     known = np.abs(poses.times_s[nearest] - times) <= _FARTHEST_S
     without = [
         Refused(r.index, r.time_s, "no ground truth", "no pose of the ground truth at this time")

@@ -12,12 +12,10 @@ and m landmarks that may be in view, each measured by d numbers (2 for a disc, 1
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
@@ -25,85 +23,60 @@ from redetect.compiled import kernel
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
 
-Method = Literal["nearest", "joint"]
-
 DEFAULT_GATE_PROBABILITY = 0.999
 #: Bound of the joint search.
 MOST_NODES = 30_000
 
 
-@dataclass(frozen=True, eq=False)
-class Pairing:
+class Pairing(NamedTuple):
     """Rows and the landmarks they show."""
 
     # (n,): index of each row's landmark, -1 where it shows none of them; none is there twice.
     landmark: IntArray
-    # Squared Mahalanobis distance of all pairs: joint for `joint_compatible`, the sum of the single
-    # ones for `nearest_compatible`.
-    squared_distance: float
     complete: bool = True  # whether the search was finished: only then is no better pairing left
 
 
 def compatible(
     method: str,
-    innovations: ArrayLike,
-    predicted_covariance: ArrayLike,
-    noise: ArrayLike,
-    gate_probability: float,
-) -> Pairing:
-    """By the method `nearest` `nearest_compatible`, by `joint` `joint_compatible`."""
-    pair = joint_compatible if method == "joint" else nearest_compatible
-    return pair(innovations, predicted_covariance, noise, gate_probability=gate_probability)
-
-
-def nearest_compatible(
-    innovations: ArrayLike,
-    predicted_covariance: ArrayLike,
-    noise: ArrayLike,
-    *,
+    innovations: FloatArray,
+    predicted_covariance: FloatArray,
+    noise: FloatArray,
     gate_probability: float = DEFAULT_GATE_PROBABILITY,
-) -> Pairing:
-    """Nearest neighbour with Mahalanobis gate: closest pairs first, each row and landmark once.
-
-    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
-    """
-    innovation, predicted, measured = map(_contiguous, (innovations, predicted_covariance, noise))
-    width = innovation.shape[2]
-    squared = individual_distances(innovation, predicted, measured)
-    landmark = pair_nearest_first(squared, chi_squared_gates(gate_probability, width, 1)[1])
-    paired = np.flatnonzero(landmark >= 0)
-    return Pairing(landmark, float(np.sum(squared[paired, landmark[paired]])))
-
-
-def joint_compatible(
-    innovations: ArrayLike,
-    predicted_covariance: ArrayLike,
-    noise: ArrayLike,
     *,
-    gate_probability: float = DEFAULT_GATE_PROBABILITY,
     most_nodes: int = MOST_NODES,
 ) -> Pairing:
-    """The largest set of pairs that are compatible jointly; among equals the most likely one.
+    """Which rows show which landmarks.
 
-    Branch and bound. Every pair must pass the individual gate, and all k pairs together the gate of
-    d k degrees of freedom. Unlike the published search, a branch is only given up where no set
-    below it can pass, so that the result does not depend on the order of the rows.
-
-    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d).
+    Parameters
+    ----------
+    method : str
+        `nearest`: nearest neighbour with Mahalanobis gate, closest pairs first, each row and
+        landmark once. `joint`: the largest set of pairs that are compatible jointly, among equals
+        the most likely one. Every pair must pass the individual gate, and all k pairs together the
+        gate of d k degrees of freedom. Unlike in the published search, a branch is only given up
+        where no set below it can pass, so that the result does not depend on the order of the rows.
+    innovations, predicted_covariance, noise : (n, m, d), (m d, m d), (n, d, d) float64
+    gate_probability : float
+        Share of right pairs, or sets of pairs, that pass.
+    most_nodes : int
+        Bound of the joint search.
     """
-    innovation, predicted, measured = map(_contiguous, (innovations, predicted_covariance, noise))
-    n, _, width = innovation.shape
-    squared = individual_distances(innovation, predicted, measured)
-    gates = chi_squared_gates(gate_probability, width, max(n, 1))
+    arrays = map(np.ascontiguousarray, (innovations, predicted_covariance, noise))
+    innovations, predicted_covariance, noise = arrays
+    n, _, width = innovations.shape
+    squared = individual_distances(innovations, predicted_covariance, noise)
+    gates = chi_squared_gates(gate_probability, width, n)
+    if method == "nearest":
+        return Pairing(pair_nearest_first(squared, gates[1] if n else 0.0))
     candidates = np.argsort(squared, axis=1, kind="stable")
-    counts = np.sum(squared <= gates[1], axis=1)
+    counts = np.sum(squared <= gates[1], axis=1) if n else np.zeros(0, np.int64)
     # Rows with few candidates first: they decide most.
     rows = np.argsort(counts, kind="stable")
     rows = rows[counts[rows] > 0]
-    landmark, distance, nodes = search_jointly(
-        innovation, predicted, measured, rows, candidates, counts, gates, most_nodes
+    landmark, _, nodes = search_jointly(
+        innovations, predicted_covariance, noise, rows, candidates, counts, gates, most_nodes
     )
-    return Pairing(landmark, float(distance), nodes < most_nodes)
+    return Pairing(landmark, nodes < most_nodes)
 
 
 @cache
@@ -116,10 +89,6 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
     gates = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
     return np.concatenate([[0.0], gates])
-
-
-def _contiguous(values: ArrayLike) -> FloatArray:
-    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 @kernel()
@@ -199,7 +168,7 @@ def search_jointly(
 ) -> tuple[IntArray, float, int]:
     """Depth-first branch and bound over all ways to give rows landmarks.
 
-    Parameters are those of `joint_compatible`, and the rows in the order in which they get
+    Parameters are those of `compatible`, and the rows in the order in which they get
     landmarks, the first `counts` (n,) of `candidates` (n, m) of each, the joint gate of k pairs
     `gates[k]` (n + 1), and how many pairs may be tried.
 

@@ -13,10 +13,9 @@ IEEE Transactions on Robotics 24(5), 2008).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,16 +24,14 @@ from scipy.linalg import block_diag
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import rotation
-from redetect.slam.association.compatibility import Method, compatible
-from redetect.slam.errors import SlamError
+from redetect.slam.association.compatibility import compatible
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from redetect.storage.bounds import PROBABILITY, Bounds, Positive, demand_fields, whole
+from redetect.slam.settings import AssociateSettings
 
 # Of the first sight of a line: half a metre to infinity within two standard deviations.
 _INVERSE_DISTANCE_PRIOR = (0.4, 0.4)
 
 
-_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
 #: Of the camera above the floor (m).
 CAMERA_HEIGHT_M = 1.5
 # A landmark that is unseen for longer is forgotten (frames); so is a disc whose position relative
@@ -42,29 +39,6 @@ CAMERA_HEIGHT_M = 1.5
 _FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
 # At most this many landmarks of each kind are kept, those seen last.
 _MOST_LANDMARKS = 40
-
-
-@dataclass(frozen=True)
-class AssociateSettings:
-    """How a run is associated."""
-
-    method: Method = "joint"  # see `redetect.slam.association.compatibility`
-    # Share of right rows (or sets of rows) that pass the gate.
-    gate_probability: Annotated[float, PROBABILITY] = 0.999
-    # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
-    # by more than the file says. Bearings are compensated for tilt.
-    sigma_scale: Positive = 1.4
-    # Standard deviation of the robot's tilt about both axes of the floor, which moves all discs of
-    # a frame together, by the camera's height above the floor.
-    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0035
-    map_level: bool = True  # whether loops are detected
-    # Share of a disc's right rows that keep its label at the end, by their covariances as stated;
-    # those farther from its place in the map lose it.
-    kept_probability: Annotated[float, PROBABILITY] = 0.99
-    fewest_rows: Annotated[int, whole(1)] = 3  # a disc of fewer such rows is taken for clutter
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
 
 
 @dataclass(eq=False)

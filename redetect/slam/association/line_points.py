@@ -59,6 +59,10 @@ class Search(NamedTuple):
     least_score: float = 4.0  # of a point: log likelihood ratio of the rows with it to without
 
 
+# Numbers of steps between frames whose rays are intersected.
+_GAPS = np.array([2, 4, 7, 11])
+# Least angle between two rays that are intersected, in standard deviations, and how far away.
+_LEAST_PARALLAX_SIGMAS, _FARTHEST_M = 4.0, 14.0
 _NEAREST_M = 0.3
 _FEWEST_ROWS = 3
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -82,30 +86,22 @@ def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[fl
 
 
 @kernel()
-def crossings(
-    rays: Rays,
-    gaps: IntArray,
-    least_parallax: float,
-    farthest_m: float,
-) -> tuple[FloatArray, IntArray]:
-    """Where rays of frames that are some steps apart cross, ahead of both.
-
-    Takes `gaps` (g,); returns `points` (k, 2), `frames` (k,).
-    """
+def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
+    """Points (k, 2) where rays of frames some steps apart cross, ahead of both, and the frames."""
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
     frames = []
     for i in range(len(angle)):
-        for gap in gaps:
+        for gap in _GAPS:
             other = frame[i] + gap
             if other >= len(start) - 1:
                 continue
             for j in range(start[other], start[other + 1]):
                 parallax = abs(_wrapped(angle[j] - angle[i]))
-                if parallax < least_parallax * math.hypot(sigma[i], sigma[j]):
+                if parallax < _LEAST_PARALLAX_SIGMAS * math.hypot(sigma[i], sigma[j]):
                     continue
                 near, far = _crossing(centre, angle, i, j)
-                if min(near, far) < _NEAREST_M or max(near, far) > farthest_m:
+                if min(near, far) < _NEAREST_M or max(near, far) > _FARTHEST_M:
                     continue
                 points.append(centre[i, 0] + near * math.sin(angle[i]))
                 points.append(centre[i, 1] - near * math.cos(angle[i]))
@@ -246,10 +242,6 @@ _HEADING_SIGMA_DEG = (0.2, 0.15, 0.1, 0.1)
 _SIGMA_SCALE, _PATH_SIGMA_SCALE = 1.5, 2.0
 # Points of fewer rows do not correct the path.
 _PATH_ROWS = 6
-# Numbers of steps between frames whose rays are intersected.
-_GAPS = np.array([2, 4, 7, 11])
-# Least angle between two rays that are intersected, in standard deviations, and how far away.
-_LEAST_PARALLAX_SIGMAS, _FARTHEST_M = 4.0, 14.0
 
 
 def lines_by_points(
@@ -345,7 +337,7 @@ def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
 
     Returns `labels` (n,), `points` (k, 2).
     """
-    points, frames = crossings(rays, _GAPS, _LEAST_PARALLAX_SIGMAS, _FARTHEST_M)
+    points, frames = _crossings(rays)
     search = Search(widest_sigma=float(rays.sigma.max(initial=0.0)))
     taken, found = take_points(points, frames, rays, search)
     labels = np.empty(len(taken), dtype=np.int64)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
@@ -142,27 +143,18 @@ def merge_labels(
     Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
     apart = seen_together(frames, labels)
-    count = len(apart)
-    root = list(range(count))
-
-    def find(label: int) -> int:
-        while root[label] != label:
-            root[label] = root[root[label]]
-            label = root[label]
-        return label
-
-    merged = 0
+    same = DisjointSet(range(len(apart)))
     for first, second in pairs:
-        a, b = sorted((find(int(first)), find(int(second))))
+        a, b = same[int(first)], same[int(second)]
         if a == b or b in apart[a]:
             continue
-        root[b] = a
-        apart[a] |= apart[b]
-        for other in apart[b]:
-            apart[other].add(a)
-        merged += 1
-    roots = np.array([find(label) for label in range(count)], dtype=np.int64)
-    return in_order(roots[labels]), merged
+        same.merge(a, b)
+        root = same[a]
+        apart[root] = apart[a] | apart[b]
+        for other in apart[root]:
+            apart[other].add(root)
+    roots = np.array([same[label] for label in range(len(apart))], dtype=np.int64)
+    return in_order(roots[labels]), len(apart) - same.n_subsets
 
 
 def in_order(labels: IntArray) -> IntArray:

@@ -29,10 +29,36 @@ _CELL_M = 0.05
 _NEIGHBOURS = 5
 
 
+# By how much the lengths of two pairs of landmarks may differ to vote, and how long these have to
+# be (m).
+_LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
+#: Largest distance of landmarks that agree (m).
+REACH_M = 0.12
+
+
+class Search(NamedTuple):
+    """How constellations are compared, and which."""
+
+    # Largest motion that brings one constellation onto the other.
+    most_turn_rad: float = 0.8
+    most_shift_m: float = 8.0
+    # Least number of agreeing landmarks, whatever the number of false alarms.
+    least_agreeing: int = 7
+    # Largest number of matches at least as good that are expected by chance in the whole search.
+    false_alarms: float = 1e-3
+    # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
+    # `earlier_step`-th of these.
+    later_step: int = 1
+    earlier_step: int = 2
+    # A stretch that shares landmarks with one at least this many frames earlier is part of the map
+    # already and not matched again; 0 to match all.
+    attached_frames: int = 0
+
+
 @kernel()
-def _nearest_by_cell(fixed: FloatArray, reach_m: float) -> tuple[float, float, IntArray]:
+def _nearest_by_cell(fixed: FloatArray) -> tuple[float, float, IntArray]:
     """Low corner, and for every cell the landmark next to its centre, -1 with none in reach."""
-    margin = reach_m + _CELL_M
+    margin = REACH_M + _CELL_M
     low_x, low_y = fixed[:, 0].min() - margin, fixed[:, 1].min() - margin
     columns = int((fixed[:, 0].max() + margin - low_x) / _CELL_M) + 1
     rows = int((fixed[:, 1].max() + margin - low_y) / _CELL_M) + 1
@@ -54,23 +80,14 @@ def _nearest_by_cell(fixed: FloatArray, reach_m: float) -> tuple[float, float, I
 
 
 @kernel()
-def best_motion(
-    moved: FloatArray,
-    fixed: FloatArray,
-    length_tolerance_m: float,
-    least_length_m: float,
-    reach_m: float,
-    most_turn_rad: float,
-    most_shift_m: float,
-    least_agreeing: int,
-) -> tuple[float, float, float, int, float, int]:
+def _best_motion(
+    moved: FloatArray, fixed: FloatArray, search: Search
+) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
     Every pair of landmarks of the first with every pair of the second of the same length says what
-    the motion would be; it is counted how many landmarks agree.
-
-    Takes `moved` (n, 2), `fixed` (m, 2); returns `turn_rad`, `shift_x, shift_y`, `agreeing`,
-    `squared`, `tried`.
+    the motion would be; it is counted how many landmarks agree. Returns the turn about the first
+    constellation's centre and the shift, how many agree, and how many motions were tried.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -78,8 +95,8 @@ def best_motion(
         centre_x += moved[i, 0] / n
         centre_y += moved[i, 1] / n
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
-    best_count, best_squared, tried = least_agreeing - 1, 0.0, 0
-    low_x, low_y, nearest = _nearest_by_cell(fixed, reach_m)
+    best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
+    low_x, low_y, nearest = _nearest_by_cell(fixed)
     columns, rows = nearest.shape
     squared_length = np.empty((m, m))
     for c in range(m):
@@ -91,17 +108,17 @@ def best_motion(
         for b in range(a + 1, min(a + 1 + _NEIGHBOURS, n)):
             ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]
             length = math.hypot(ab_x, ab_y)
-            if length < least_length_m:
+            if length < _LEAST_LENGTH_M:
                 continue
-            shortest = (length - length_tolerance_m) ** 2
-            longest = (length + length_tolerance_m) ** 2
+            shortest = (length - _LENGTH_TOLERANCE_M) ** 2
+            longest = (length + _LENGTH_TOLERANCE_M) ** 2
             for c in range(m):
                 for d in range(m):
                     if not shortest <= squared_length[c, d] <= longest:
                         continue
                     cd_x, cd_y = fixed[d, 0] - fixed[c, 0], fixed[d, 1] - fixed[c, 1]
                     turn = math.atan2(ab_x * cd_y - ab_y * cd_x, ab_x * cd_x + ab_y * cd_y)
-                    if abs(turn) > most_turn_rad:
+                    if abs(turn) > search.most_turn_rad:
                         continue
                     cos, sin = math.cos(turn), math.sin(turn)
                     # The middle of one pair goes to the middle of the other.
@@ -110,7 +127,7 @@ def best_motion(
                     new_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
                     new_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
                     shift_x, shift_y = new_x - centre_x, new_y - centre_y
-                    if math.hypot(shift_x, shift_y) > most_shift_m:
+                    if math.hypot(shift_x, shift_y) > search.most_shift_m:
                         continue
                     tried += 1
                     count, squared = 0, 0.0
@@ -127,15 +144,15 @@ def best_motion(
                         if j >= 0:
                             off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
                             distance = off_x * off_x + off_y * off_y
-                            if distance <= reach_m * reach_m:
+                            if distance <= REACH_M * REACH_M:
                                 count += 1
                                 squared += distance
                     if count > best_count or (count == best_count and squared < best_squared):
                         best_turn, best_x, best_y = turn, shift_x, shift_y
                         best_count, best_squared = count, squared
-    if best_count < least_agreeing:
+    if best_count < search.least_agreeing:
         best_count = 0
-    return best_turn, best_x, best_y, best_count, best_squared, tried
+    return best_turn, best_x, best_y, best_count, tried
 
 
 # A constellation covers the area within this distance of its landmarks.
@@ -143,32 +160,8 @@ _COVER_M = 0.6
 _GRID_M = 0.15
 #: Frames whose landmarks form a constellation, and from one constellation to the next.
 STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
-# By how much the lengths of two pairs of landmarks may differ to vote, and how long these have to
-# be (m).
-_LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
-#: Largest distance of landmarks that agree (m).
-REACH_M = 0.12
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
-
-
-class Search(NamedTuple):
-    """How constellations are compared, and which."""
-
-    # Largest motion that brings one constellation onto the other.
-    most_turn_rad: float = 0.8
-    most_shift_m: float = 8.0
-    # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: int = 7
-    # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: float = 1e-3
-    # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
-    # `earlier_step`-th of these.
-    later_step: int = 1
-    earlier_step: int = 2
-    # A stretch that shares landmarks with one at least this many frames earlier is part of the map
-    # already and not matched again; 0 to match all.
-    attached_frames: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,11 +282,8 @@ class Motion(NamedTuple):
 
 def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
     """The motion under which most landmarks (n, 2) fall on those of another constellation."""
-    turn, x, y, agreeing, _, tried = best_motion(
-        moved, fixed, _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M, REACH_M,
-        search.most_turn_rad, search.most_shift_m, search.least_agreeing,
-    )  # fmt: skip
-    centre = moved.mean(axis=0)
+    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search)
+    centre = moved.sum(axis=0) / max(len(moved), 1)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 

@@ -29,7 +29,6 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import compose, rotation
 from redetect.slam.association.frame_to_frame import (
-    AssociateSettings,
     LocalAssociation,
     associate_locally,
     tilt_jacobian,
@@ -58,6 +57,7 @@ from redetect.slam.association.placing import ANYWHERE, lay_together
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import LineRows, Recording
+from redetect.slam.settings import AssociateSettings
 
 Progress = Callable[[str], None]
 
@@ -106,10 +106,6 @@ def associate_run(
         The camera's centre in the robot frame (m); only bearings of lines need it.
     progress : callable, optional
         Called with a description of the current stage.
-
-    Returns
-    -------
-    RunAssociation
     """
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)
@@ -164,7 +160,7 @@ def _associated_locally(
     local = associate_locally(
         recording,
         # Bearings say more of a frame's heading than discs, whose sway would only blur it.
-        replace(setting, tilt_sigma_rad=0.0) if both else setting,
+        replace(setting, tilt_sigma_deg=0.0) if both else setting,
         camera_xy=camera_xy,
         progress=lambda done: report(f"frame {done} of {len(recording)}"),
     )

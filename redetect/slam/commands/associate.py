@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,6 @@ import numpy as np
 from redetect import slam
 from redetect.array_types import IntArray
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
-from redetect.slam.association.frame_to_frame import AssociateSettings
 from redetect.slam.association.run import RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
 from redetect.slam.commands.files import (
@@ -29,7 +27,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
 from redetect.slam.recording import UNKNOWN_ID, Recording, joined
-from redetect.storage.bounds import NOT_NEGATIVE, demand, from_to, whole
+from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 
 #: Of each kind's rows those before and those after the map level.
 Scores = dict[str, dict[str, AssociationScore]]
@@ -37,22 +35,8 @@ Scores = dict[str, dict[str, AssociationScore]]
 
 def perform(options: Associate) -> int:
     """Carry the command out; returns the exit code."""
-    demand(
-        options,
-        SlamError,
-        tilt_sigma_deg=from_to(0.0, 45.0),
-        noise=NOT_NEGATIVE,
-        seed=whole(0),
-    )
-    settings = AssociateSettings(
-        method=options.method,
-        gate_probability=options.gate_probability,
-        sigma_scale=options.sigma_scale,
-        tilt_sigma_rad=math.radians(options.tilt_sigma_deg),
-        map_level=options.map_level,
-        kept_probability=options.kept_probability,
-        fewest_rows=options.fewest_rows,
-    )
+    demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
+    settings = options.settings
     sources = [(k, f) for k, run in enumerate(options.runs) for f in files_of(options, run)]
     targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
     if len(set(targets)) < len(targets):

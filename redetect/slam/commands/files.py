@@ -83,8 +83,7 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
     """(2,) the camera's centre in the robot frame (m); zero where no line needs it."""
     if not len(recording.lines):
         return NO_CAMERA
-    mounting = camera_of_run(run, camera).robot_from_camera
-    return np.array([mounting[0][3], mounting[1][3]])
+    return np.array(camera_of_run(run, camera).centre[:2])
 
 
 def default_output(run: Path, name: str = "") -> Path:

@@ -137,10 +137,7 @@ def localized_run_of(
 ) -> FilterRun:
     """What a command asks for: a run's rows localised in a map, whose joint covariance is `joint`.
 
-    Raises
-    ------
-    SlamError
-        If no row shows a landmark of the map, or a flag is out of its range.
+    Raises `SlamError` if no row shows a landmark of the map, or a flag is out of its range.
     """
     demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
     start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))

@@ -124,7 +124,7 @@ class EkfSlam:
         new_discs: dict[int, int] = {}
         again: list[int] = []
         single: list[int] = []
-        for k, number in enumerate(rows.disc_ids):
+        for k, number in enumerate(rows.circles.ids.tolist()):
             if number == UNKNOWN_ID:
                 self.count.left_out["disc without ID"] += 1
             elif number in self.disc_slots:
@@ -133,7 +133,7 @@ class EkfSlam:
                 again.append(k)
             else:
                 new_discs[number] = k
-        for k, numbers in enumerate(rows.line_ids):
+        for k, numbers in enumerate(rows.lines.ids):
             if not numbers:
                 self.count.left_out["line without ID"] += 1
             elif all(number in self.line_slots for number in numbers):
@@ -145,7 +145,7 @@ class EkfSlam:
         if discs or lines:
             self._update(rows.only(discs, lines))
         for number, k in new_discs.items():
-            self._add_disc(number, rows.disc_xy[k], rows.disc_covariance[k])
+            self._add_disc(number, rows.circles.xy[k], rows.circles.covariance[k])
         if again:
             self._update(rows.only(again, []))
         if single or self._waiting.slots:
@@ -170,10 +170,10 @@ class EkfSlam:
     def _update(self, rows: FrameRows) -> None:
         """Use rows whose landmarks are in the state."""
         self._apply(innovation_of(rows, self, self._linearised))
-        self.count.discs += len(rows.disc_ids)
-        self.count.lines += len(rows.line_ids)
-        self.disc_rows.update(rows.disc_ids)
-        self.line_rows.update(number for numbers in rows.line_ids for number in numbers)
+        self.count.discs += len(rows.circles)
+        self.count.lines += len(rows.lines)
+        self.disc_rows.update(rows.circles.ids.tolist())
+        self.line_rows.update(number for numbers in rows.lines.ids for number in numbers)
 
     def _apply(self, innovation: Innovation) -> None:
         """Update the state."""
@@ -201,8 +201,10 @@ class EkfSlam:
         given_up = waiting.forget(self.frame)
         kept = False
         for k in single:
-            number = rows.line_ids[k][0]
-            view = View(self.frame, float(rows.bearing_rad[k]), float(rows.sigma_rad[k]))
+            number = rows.lines.ids[k][0]
+            view = View(
+                self.frame, float(rows.lines.bearing_rad[k]), float(rows.lines.sigma_rad[k])
+            )
             if number in self.line_slots or any(
                 other.frame == self.frame for other in waiting.views(number)
             ):

@@ -26,32 +26,20 @@ from redetect.slam.association.compatibility import (
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_in_robot
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 NO_CAMERA = np.zeros(2)
 
 
-@dataclass(frozen=True, eq=False)
-class FrameRows:
+class FrameRows(NamedTuple):
     """Measurements of one frame."""
 
-    disc_ids: tuple[int, ...]  # -1 where unknown
-    disc_xy: FloatArray  # (d, 2): in the robot frame (m)
-    disc_covariance: FloatArray  # (d, 2, 2)
-    line_ids: tuple[tuple[int, ...], ...]  # all lines that a row shows; empty where unknown
-    bearing_rad: FloatArray  # (l,)
-    sigma_rad: FloatArray  # (l,)
+    circles: CircleRows
+    lines: LineRows
 
     def only(self, discs: Sequence[int], lines: Sequence[int]) -> FrameRows:
         """Some of the rows."""
-        return FrameRows(
-            tuple(self.disc_ids[k] for k in discs),
-            self.disc_xy[discs],
-            self.disc_covariance[discs],
-            tuple(self.line_ids[k] for k in lines),
-            self.bearing_rad[lines],
-            self.sigma_rad[lines],
-        )
+        return FrameRows(self.circles.only(discs), self.lines.only(lines))
 
 
 class Prediction(NamedTuple):
@@ -107,21 +95,21 @@ def innovation_of(rows: FrameRows, estimate: Filter, linearised_at: FloatArray) 
     """
     seen, jacobian, index = predicted(
         estimate,
-        [estimate.disc_slots[number] for number in rows.disc_ids],
-        [estimate.line_slots[number] for numbers in rows.line_ids for number in numbers],
+        [estimate.disc_slots[number] for number in rows.circles.ids.tolist()],
+        [estimate.line_slots[number] for numbers in rows.lines.ids for number in numbers],
         linearised_at,
     )
-    d = 2 * len(rows.disc_ids)
-    error = rows.disc_xy.ravel() - seen[:d]
-    if rows.line_ids:
-        members = np.array([len(numbers) for numbers in rows.line_ids])
+    d = 2 * len(rows.circles)
+    error = rows.circles.xy.ravel() - seen[:d]
+    if rows.lines.ids:
+        members = np.array([len(numbers) for numbers in rows.lines.ids])
         mean = np.repeat(np.diag(1.0 / members), members, axis=1)
-        off = wrap_angle(np.repeat(rows.bearing_rad, members) - seen[d:])
+        off = wrap_angle(np.repeat(rows.lines.bearing_rad, members) - seen[d:])
         error = np.append(error, mean @ off)
         jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
-    noise = np.diag(np.append(np.zeros(d), rows.sigma_rad**2))
+    noise = np.diag(np.append(np.zeros(d), rows.lines.sigma_rad**2))
     at = np.arange(d).reshape(-1, 2)
-    noise[at[:, :, None], at[:, None, :]] = rows.disc_covariance
+    noise[at[:, :, None], at[:, None, :]] = rows.circles.covariance
     return Innovation(error, jacobian, index, noise)
 
 
@@ -154,21 +142,13 @@ class FilterRun:
 
 def frames_of(recording: Recording) -> Iterator[FrameRows]:
     """The rows of each frame of a run, in order."""
-    circles, lines = recording.circles, recording.lines
     frames = np.arange(len(recording) + 1)
-    disc_start = np.searchsorted(circles.frame, frames)
-    line_start = np.searchsorted(lines.frame, frames)
-    disc_ids = circles.ids.tolist()
+    discs = np.searchsorted(recording.circles.frame, frames)
+    lines = np.searchsorted(recording.lines.frame, frames)
     for k in range(len(recording)):
-        discs = slice(disc_start[k], disc_start[k + 1])
-        some = slice(line_start[k], line_start[k + 1])
         yield FrameRows(
-            disc_ids=tuple(disc_ids[discs]),
-            disc_xy=circles.xy[discs],
-            disc_covariance=circles.covariance[discs],
-            line_ids=lines.ids[some],
-            bearing_rad=lines.bearing_rad[some],
-            sigma_rad=lines.sigma_rad[some],
+            recording.circles.only(slice(discs[k], discs[k + 1])),
+            recording.lines.only(slice(lines[k], lines[k + 1])),
         )
 
 
@@ -225,39 +205,38 @@ class Associator:
         """Rows with the identifiers of the landmarks they are found to show."""
         if self.method == "known":
             return rows
-        discs = self._discs(rows, estimate) if rows.disc_ids else ()
-        lines = self._lines(rows, estimate) if rows.line_ids else ()
-        return replace(rows, disc_ids=discs, line_ids=lines)
+        discs = self._discs(rows.circles, estimate)
+        lines = self._lines(rows.lines, estimate)
+        return FrameRows(replace(rows.circles, ids=discs), replace(rows.lines, ids=lines))
 
-    def _discs(self, rows: FrameRows, estimate: Filter) -> tuple[int, ...]:
-        names, slots = _near_discs(rows.disc_xy, estimate)
-        found = np.full(len(rows.disc_xy), UNKNOWN_ID, dtype=np.int64)
+    def _discs(self, rows: CircleRows, estimate: Filter) -> IntArray:
+        names, slots = _near_discs(rows.xy, estimate)
+        found = np.full(len(rows), UNKNOWN_ID, dtype=np.int64)
         closest = np.full(len(found), np.inf)
         if len(slots):
             seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
             spread = jacobian @ estimate.block(index) @ jacobian.T
-            innovation = rows.disc_xy[:, None] - seen.reshape(-1, 2)
-            pairing = compatible(
-                self.method, innovation, spread, rows.disc_covariance, self.gate_probability
+            innovation = rows.xy[:, None] - seen.reshape(-1, 2)
+            landmark, _ = compatible(
+                self.method, innovation, spread, rows.covariance, self.gate_probability
             )
-            landmark = pairing.landmark
             found[landmark >= 0] = names[landmark[landmark >= 0]]
-            distances = individual_distances(innovation, spread, rows.disc_covariance)
+            distances = individual_distances(innovation, spread, rows.covariance)
             closest = np.min(distances, axis=1)
         if self.new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
                 found[k] = self.new_id()
-        return tuple(int(number) for number in found)
+        return found
 
-    def _lines(self, rows: FrameRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
+    def _lines(self, rows: LineRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
         slots = np.array(list(estimate.line_slots.values()), dtype=np.int64)
         names = np.array(list(estimate.line_slots), dtype=np.int64)
         state = estimate.state
         away = np.hypot(state[slots] - state[0], state[slots + 1] - state[1])
         slots, names = slots[away < FARTHEST_LINE_M], names[away < FARTHEST_LINE_M]
-        if not len(slots):
-            return ((),) * len(rows.line_ids)
+        if not len(slots) or not len(rows):
+            return ((),) * len(rows)
         seen, jacobian, index = predicted(estimate, [], slots, state)
         innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
         spread = jacobian @ estimate.block(index) @ jacobian.T
@@ -291,8 +270,8 @@ def run_filter(
             estimate.measure(identified)
         except SlamError as error:
             raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
-        disc_ids.extend(identified.disc_ids)
-        line_ids.extend(identified.line_ids)
+        disc_ids.extend(identified.circles.ids.tolist())
+        line_ids.extend(identified.lines.ids)
         poses[k + 1], covariance[k + 1] = estimate.state[:3], estimate.pose_covariance
     return FilterRun(
         path=Path2D(("start", *recording.prefixes), poses, covariance),

@@ -28,13 +28,7 @@ _PENDING = 128
 
 
 class JointCovariance:
-    """Covariance of a pose and of a growing number of landmarks.
-
-    Parameters
-    ----------
-    pose_covariance : (3, 3) array
-        Of the pose at the start.
-    """
+    """Covariance of a pose, at first (3, 3), and of a growing number of landmarks."""
 
     def __init__(self, pose_covariance: FloatArray) -> None:
         self.size = POSE_SIZE

@@ -120,12 +120,12 @@ class Localizer:
         A row of several lines measures the mean of their bearings.
         """
         discs, lines, left_out = [], [], self.count.left_out
-        for k, number in enumerate(rows.disc_ids):
+        for k, number in enumerate(rows.circles.ids.tolist()):
             if number in self.disc_slots:
                 discs.append(k)
             else:
                 left_out["disc without ID" if number == UNKNOWN_ID else "disc not in the map"] += 1
-        for k, numbers in enumerate(rows.line_ids):
+        for k, numbers in enumerate(rows.lines.ids):
             if numbers and all(number in self.line_slots for number in numbers):
                 lines.append(k)
             else:

@@ -81,17 +81,17 @@ def first_disc_vertex(last_pose_vertex: int) -> int:
     return int(10 ** len(str(last_pose_vertex)))
 
 
-def end_covariance(steps: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances of steps in the axes at their end, as errors of SE(2) edges are measured.
+def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
+    """Covariances (N, 3, 3) of steps as seen from axes that are turned by angles (N,).
 
-    Takes `steps` (N, 3), `covariance` (N, 3, 3); returns (N, 3, 3).
+    Turned by their own dphi: in the axes at their end, as errors of SE(2) edges are measured.
     """
-    return _in_turned_axes(covariance, steps[:, 2])
-
-
-def start_covariance(steps: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Undo `end_covariance`."""
-    return _in_turned_axes(covariance, -steps[:, 2])
+    turn = np.zeros((len(angle_rad), 3, 3))
+    turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
+    turn[:, 2, 2] = 1.0
+    with np.errstate(all="ignore"):  # what is not finite stays so
+        turned = np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
 
 def write_g2o(
@@ -121,12 +121,11 @@ def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]
         yield f"VERTEX_XY {base + disc} {_numbers(xy)}"
 
     steps = from_dataset(run.steps, axes)
-    of_steps = inverse_of_3x3(
-        end_covariance(steps, covariance_from_dataset(run.step_covariance, axes))
-    )[:, *np.triu_indices(3)]
+    at_end = in_turned_axes(covariance_from_dataset(run.step_covariance, axes), steps[:, 2])
+    of_steps = inverses(at_end)[:, *np.triu_indices(3)]
     rows = run.circles
     seen = from_dataset(rows.xy, axes)
-    of_rows = inverse_of_2x2(covariance_from_dataset(rows.covariance, axes))[:, *np.triu_indices(2)]
+    of_rows = inverses(covariance_from_dataset(rows.covariance, axes))[:, *np.triu_indices(2)]
     for what, information in (("step", of_steps), ("measurement of a disc", of_rows)):
         for bad in np.flatnonzero(~np.all(np.isfinite(information), axis=1))[:1]:
             raise SlamError(f"{what} {bad + 1}: expected a covariance that can be inverted")
@@ -149,21 +148,8 @@ def _rows(graph: RunGraph, axes: Axes, comments: Sequence[str]) -> Iterator[str]
         yield f"{FRAME_COMMENT} {k + 1} {graph.path.prefixes[k + 1]} {_numbers(known)}".rstrip()
 
 
-def inverse_of_2x2(matrices: FloatArray) -> FloatArray:
-    """Inverses of symmetric (n, 2, 2) matrices, by elements: twice gives the same 6 digits again.
-
-    Solvers mix the elements, and what was 0 comes back as a rounding error. Where there is no
-    inverse the result is not finite.
-    """
-    xx, xy, yy = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
-    with np.errstate(all="ignore"):
-        determinant = xx * yy - xy * xy
-        inverse = np.stack([yy, -xy, -xy, xx], axis=-1) / determinant[:, None]
-    return np.asarray(inverse.reshape(-1, 2, 2))
-
-
-def inverse_of_3x3(matrices: FloatArray) -> FloatArray:
-    """Inverses of symmetric (n, 3, 3) matrices, scaled to ones on the diagonal meanwhile.
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of symmetric (n, d, d) matrices, scaled to ones on the diagonal meanwhile.
 
     Metres and radians may differ by orders of magnitude. Where there is no inverse the result is
     not finite.
@@ -177,16 +163,6 @@ def inverse_of_3x3(matrices: FloatArray) -> FloatArray:
         inverse[usable] = np.linalg.inv(unit[usable])
         inverse = inverse / scale[:, :, None] / scale[:, None, :]
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, 1, 2)))
-
-
-def _in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
-    """Covariances of vectors as seen from axes that are turned by an angle."""
-    turn = np.zeros((len(angle_rad), 3, 3))
-    turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
-    turn[:, 2, 2] = 1.0
-    with np.errstate(all="ignore"):  # what is not finite stays so
-        turned = np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
-    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
 
 def _numbers(values: FloatArray) -> str:
@@ -218,28 +194,15 @@ class _Row(NamedTuple):
 
 
 def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGraph:
-    """Read a graph of a run.
+    """Read a graph of a run that is in some axes; the result is in the data set's.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    axes : str
-        The axes that it is in.
+    Where the file has no ``# FRAME`` comments, poses are called by their vertices' numbers and
+    qualities are unknown. Discs whose vertices all have numbers above the power of ten over the
+    poses' are counted from there, others named by the vertex.
 
-    Returns
-    -------
-    RunGraph
-        In the data set's axes. Where the file has no ``# FRAME`` comments, poses are called by
-        their vertices' numbers and qualities are unknown. Discs whose vertices all have numbers
-        above the power of ten over the poses' are counted from there, others named by the vertex.
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read, a row is malformed or names a vertex that is missing, an
-        information matrix is not positive definite, the poses are no chain from each to the next
-        number, or the file says that its axes are others; the message names file and line.
+    Raises `SlamError` if the file cannot be read, a row is malformed or names a vertex that is
+    missing, an information matrix is not positive definite, the poses are no chain from each to the
+    next number, or the file says that its axes are others; the message names file and line.
     """
     rows = _read_rows(path, axes)
     _once(path, [*rows[_POSE], *rows[_DISC]], "there is a vertex {} already")
@@ -268,9 +231,9 @@ def read_g2o(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> RunGra
                 f"{path}:{some[bad].line}: the information matrix is not positive definite"
             )
     steps = _table([row.numbers[:3] for row in chain], 3)
-    at_start = start_covariance(steps, inverse_of_3x3(_symmetric(chain, 3)))
+    at_start = in_turned_axes(inverses(_symmetric(chain, 3)), -steps[:, 2])
     step_covariance = covariance_from_dataset(at_start, axes, back=True)
-    of_rows = inverse_of_2x2(_symmetric(sights, 2))
+    of_rows = inverses(_symmetric(sights, 2))
     covariance = covariance_from_dataset(of_rows, axes, back=True)
     for some, spread in ((chain, step_covariance), (sights, covariance)):
         for bad in np.flatnonzero(~np.all(np.isfinite(spread), axis=(1, 2)))[:1]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.slam.formats.g2o import end_covariance
+from redetect.slam.formats.g2o import in_turned_axes
 from redetect.slam.formats.text import Axes, covariance_from_dataset, from_dataset
 from redetect.slam.recording import Recording
 
@@ -41,9 +41,8 @@ def odometry_table(recording: Recording, axes: Axes) -> Table:
     """A run's steps."""
     steps = from_dataset(recording.steps, axes)
     before = covariance_from_dataset(recording.step_covariance, axes)
-    triangles = [
-        spread[:, *np.triu_indices(3)] for spread in (before, end_covariance(steps, before))
-    ]
+    after = in_turned_axes(before, steps[:, 2])
+    triangles = [spread[:, *np.triu_indices(3)] for spread in (before, after)]
     numbers = np.concatenate([steps, *triangles], axis=1).tolist()
     rows = [
         (k + 1, prefix, *row) for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers))

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.errors import SlamError
 from redetect.storage import write_bytes
-from redetect.storage.bounded import read_bounded
+from redetect.storage.bounded import read_content
 
 Axes = Literal["robotics", "dataset"]
 
@@ -92,10 +92,7 @@ def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: 
 
 def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
     """Rows of a text file with their line numbers, without blank ones; comments are among them."""
-    try:
-        content = read_bounded(path, _LARGEST_FILE_BYTES)
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be read: {error.strerror or error}") from None
+    content = read_content(path, _LARGEST_FILE_BYTES, "file", SlamError)
     for number, source in enumerate(content.split(b"\n"), 1):
         text = source.decode("utf-8", "surrogateescape").strip()
         if text:

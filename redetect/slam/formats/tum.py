@@ -71,26 +71,11 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
 
 
 def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D:
-    """Read a TUM trajectory of a path on the floor.
+    """Read a TUM trajectory of a path on the floor; the result is in the data set's axes.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    axes : str
-        The axes that it is in.
-
-    Returns
-    -------
-    Path2D
-        In the data set's axes; angles in [-pi, pi). The first pose is called ``start``, the others
-        by their time as it is written.
-
-    Raises
-    ------
-    SlamError
-        If the file cannot be read, is not a path on the floor, its times do not ascend, or it says
-        that its axes are others; the message names file and line.
+    Angles are in [-pi, pi). The first pose is called ``start``, the others by their time as it is
+    written. Raises `SlamError` if the file cannot be read, is not a path on the floor, its times do
+    not ascend, or it says that its axes are others; the message names file and line.
     """
     prefixes: list[str] = []
     numbers: list[list[float]] = []

@@ -22,7 +22,6 @@ from redetect.slam.models import (
     disc_jacobians,
 )
 from redetect.slam.mounting import (
-    nominal_mounting,
     rows_as_recorded,
     rows_through_mounting,
     turn_to_the_left,
@@ -176,7 +175,7 @@ def _disc_rows(
         rows, moves = rows_through_mounting(graph.camera, graph.disc_xy, mounting)
         return seen - rows, by_pose, none, by_disc, -moves
     if mounting is None:
-        mounting = nominal_mounting(graph.camera)
+        mounting = np.array(graph.camera.robot_from_camera)
     tilted = np.zeros((len(seen), 2)) if tilt is None else tilt[graph.disc_pose]
     rows, by = rows_as_recorded(graph.camera, seen, mounting, tilted)
     return rows - graph.disc_xy, by.floor @ by_pose, by.tilt, by.floor @ by_disc, by.mounting

@@ -191,10 +191,6 @@ def map_run(
     name : str
         What messages call the run.
 
-    Returns
-    -------
-    MappedRun
-
     Raises
     ------
     SlamError

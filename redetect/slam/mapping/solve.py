@@ -28,7 +28,8 @@ from redetect.least_squares.solver import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
-from redetect.slam.mounting import nominal_mounting
+
+_MOST_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,6 @@ def solve(
     weighting: Weighting,
     *,
     tolerance: float = 1e-10,
-    most_steps: int = 200,
 ) -> Solution:
     """Minimise the sum of squared (or robust) whitened errors.
 
@@ -107,7 +107,7 @@ def solve(
                 problem,
                 estimate,
                 tolerance=tolerance,
-                most_steps=most_steps,
+                most_steps=_MOST_STEPS,
                 refined=problem.with_best_positions,
             )
     except StartError:
@@ -116,7 +116,7 @@ def solve(
         ) from None
     if not found.converged:
         raise SlamError(
-            f"least squares: no minimum within {most_steps} steps: chi-squared is "
+            f"least squares: no minimum within {_MOST_STEPS} steps: chi-squared is "
             f"{found.costs[-1]:.6g} and falling"
         )
     return Solution(found.at, found.costs[-1], found.costs)
@@ -196,7 +196,7 @@ def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estim
     if graph.camera is None:
         raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
     if weighting.calibrate and start.mounting is None:
-        start = replace(start, mounting=nominal_mounting(graph.camera))
+        start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
     if weighting.tilt_sigma_rad > 0.0:
         if weighting.calibrate and weighting.row_errors != "recorded":
             raise SlamError("a separate tilt for each pose: expected row errors as recorded")

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import (
     ClockModel,
@@ -281,7 +281,7 @@ def test_both_layouts_of_ptpd_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.drift, [-1.63998e-5])
 
     (tmp_path / "other.log").write_text("nothing of the kind\n")
-    with pytest.raises(StreamError, match="no line reports an offset"):
+    with pytest.raises(GroundTruthError, match="no line reports an offset"):
         read_ptpd(tmp_path / "other.log")
 
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
@@ -284,16 +284,16 @@ def test_malformed_rows_are_refused_by_line(
 def test_files_that_are_no_text_or_cut_off_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.scans.csv.gz"
     path.write_bytes(gzip.compress(b"1,2,3\n" * 9)[:-9])
-    with pytest.raises(StreamError, match="gzip"):
+    with pytest.raises(GroundTruthError, match="gzip"):
         read_scans(path)
     path.write_bytes(b"1,2,3\n")
-    with pytest.raises(StreamError, match="gzip"):
+    with pytest.raises(GroundTruthError, match="gzip"):
         read_scans(path)
     plain = tmp_path / "b.scans.csv"
     plain.write_bytes(b"\xff\xfe\x00\n")
-    with pytest.raises(StreamError, match="no text"):
+    with pytest.raises(GroundTruthError, match="no text"):
         read_scans(plain)
-    with pytest.raises(StreamError, match="no such file"):
+    with pytest.raises(GroundTruthError, match="no such file"):
         read_scans(tmp_path / "c.scans.csv")
 
 
@@ -385,7 +385,7 @@ def test_a_packed_giant_is_refused_before_it_is_unpacked(
         read_scans(path)
     rows = tmp_path / "a.scans.csv.gz"
     rows.write_bytes(gzip.compress(b"1,2,3\n" * (1 << 14)))
-    with pytest.raises(StreamError, match="more than 65536"):
+    with pytest.raises(GroundTruthError, match="more than 65536"):
         read_scans(rows)
 
 

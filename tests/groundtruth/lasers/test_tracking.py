@@ -84,7 +84,7 @@ def one_set(
         Scans(np.zeros(1), ranges_mm(s, np.vstack([ROOM, sides(outline, pose)]), rng)[None])
         for s in scanners
     ]
-    return sets_of_scans(scans, 0.01)
+    return sets_of_scans(scans)
 
 
 def seen_in(sets: ScanSets, tables: FixedScanners, pose: FloatArray, index: int = 0) -> Seen:

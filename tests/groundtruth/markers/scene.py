@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
-from redetect.groundtruth.markers.refinement import Floor, PoseProblem
+from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
+from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
+from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
@@ -25,6 +26,10 @@ FloatArray = NDArray[np.float64]
 #: A mild barrel distortion, so that no test passes by ignoring the lens.
 COEF = (-0.02, -0.08, 0.1, 0.1, 0.0)
 NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+#: Of the poses, without a robust loss.
+LEAST_SQUARES = PoseSettings(loss="linear")
 
 
 def lens(scale_px: float = 900.0, coef: tuple[float, ...] = COEF) -> Camera:
@@ -116,9 +121,8 @@ def points_of(
         camera, np.zeros(len(camera), np.int64), part, points,
         np.zeros((len(camera), 2)), np.tile(np.eye(2) * sigma_px**2, (len(camera), 1, 1)),
     )  # fmt: skip
-    pixels = project_chain(
-        cameras, world_from_camera, world_from_robot[None], rig.robot_from_marker, empty
-    )
+    chain = Chain(cameras, world_from_camera, world_from_robot[None], rig.robot_from_marker)
+    pixels = project_chain(chain, empty)
     if noise is not None:
         pixels = pixels + noise.normal(0.0, sigma_px, pixels.shape)
     seen = ChainPoints(camera, empty.body, part, points, pixels, empty.covariances)
@@ -135,7 +139,7 @@ def pose_problem(
     noise: np.random.Generator | None = None,
     camera_covariance: FloatArray | None = None,
     marker_covariance: FloatArray | None = None,
-    floor: Floor | None = None,
+    settings: PoseSettings = LEAST_SQUARES,
     rig: Rig | None = None,
     scale_px: float = 900.0,
 ) -> PoseProblem:
@@ -151,7 +155,7 @@ def pose_problem(
     if marker_covariance is not None:
         rig = replace(rig, covariance=marker_covariance)
     network = network_of(world_from_camera, camera_covariance, scale_px)
-    return PoseProblem(network, rig, seen, view, floor)
+    return PoseProblem(network, rig, seen, view, settings)
 
 
 def network_of(

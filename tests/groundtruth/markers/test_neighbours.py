@@ -98,10 +98,11 @@ def test_a_frontal_marker_between_views_of_several() -> None:
         truth = planar_transform(1.5, 1.5, bearing + 0.06 * (i - 7))
         pairs = [(0, 0)] if abs(i - 7) < 3 else [(0, 0), (0, 1), (0, 4)]
         problem = pose_problem(
-            truth, cameras=1, pairs=pairs, noise=generator, sigma_px=0.3, scale_px=500.0
-        )
+            truth, cameras=1, pairs=pairs, noise=generator, sigma_px=0.3, scale_px=500.0,
+            settings=settings,
+        )  # fmt: skip
         truths.append(truth)
-        estimates.append(estimate_pose(problem, settings))
+        estimates.append(estimate_pose(problem))
     assert sum(e.ambiguous for e in estimates[5:10]) >= 3
     choices = choose_candidates([0.1 * i for i in range(15)], estimates, settings)
     for truth, each, choice in zip(truths, estimates, choices):

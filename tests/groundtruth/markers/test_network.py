@@ -102,7 +102,7 @@ def estimated(
         dict.fromkeys(NAMES, lens()),
         BOARDS,
         {"world": WORLD},
-        DoubleBoard("first", "second", offset, covariance),
+        DoubleBoard(offset, covariance),
         found,
         NetworkSettings(corner_sigma_px=sigma_px),
     )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import ChainPoints
-from redetect.groundtruth.markers.poses import SOLVERS, estimate_pose
-from redetect.groundtruth.markers.refinement import Floor, PoseProblem
+from redetect.groundtruth.markers.poses import SOLVERS, PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     inverse,
@@ -36,6 +36,13 @@ def error_of(pose: FloatArray, truth: FloatArray) -> float:
     return float(np.abs(log_se3(inverse(truth) @ pose)).max())
 
 
+SETTINGS = PoseSettings()
+
+
+def estimated(problem: PoseProblem, settings: PoseSettings = SETTINGS) -> PoseEstimate:
+    return estimate_pose(dataclasses.replace(problem, settings=settings))
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("cameras", [1, 2, 4])
 @pytest.mark.parametrize("markers", [1, 3, 6])
@@ -47,22 +54,20 @@ def test_every_solver_ends_at_the_exact_pose(solver: Solver, cameras: int, marke
         problem = pose_problem(truth, cameras=cameras, markers=markers)
         if problem.views:
             tried += 1
-            estimate = estimate_pose(problem, PoseSettings(solver=solver))
+            estimate = estimated(problem, PoseSettings(solver=solver))
             assert error_of(estimate.candidates[0].world_from_robot, truth) < 1e-7
             assert estimate.candidates[0].views.all()
             assert not estimate.contradiction
 
 
-def frontal_marker(
-    generator: np.random.Generator | None, floor: Floor | None = None
-) -> PoseProblem:
+def frontal_marker(generator: np.random.Generator | None) -> PoseProblem:
     """A marker far away and looking almost into the camera."""
     camera = hall_cameras(1)[0]
     away = camera[:3, 3] - np.array([0.0, 0.0, 0.5])
     yaw = float(np.arctan2(away[1], away[0]))
     truth = planar_transform(1.5, 1.5, yaw)
     return pose_problem(
-        truth, cameras=1, pairs=[(0, 0)], noise=generator, floor=floor, sigma_px=0.3, scale_px=500.0
+        truth, cameras=1, pairs=[(0, 0)], noise=generator, sigma_px=0.3, scale_px=500.0
     )
 
 
@@ -73,7 +78,7 @@ def test_the_planar_ambiguity_occurs_and_is_reported() -> None:
     for _ in range(40):
         problem = frontal_marker(generator)
         truth = planar_transform(1.5, 1.5, float(np.arctan2(-4.5, -4.5)))
-        estimate = estimate_pose(problem, PoseSettings())
+        estimate = estimated(problem)
         errors = [error_of(c.world_from_robot, truth) for c in estimate.candidates]
         # Whichever is first: the truth is near one of the candidates. (Not within its
         # covariance: where two minima lie close together, the valley is far from quadratic.)
@@ -93,10 +98,9 @@ def test_the_planar_ambiguity_occurs_and_is_reported() -> None:
 
 def test_the_floor_decides_the_ambiguity() -> None:
     generator = np.random.default_rng(23)
-    floor = Floor(0.0, 0.01, np.radians(0.5))
     truth = planar_transform(1.5, 1.5, float(np.arctan2(-4.5, -4.5)))
     for _ in range(10):
-        estimate = estimate_pose(frontal_marker(generator, floor), PoseSettings())
+        estimate = estimated(frontal_marker(generator), PoseSettings(floor=True))
         assert not estimate.ambiguous
         error = log_se3(inverse(truth) @ estimate.candidates[0].world_from_robot)
         assert error @ np.linalg.solve(estimate.candidates[0].covariance, error) < 30.0
@@ -104,7 +108,6 @@ def test_the_floor_decides_the_ambiguity() -> None:
 
 def test_a_misread_marker_is_found_and_does_not_move_the_pose() -> None:
     generator = np.random.default_rng(24)
-    settings = PoseSettings()
     found = 0
     while found < 8:
         truth = robot_pose(generator)
@@ -117,10 +120,10 @@ def test_a_misread_marker_is_found_and_does_not_move_the_pose() -> None:
         part = seen.part.copy()
         part[problem.view == wrong] = (part[problem.view == wrong] + 3) % 6
         misread = dataclasses.replace(problem, seen=dataclasses.replace(seen, part=part))
-        estimate = estimate_pose(misread, settings)
+        estimate = estimated(misread)
         expected = np.arange(problem.views) != wrong
         np.testing.assert_array_equal(estimate.candidates[0].views, expected)
-        clean = estimate_pose(problem.only(expected), settings)
+        clean = estimated(problem.only(expected))
         assert (
             error_of(estimate.candidates[0].world_from_robot, clean.candidates[0].world_from_robot)
             < 1e-6
@@ -134,7 +137,7 @@ def test_a_marker_with_one_corner_elsewhere_is_left_out() -> None:
     problem = pose_problem(truth, cameras=4, noise=generator)
     pixels = problem.seen.pixels.copy()
     pixels[4] += [9.0, -4.0]
-    estimate = estimate_pose(with_pixels(problem, pixels), PoseSettings())
+    estimate = estimated(with_pixels(problem, pixels))
     assert not estimate.candidates[0].views[1]
     assert estimate.candidates[0].views.sum() == problem.views - 1
 
@@ -147,7 +150,7 @@ def test_two_markers_that_exclude_each_other_are_a_contradiction() -> None:
     pair = problem.only(np.isin(np.arange(problem.views), [first, other]))
     pixels = pair.seen.pixels.copy()
     pixels[4:] += [60.0, 25.0]
-    estimate = estimate_pose(with_pixels(pair, pixels), PoseSettings())
+    estimate = estimated(with_pixels(pair, pixels))
     assert estimate.contradiction
     assert {tuple(c.views) for c in estimate.candidates} == {(True, False), (False, True)}
 
@@ -155,11 +158,11 @@ def test_two_markers_that_exclude_each_other_are_a_contradiction() -> None:
 def test_nothing_seen_is_no_pose() -> None:
     problem = pose_problem(np.eye(4), cameras=1, pairs=[])
     with pytest.raises(GeometryError, match="no marker"):
-        estimate_pose(problem, PoseSettings())
+        estimated(problem)
     noise = pose_problem(np.eye(4), cameras=1, pairs=[(0, 0)])
     pixels = np.array([[100.0, 100.0], [500.0, 120.0], [110.0, 130.0], [480.0, 600.0]])
     with pytest.raises(GeometryError, match="no pose explains"):
-        estimate_pose(with_pixels(noise, pixels), PoseSettings())
+        estimated(with_pixels(noise, pixels))
 
 
 @pytest.mark.parametrize(

@@ -11,17 +11,17 @@ from scipy.stats import chi2
 
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.adjustment import (
+    Chain,
     project_chain,
     project_chain_with_jacobians,
 )
 from redetect.groundtruth.markers.poses import SOLVERS, solve_camera, solve_robot
 from redetect.groundtruth.markers.refinement import (
-    Floor,
     floor_residuals,
     predicted_errors,
     refine_pose,
 )
-from redetect.groundtruth.settings import Solver
+from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     composed_covariance,
     exp_se3,
@@ -34,6 +34,7 @@ from redetect.groundtruth.trajectories.transforms import (
     roll_pitch,
 )
 from tests.groundtruth.markers.scene import (
+    LEAST_SQUARES,
     box_rig,
     hall_cameras,
     lens,
@@ -62,12 +63,13 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
         "part": problem.rig.robot_from_marker,
     }
 
-    def project(by: dict[str, FloatArray]) -> FloatArray:
-        return project_chain(problem.network.cameras, by["camera"], by["body"], by["part"], seen)
+    def chain(by: dict[str, FloatArray]) -> Chain:
+        return Chain(problem.network.cameras, by["camera"], by["body"], by["part"])
 
-    projection = project_chain_with_jacobians(
-        problem.network.cameras, poses["camera"], poses["body"], poses["part"], seen
-    )
+    def project(by: dict[str, FloatArray]) -> FloatArray:
+        return project_chain(chain(by), seen)
+
+    projection = project_chain_with_jacobians(chain(poses), seen)
     np.testing.assert_allclose(projection.pixels, project(poses), atol=1e-9)
     step = 1e-6
     for name in poses:
@@ -84,7 +86,7 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
 
 def test_the_floors_and_the_planes_jacobians_are_derivatives() -> None:
     generator = np.random.default_rng(3)
-    floor = Floor(0.02, 0.01, 0.005)
+    floor = PoseSettings(floor_z_m=0.02, floor_sigma_z_m=0.01, floor_sigma_tilt_deg=0.3)
     step = 1e-6
     for _ in range(20):
         pose = exp_se3(generator.normal(0.0, 0.4, 6))
@@ -189,9 +191,7 @@ def normalised_errors(
     squares, plane, costs = [], [], []
     for _ in range(draws):
         truth = robot_pose(generator)
-        stance = None
-        if floor:
-            stance = Floor(0.0, 0.01, 0.01)
+        stance = replace(LEAST_SQUARES, floor=floor, floor_sigma_tilt_deg=float(np.degrees(0.01)))
         true = pose_problem(truth, cameras=cameras, noise=generator, sigma_px=0.15)
         moved_rig = rig.robot_from_marker @ exp_se3(
             (marker_factor @ generator.normal(size=36)).reshape(6, 6)
@@ -203,7 +203,7 @@ def normalised_errors(
             true,
             network=network_of(moved_cameras, camera_covariance),
             rig=replace(rig, robot_from_marker=moved_rig, covariance=marker_covariance),
-            floor=stance,
+            settings=stance,
         )
         result = refine_pose(believed, truth)
         error = log_se3(inverse(truth) @ result.world_from_robot)
@@ -273,7 +273,8 @@ def test_a_robust_loss_gives_a_bad_view_little_say(loss: str) -> None:
     spoilt = replace(problem, seen=replace(seen, pixels=shifted))
 
     def error(name: str) -> float:
-        result = refine_pose(spoilt, truth, loss=name)  # type: ignore[arg-type]
+        settings = PoseSettings(loss=name)  # type: ignore[arg-type]
+        result = refine_pose(replace(spoilt, settings=settings), truth)
         return float(np.linalg.norm(log_se3(inverse(truth) @ result.world_from_robot)))
 
     assert error(loss) < 0.5 * error("linear")
@@ -284,12 +285,13 @@ def test_the_floor_holds_what_a_far_marker_cannot() -> None:
     rig = box_rig()
     truth = np.eye(4)
     truth[:2, 3] = 0.3, 0.2
+    known = replace(LEAST_SQUARES, floor=True, floor_sigma_z_m=3e-4, floor_sigma_tilt_deg=0.017)
     free: list[float] = []
     held: list[float] = []
     for _ in range(30):
-        for floor, kept in ((None, free), (Floor(0.0, 3e-4, 3e-4), held)):
+        for settings, kept in ((LEAST_SQUARES, free), (known, held)):
             problem = pose_problem(
-                truth, cameras=1, pairs=[(0, 2)], noise=generator, floor=floor, rig=rig
+                truth, cameras=1, pairs=[(0, 2)], noise=generator, settings=settings, rig=rig
             )
             pose = refine_pose(problem, truth).world_from_robot
             kept.append(np.abs(roll_pitch(pose)).max())

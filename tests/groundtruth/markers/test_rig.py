@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
-    chained_poses,
     pair_consensus,
     pair_estimates,
     spanning_tree,
@@ -179,7 +178,7 @@ def test_a_consensus_stands_thirty_percent_of_flipped_solutions() -> None:
             times.append(
                 MarkerPose(poses, np.tile(covariance, (4, 1, 1)), np.array([1.0, 2.0, 4.0, 6.0]))
             )
-        consensus = pair_consensus((0, 1), times)
+        consensus = pair_consensus(times)
         error = log_se3(inverse(truth) @ consensus.a_from_b)
         assert np.all(np.abs(error) < 4 * sigma / np.sqrt(60) + 1e-3)
         assert consensus.support >= 57
@@ -203,7 +202,7 @@ def test_a_consensus_stands_misread_markers() -> None:
         )
         for i in range(30)
     ]
-    consensus = pair_consensus((0, 1), times)
+    consensus = pair_consensus(times)
     assert consensus.agrees.tolist() == [i % 3 != 0 for i in range(30)]
 
 
@@ -224,7 +223,6 @@ def test_markers_never_seen_together_are_bridged_by_a_third() -> None:
     kept = ({0, 4}, {4, 1}, {1, 5}, {5, 2}, {2, 3})
     estimate = estimated(walk_round(rig, 40, seed=7, kept=kept), rig, reference=31)
     assert set(estimate.pairs) == {(0, 4), (1, 4), (1, 5), (2, 5), (2, 3)}
-    assert [rig.ids[p] for p in estimate.parents] == [31, 35, 36, 33, 31, 32]
     square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
     assert square / dof < 2.0
 
@@ -367,8 +365,6 @@ def test_the_frame_follows_from_reference_poses() -> None:
 def test_the_tree_prefers_support() -> None:
     pairs = {(0, 1): 5, (0, 2): 50, (1, 2): 40, (3, 4): 9}
     assert spanning_tree(pairs, 5, 0) == [0, 2, 0, -1, -1]
-    with pytest.raises(GroundTruthError, match="not connected"):
-        chained_poses({}, [0, -1], 0)
 
 
 def test_the_mean_of_poses_weights_by_covariance() -> None:
@@ -377,10 +373,9 @@ def test_the_mean_of_poses_weights_by_covariance() -> None:
     roots = generator.normal(0, 0.01, (400, 6, 6))
     poses = np.stack([truth @ exp_se3(root @ generator.normal(size=6)) for root in roots])
     covariances = roots @ roots.transpose(0, 2, 1) + 1e-9 * np.eye(6)
-    mean, covariance, spread = mean_pose(poses, covariances)
+    mean, covariance = mean_pose(poses, covariances)
     error = log_se3(inverse(truth) @ mean)
     assert error @ np.linalg.solve(covariance, error) < 25.0
-    assert spread == pytest.approx(1.0, abs=0.15)
 
 
 def test_the_picture_is_a_png_and_always_the_same() -> None:

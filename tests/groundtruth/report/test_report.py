@@ -227,8 +227,12 @@ def test_files_larger_than_the_bounds_are_not_read(
     ):
         monkeypatch.setattr(f"redetect.groundtruth.{module}.{name}", 64)
     inputs = gather(session)
-    for place in ("validation/errors.png", "laser.jsonl", "laser.json"):
-        assert f"{place}: cannot be read: larger than 64 bytes" in inputs.problems
+    for place, kind in (
+        ("validation/errors.png", "picture"),
+        ("laser.jsonl", "file"),
+        ("laser.json", "file"),
+    ):
+        assert f"{place}: cannot be read as a {kind}: larger than 64 bytes" in inputs.problems
     assert not inputs.pictures
     assert not inputs.sets
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     format_planar_poses,
@@ -65,7 +65,7 @@ def test_what_is_written_is_read_back(
         path = Path(folder) / "poses.csv"
         write_planar_poses(path, poses)
         if not rows:
-            with pytest.raises(StreamError, match="no poses"):
+            with pytest.raises(GroundTruthError, match="no poses"):
                 read_planar_poses(path)
             return
         read = read_planar_poses(path)
@@ -95,7 +95,7 @@ def test_malformed_streams_are_refused_by_line(
 ) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(text)
-    with pytest.raises(StreamError, match=problem) as caught:
+    with pytest.raises(GroundTruthError, match=problem) as caught:
         read_planar_poses(path)
     assert str(caught.value).startswith(f"{path}:{line}: ")
 
@@ -123,7 +123,7 @@ def test_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
     with pytest.raises(OutputExistsError):
         write_planar_poses(path, poses)
     write_planar_poses(path, poses, overwrite=True)
-    with pytest.raises(StreamError, match="no such file"):
+    with pytest.raises(GroundTruthError, match="no such file"):
         read_planar_poses(tmp_path / "absent.csv")
 
 
@@ -153,8 +153,8 @@ def test_times_are_read_by_prefix(tmp_path: Path) -> None:
     path.write_text("# prefix seconds\na0001 1235.250000\na0002 1235.300000 # late\n")
     assert read_times(path) == {"a0001": 1235.25, "a0002": 1235.3}
     path.write_text("a 1\na 2\n")
-    with pytest.raises(StreamError, match="a second time"):
+    with pytest.raises(GroundTruthError, match="a second time"):
         read_times(path)
     path.write_text("a 1 2\n")
-    with pytest.raises(StreamError, match="expected prefix,seconds"):
+    with pytest.raises(GroundTruthError, match="expected prefix,seconds"):
         read_times(path)

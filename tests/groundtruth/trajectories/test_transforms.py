@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from camera.calibration.model import cross_matrices
 from redetect.groundtruth.trajectories.transforms import (
     adjoint,
     apply,
     exp_se3,
-    hat,
     heading,
     inverse,
     log_se3,
@@ -64,7 +64,7 @@ def test_the_exponential_is_the_matrix_exponential(xi: FloatArray) -> None:
     from scipy.linalg import expm
 
     generator = np.zeros((4, 4))
-    generator[:3, :3], generator[:3, 3] = hat(xi[3:]), xi[:3]
+    generator[:3, :3], generator[:3, 3] = cross_matrices(xi[3:]), xi[:3]
     np.testing.assert_allclose(exp_se3(xi), expm(generator), atol=1e-11)
     np.testing.assert_allclose(exp_se3(-xi), inverse(exp_se3(xi)), atol=1e-12)
 

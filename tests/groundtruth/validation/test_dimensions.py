@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.validation.reference_poses import (
     DIMENSIONS_HEAD,
     FIDUCIAL_DISTANCES_HEAD,
@@ -38,12 +38,12 @@ def test_files_are_read_and_malformed_rows_refused(tmp_path: Path) -> None:
     path.write_text(f"{DIMENSIONS_HEAD}\nroom,0,0,3,4,5.01\n")
     assert read_dimensions(path) == [("room", 5.0, 5.01)]
     path.write_text("room,0,0,3,4\n")
-    with pytest.raises(StreamError, match=":1: 5 words: expected name"):
+    with pytest.raises(GroundTruthError, match=":1: 5 words: expected name"):
         read_dimensions(path)
     path.write_text(f"{FIDUCIAL_DISTANCES_HEAD}\nSW,SE,10.002\n")
     assert read_fiducial_distances(path, SURVEY) == [("SW", "SE", 10.002)]
     path.write_text("SW,X,10.002\n")
-    with pytest.raises(StreamError, match=":1: 'X': expected one of SW, SE"):
+    with pytest.raises(GroundTruthError, match=":1: 'X': expected one of SW, SE"):
         read_fiducial_distances(path, SURVEY)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.validation.reference_poses import (
     Distance,
     Survey,
@@ -96,14 +96,14 @@ def test_malformed_distances_are_refused_by_line(
 ) -> None:
     path = tmp_path / "distances.csv"
     path.write_text(text)
-    with pytest.raises(StreamError, match=message) as error:
+    with pytest.raises(GroundTruthError, match=message) as error:
         read_distances(path, SURVEY)
     assert str(error.value).startswith(f"{path}:{line}: ")
 
 
 def test_files_that_are_no_text_or_not_there_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(StreamError, match="no such file"):
+    with pytest.raises(GroundTruthError, match="no such file"):
         read_distances(tmp_path / "distances.csv", SURVEY)
     (tmp_path / "distances.csv").write_bytes(b"\xff\xfe")
-    with pytest.raises(StreamError, match="no text"):
+    with pytest.raises(GroundTruthError, match="no text"):
         read_distances(tmp_path / "distances.csv", SURVEY)

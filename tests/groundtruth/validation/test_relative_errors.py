@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.errors import GroundTruthError, StreamError
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     matched_streams,
@@ -163,7 +163,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
         ("# nothing\n", "no relations in it"),
     ):
         path.write_text(text)
-        with pytest.raises(StreamError, match=message):
+        with pytest.raises(GroundTruthError, match=message):
             read_relations(path)
 
 

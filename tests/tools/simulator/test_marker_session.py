@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from camera import parse_camera, read_camera
-from redetect.groundtruth.markers.adjustment import ChainPoints, project_chain
+from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
 from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
@@ -86,9 +86,8 @@ def _corners_by_files(folder: Path, truth: dict[str, Any]) -> tuple[np.ndarray, 
         np.array(pixels), np.tile(np.eye(2), (len(part), 1, 1)),
     )  # fmt: skip
     bodies = np.stack([planar_transform(*(float(x) for x in pose)) for pose in poses.poses])
-    projected = project_chain(
-        network.cameras, network.world_from_camera, bodies, rig.robot_from_marker, seen
-    )
+    cameras, places = network.cameras, network.world_from_camera
+    projected = project_chain(Chain(cameras, places, bodies, rig.robot_from_marker), seen)
     return seen.pixels, projected
 
 

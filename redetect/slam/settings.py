@@ -1,0 +1,81 @@
+"""Settings of association and of added noise, for the command line and library callers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from redetect.slam.errors import SlamError
+from redetect.storage.bounds import (
+    PROBABILITY,
+    NotNegative,
+    Positive,
+    demand_fields,
+    from_to,
+    whole,
+)
+
+Method = Literal["nearest", "joint"]
+
+
+@dataclass(frozen=True)
+class AssociateSettings:
+    """How a run is associated."""
+
+    # `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
+    # frame's rows (JCBB).
+    method: Method = "joint"
+    # Then search loops by fitting local maps of landmarks to each other.
+    map_level: bool = True
+    gate_probability: Annotated[float, PROBABILITY] = 0.999  # Share of right rows that pass.
+    # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
+    # by more than the file says.
+    sigma_scale: Positive = 1.4
+    # Standard deviation of the robot's sway about both axes of the floor, which moves all discs of
+    # a frame together (degrees). Bearings are compensated for tilt.
+    tilt_sigma_deg: Annotated[float, from_to(0.0, 45.0)] = 0.2
+    # Share of a disc's right rows that keep its ID at the map level, by their covariances as the
+    # file states them; rows farther from its place in the map get -1.
+    kept_probability: Annotated[float, PROBABILITY] = 0.99
+    # Discs of fewer such rows are taken for clutter: their rows get -1.
+    fewest_rows: Annotated[int, whole(1)] = 3
+
+    def __post_init__(self) -> None:
+        demand_fields(self, SlamError)
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """`tilt_sigma_deg` in radians."""
+        return math.radians(self.tilt_sigma_deg)
+
+
+@dataclass(frozen=True)
+class AddedNoise:
+    """Standard deviations of the added noise, independent for each number."""
+
+    sigma: NotNegative = 0.0  # Added to disc positions along x and y (m).
+    # Added to bearings of lines (rad). Their ends in the image stay as they are.
+    bearing_sigma: NotNegative = 0.0
+    step_sigma: NotNegative = 0.0  # Added to dx and dy of each step (m).
+    turn_sigma: NotNegative = 0.0  # Added to dphi of each step (rad).
+    # Everything random follows from it. The files of discs and of lines of one run get the same
+    # odometry.
+    seed: Annotated[int, whole(0)] = 1
+
+    def __post_init__(self) -> None:
+        demand_fields(self, SlamError)
+
+    @property
+    def nothing(self) -> bool:
+        """Whether all are 0."""
+        return not (self.sigma or self.bearing_sigma or self.step_sigma or self.turn_sigma)
+
+    @property
+    def comment(self) -> str:
+        """The head of the file."""
+        return (
+            f"Noise was added, standard deviations: discs {self.sigma:g} m, bearings "
+            f"{self.bearing_sigma:g} rad, dx and dy {self.step_sigma:g} m, dphi "
+            f"{self.turn_sigma:g} rad; seed {self.seed}. The covariances are raised to match."
+        )
