@@ -253,7 +253,7 @@ def gather_by_sector(
 
     `ends` (SECTORS + 1,) is a result: where in the patch each sector begins, and the last ends.
     """
-    ends[:] = 0
+    ends.fill(0)
     view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
     if view.u_per_radius == 0.0:
         return Gathered(view.shape, 0, 0)

@@ -95,9 +95,10 @@ _MOST_OFF = 0.3
 _DISAGREEMENT = 0.5
 #: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
 #: the variance is larger than what that gives.
-_STRETCH, _INFLATION = 3, 1.4
-#: Fits of a whole disc that explain this much of the variance leave nothing to be asked.
-_EXPLAINS_ALL = 0.985
+_STRETCH, _INFLATION = 3, 1.6
+#: Fits of a whole disc that explain this much of the variance leave nothing to be asked, unless the
+#: disc is more blurred than this: movement blurs along one axis only.
+_EXPLAINS_ALL, _SHARP_PX = 0.985, 0.9
 #: It is fitted again if the blur is this much longer along one axis.
 _MOVED = 1.5
 #: Least number of whole discs that give the apparent radius.
@@ -285,12 +286,15 @@ def _see(sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: 
         if pixels < _LEAST_PIXELS:
             continue
         of_sector[_RAMP, _RAMP] += (noise / _RAMP_SIGMA) ** 2
-        eliminate(of_sector, _OUTSIDE)
+        for k in range(_RAMP):
+            eliminate(of_sector, k)
         if of_sector[_CONTRAST, _CONTRAST] < _LEAST_SPREAD:
             continue
-        eliminate(of_sector, _RAMP)
+        for k in range(_RAMP, _CONTRAST):
+            eliminate(of_sector, k)
         contrast = of_sector[_GREY, _CONTRAST] / of_sector[_CONTRAST, _CONTRAST]
-        eliminate(of_sector, _CONTRAST)
+        for k in range(_CONTRAST, _BLUR_1):
+            eliminate(of_sector, k)
         sectors.contrast[s] = contrast
         sectors.variance[s] = of_sector[_GREY, _GREY] / (pixels - 3.0)
         angle = 2.0 * math.pi * (s + 0.5) / SECTORS
@@ -351,7 +355,7 @@ def _add_up(
     sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
 ) -> None:
     """The normal equations of the step of the edge, of all sectors and what is expected of it."""
-    normal[:] = 0.0
+    normal.fill(0.0)
     for s in range(SECTORS):
         _add_sector(sectors, s, 1.0, normal)
     _expect(normal, _RADIUS, settings.radius_sigma, expected.radius - edge.radius)
@@ -430,11 +434,11 @@ def _centre_and_covariance(
     sectors: Sectors, normal: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float, float]]:
     """Step of the centre, and covariance (xx, xy, yy) by leaving out neighbouring sectors."""
-    others, some = np.empty((SECTORS, 2)), np.empty((_TERMS, _TERMS))
+    others = np.empty((SECTORS, 2))
     mean_x = mean_y = 0.0
     count = 0
     for s in range(SECTORS):
-        some[:] = normal
+        some = normal.copy()
         for k in range(_STRETCH):
             _add_sector(sectors, (s + k) % SECTORS, -1.0, some)
         (others[s, 0], others[s, 1]), _ = _centre(some)
@@ -449,14 +453,14 @@ def _centre_and_covariance(
     return centre, (scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy)
 
 
-@kernel()
+@kernel(inline="always")
 def place_fitted(scene: Scene, radius: float, work: Any, result: Any) -> None:
     """Place a disc that was fitted as a whole by its sectors, where these are more certain.
 
     Movement blurs an image along one axis, mostly: with what the sectors say of the blur along
     either, the whole disc is fitted once more.
     """
-    if result.explained >= _EXPLAINS_ALL:
+    if result.explained >= _EXPLAINS_ALL and result.blur < _SHARP_PX:
         return
     start = Start(result.x, result.y, result.radius, result.blur)
     others = np.zeros(2, RESULT)
@@ -487,7 +491,7 @@ def _place_if_better(other: Any, result: Any) -> None:
         result.cov_xx, result.cov_xy, result.cov_yy = other.cov_xx, other.cov_xy, other.cov_yy
 
 
-@kernel()
+@kernel(inline="always")
 def place_by_rim(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) -> bool:
     """Place a disc of which the rim is known: by its sectors, or where they differ by the points.
 

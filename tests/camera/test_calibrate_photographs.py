@@ -10,7 +10,7 @@ from tools.evaluation.calibration import compare
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("group", ["asym", "rct"])
+@pytest.mark.parametrize("group", ["asym", "rct", "robvis", "sym"])
 def test_held_out_photographs_are_explained_as_well_as_by_opencv(
     shared_data: Path, group: str
 ) -> None:

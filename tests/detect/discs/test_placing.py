@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape
-from detect.discs.placing import apparent_radius
+from detect.discs.placing import apparent_radius, eliminate
 from detect.discs.rim import DIRECTIONS, best_circle
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
@@ -45,6 +48,83 @@ def test_a_door_over_a_disc_does_not_move_it(
     assert len(squares) >= 36
     assert np.sqrt(np.median(np.square(off_px))) < 0.06
     assert 0.05 < np.median(squares) / np.log(2.0) < 2.0
+
+
+def errors_of(
+    camera: Camera, table: DiscTable, floors: list[tuple[PaintedFloor, NDArray[np.float64]]]
+) -> tuple[float, float]:
+    """Root mean square error of a coordinate, pixels, and mean normalised error squared."""
+    off_px, squares = [], []
+    for seed, (floor, place) in enumerate(floors):
+        found = detect_circles(floor.image(seed=seed), camera, table, SETTINGS)
+        k = int(np.hypot(*(found.floor_xy - place).T).argmin())
+        off_px.append(np.subtract(*camera.project_floor(np.array([found.floor_xy[k], place]))))
+        error = found.floor_xy[k] - place
+        squares.append(error @ np.linalg.solve(found.covariance[k], error) / 2.0)
+    return float(np.sqrt(np.mean(np.square(off_px)))), float(np.mean(squares))
+
+
+def places(count: int) -> list[NDArray[np.float64]]:
+    rng = np.random.default_rng(7)
+    return [PLACES[k % len(PLACES)] + rng.uniform(-0.05, 0.05, 2) for k in range(count)]
+
+
+def test_a_shadow_over_half_of_a_disc_does_not_move_it(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    floors = []
+    for k, place in enumerate(places(24)):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        u, v = published_camera.project_floor(place)
+        along = np.cos(k) * (np.arange(published_camera.width) - u)
+        across = np.sin(k) * (np.arange(published_camera.height) - v)
+        light = np.clip(0.5 + (along + across[:, None]) / 4.0, 0.0, 1.0)
+        floor.grey *= 0.55 + 0.45 * light
+        floors.append((floor, place))
+    error_px, normalised = errors_of(published_camera, table, floors)
+    assert error_px < 0.05  # the fit of a whole disc is half a pixel off
+    assert 0.2 < normalised < 2.0
+
+
+def test_light_that_falls_off_across_a_disc_does_not_move_it(
+    published_camera: Camera, table: DiscTable
+) -> None:
+    floors = []
+    for place in places(24):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        u, _ = published_camera.project_floor(place)
+        floor.grey *= np.exp(-np.square(np.arange(published_camera.width) - u - 20.0) / 3000.0)
+        floors.append((floor, place))
+    error_px, normalised = errors_of(published_camera, table, floors)
+    assert error_px < 0.05
+    assert 0.1 < normalised < 2.0
+
+
+@pytest.mark.parametrize("length_px", [7, 11])
+def test_movement_leaves_a_disc_in_its_place_and_its_covariance_right(
+    published_camera: Camera, table: DiscTable, length_px: int
+) -> None:
+    floors = []
+    for place in places(24):
+        floor = PaintedFloor(published_camera).disc(place, LIGHT)
+        floor.grey = np.asarray(cv2.blur(floor.grey, (length_px, 1)))
+        floors.append((floor, place))
+    error_px, normalised = errors_of(published_camera, table, floors)
+    assert error_px < 0.1
+    assert 0.1 < normalised < 2.0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7))
+def test_elimination_leaves_what_the_eliminated_do_not_explain(seed: int, eliminated: int) -> None:
+    rows = np.random.default_rng(seed).normal(size=(30, 8))
+    products = rows.T @ rows
+    for k in range(eliminated):
+        eliminate(products, k)
+    first, later = rows[:, :eliminated], rows[:, eliminated:]
+    left = later - first @ np.linalg.lstsq(first, later, rcond=None)[0]
+    np.testing.assert_allclose(
+        np.tril(products[eliminated:, eliminated:]), np.tril(left.T @ left), rtol=1e-8, atol=1e-8
+    )
 
 
 def test_a_circle_of_another_size_needs_more_points() -> None:
