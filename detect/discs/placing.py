@@ -1,20 +1,20 @@
-"""Where a disc is that the fit of a whole disc explains in part: by its edge, sector by sector.
+"""Where a disc is that something hides, stains or lights in part: by its edge, sector by sector.
 
-Whatever hides, stains or lights a part of a disc pulls at the fit of the whole disc. Here the same
-blurred disc is fitted to the pixels about its edge alone, and in each of 16 sectors s it has grey
-levels of its own inside and outside:
+All of that pulls at the fit of the whole disc. Here the same blurred disc is fitted to the pixels
+about its edge alone, and in each of 16 sectors s it has grey levels of its own inside and outside:
 
-    grey = outside_s + contrast_s * W(x, y, radius, log blur)
+    grey = outside_s + contrast_s * W(x, y, radius, blur) + ramp_s * (r - radius) * grey
 
-so light may change round the disc as it likes. In every sector the levels are eliminated; what
-remains are normal equations of the four parameters that all sectors share. A sector counts less if
-the model does not explain it, and if it shows the edge elsewhere than the others do: something
-else's edge. These weights are Tukey's, found anew in every step (A. E. Beaton and J. W. Tukey,
-Technometrics 16, 1974).
+so light may change round the disc as it likes, and rise or fall across the edge. Levels and ramp
+are eliminated in every sector; what remains are normal equations of what all sectors share: the
+centre, the radius, and the blur along either axis of the image, for movement blurs along one. A
+sector counts less if the model does not explain it, and if it shows the edge elsewhere than the
+others do: something else's edge. These weights are Tukey's biweights, found anew in every step
+(A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
 
-The errors of neighbouring pixels are not independent where something touches the rim, those of
-different sectors nearly are. So the covariance is that of clustered data (K.-Y. Liang and S. L.
-Zeger, Biometrika 73, 1986): of the steps that each sector by itself would still make.
+The errors of neighbouring pixels are not independent where something touches the rim; those of
+sectors apart from each other nearly are. So the covariance is that of the jackknife, leaving out
+neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989), plus that of the noise.
 """
 
 from __future__ import annotations
@@ -218,7 +218,8 @@ def place_by_sectors(scene: Scene, radius: float, start: Start, work: Any, resul
     ratio = 1.0 / ratio if gathered.shape == CHORDS_ALONG_V else ratio
     (x, y), (xx, xy, yy) = _centre_and_covariance(sectors, normal)
     x, y = edge.x + x, edge.y + y
-    if math.hypot(x - begin.x, y - begin.y) > _MOST_OFF:
+    near = math.hypot(x - begin.x, y - begin.y) <= _MOST_OFF
+    if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
         return Placed(False, ratio)
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
     result.x, result.y = floor_xy[0] + radius * x, floor_xy[1] + radius * y

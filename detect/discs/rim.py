@@ -35,14 +35,19 @@ NEAREST, FARTHEST = 0.35, 1.65
 LEAST_STEP = 0.35
 #: A point is on the circle within this share of the radius, and this many pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
-#: Of the radius about the nominal one, relative: the calibrated height may be off by some percent.
-RADIUS_SIGMA = 0.06
+#: Of the radius about the nominal one, relative, to find the circle (the calibrated height may be
+#: off by some percent), and to place it: of a short arc, place and radius trade off.
+RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
 #: Fewer points than this make no circle.
 LEAST_POINTS = 6
+#: A circle is placed by this number of points at least; steps of it, and how many deviations off
+#: the others a point may be.
+LEAST_TRUSTED = 8
+_PLACING_STEPS, _FAR_OFF = 4, 2.5
 #: So many neighbouring points err alike.
-_ALIKE = 3.0
+_ALIKE = 1.5
 #: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
 _START = 0.3
 _STARTS = 9
@@ -447,11 +452,13 @@ def follow_rim(
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
         runs += 1 if hidden and chosen[last] > 0.0 else 0
     scatter = math.sqrt(squares / best_count)
+    radius_found = radius * best.radius
+    best = _placed(at_x, at_y, chosen, best)
     area = _ALIKE * radius * radius
     return Rim(
         best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
         math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
-        x + radius * best.x, y + radius * best.y, radius * best.radius,
+        x + radius * best.x, y + radius * best.y, radius_found,
         area * best.cov_xx, area * best.cov_xy, area * best.cov_yy, radius_px,
         radius * doubt[0], radius * doubt[1],
     )  # fmt: skip
@@ -464,6 +471,42 @@ def follow_again(
     """The rim followed from its own middle, unless less of it is found from there."""
     again = follow_rim(image, camera_numbers, rim.x, rim.y, radius, rim.step)
     return again if again.agreeing >= rim.agreeing - _SLACK else rim
+
+
+@kernel()
+def _placed(
+    x: NDArray[np.float64], y: NDArray[np.float64], chosen: NDArray[np.float64], circle: Circle
+) -> Circle:
+    """The circle by the inner points of each stretch.
+
+    Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
+    far off the others by their median deviation are left out.
+    """
+    trusted, count = np.zeros(DIRECTIONS), 0
+    for k in range(DIRECTIONS):
+        if chosen[(k - 1) % DIRECTIONS] > 0.0 and chosen[(k + 1) % DIRECTIONS] > 0.0:
+            trusted[k] = chosen[k]
+        count += trusted[k] > 0.0
+    if count < LEAST_TRUSTED:
+        for k in range(DIRECTIONS):
+            trusted[k] = chosen[k]
+    off = np.empty(DIRECTIONS)
+    for _ in range(_PLACING_STEPS):
+        circle = fit_circle(x, y, trusted, circle, PLACING_SIGMA)
+        n = 0
+        for k in range(DIRECTIONS):
+            if trusted[k] > 0.0:
+                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
+                off[n] = abs(residual) * math.sqrt(trusted[k])
+                n += 1
+        limit = max(_FAR_OFF * 1.4826 * median(off[:n]), 1.0)
+        for k in range(DIRECTIONS):
+            if trusted[k] > 0.0 and n > LEAST_TRUSTED:
+                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
+                if abs(residual) * math.sqrt(trusted[k]) > limit:
+                    trusted[k] = 0.0
+                    n -= 1
+    return circle
 
 
 @kernel()
