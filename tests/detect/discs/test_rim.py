@@ -134,7 +134,7 @@ def test_covariances_of_the_rim_cover_its_errors(published_camera: Camera) -> No
         error = np.array([rim.x, rim.y]) - place
         covariance = np.array([[rim.cov_xx, rim.cov_xy], [rim.cov_xy, rim.cov_yy]])
         squares.append(error @ np.linalg.solve(covariance, error) / 2.0)
-    # The points place a disc only where sectors of its edge disagree: there they are worse than here.
+    # They place discs only where sectors of the edge disagree: there they are worse than here.
     assert 0.1 < np.median(squares) / np.log(2.0) < 1.6
 
 
