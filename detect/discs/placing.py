@@ -98,7 +98,7 @@ _DISAGREEMENT = 0.5
 _STRETCH, _INFLATION = 3, 1.6
 #: Fits of a whole disc that explain this much of the variance leave nothing to be asked, unless the
 #: disc is more blurred than this: movement blurs along one axis only.
-_EXPLAINS_ALL, _SHARP_PX = 0.985, 0.9
+_EXPLAINS_ALL, _SHARP_PX = 0.985, 1.2
 #: It is fitted again if the blur is this much longer along one axis.
 _MOVED = 1.5
 #: Least number of whole discs that give the apparent radius.
