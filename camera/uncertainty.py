@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from camera.calibration.model import COUNT, cross_matrices, project_points
+from camera.calibration.model import COUNT, project_points
 from camera.model import PARAMETERS, Camera, Pose
+from camera.rotations import cross_matrices
 from redetect.array_types import FloatArray
 
 IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
-from camera.calibration.model import rotation_of
+from camera.rotations import rotation_of
 from redetect.landmarks import Frame, Step
 
 FloatArray = NDArray[np.float64]

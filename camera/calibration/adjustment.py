@@ -17,11 +17,10 @@ from camera.calibration.model import (
     CalibrationSettings,
     FreeLens,
     corner_radius,
-    cross_matrices,
     is_possible,
     project_points,
-    rotation_of,
 )
+from camera.rotations import cross_matrices, rotation_of
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import (

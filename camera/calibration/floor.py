@@ -29,13 +29,14 @@ from camera.calibration.adjustment import (
 )
 from camera.calibration.calibrate import largest_rms_px
 from camera.calibration.images import read_grey
-from camera.calibration.model import COUNT, cross_matrices
+from camera.calibration.model import COUNT
 from camera.calibration.pictures import drawn_floor, rectified_floor
 from camera.calibration.start import best_poses, board_poses
 from camera.camfile import read_camera, write_camera
 from camera.errors import CalibrationError
 from camera.model import Camera
 from camera.options import Calibrate, Floor
+from camera.rotations import cross_matrices
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes

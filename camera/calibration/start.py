@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 
 from camera.calibration.adjustment import Estimate, Points, adjust, project_estimate
-from camera.calibration.model import COUNT, free_span, lens_of, rotation_of
+from camera.calibration.model import COUNT, free_span, lens_of
 from camera.distortion import one_to_one_radius, straightened
+from camera.rotations import rotation_of
 from redetect.array_types import FloatArray
 from redetect.least_squares.solver import StartError
 

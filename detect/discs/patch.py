@@ -230,12 +230,9 @@ def gather(
     patch : PATCH
         The result.
     """
-    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
-    if view.u_per_radius == 0.0:
-        return Gathered(view.shape, 0, 0)
-    count = _choose(floor_xy, candidate, settings, start, view, look, patch)
-    _describe(image, floor_xy, candidate, view.shape, count, patch)
-    return Gathered(view.shape, padded(count), count)
+    shape, count = _choose(floor_xy, candidate, settings, start, look, patch)
+    _describe(image, floor_xy, candidate, shape, count, patch)
+    return Gathered(shape, padded(count), count)
 
 
 @kernel()
@@ -253,14 +250,10 @@ def gather_by_sector(
 
     `ends` (SECTORS + 1,) is a result: where in the patch each sector begins, and the last ends.
     """
-    ends.fill(0)
-    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
-    if view.u_per_radius == 0.0:
-        return Gathered(view.shape, 0, 0)
-    count = _choose(floor_xy, candidate, settings, start, view, False, patch)
+    shape, count = _choose(floor_xy, candidate, settings, start, False, patch)
     count = _sort_by_sector(floor_xy, candidate, start, between, count, patch, ends)
-    _describe(image, floor_xy, candidate, view.shape, count, patch)
-    return Gathered(view.shape, padded(count), count)
+    _describe(image, floor_xy, candidate, shape, count, patch)
+    return Gathered(shape, padded(count), count)
 
 
 @kernel()
@@ -278,6 +271,7 @@ def _sort_by_sector(
     x0 = floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x
     y0 = floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y
     per_radius, per_sector = 1.0 / (candidate.radius * start.radius), SECTORS / (2.0 * math.pi)
+    ends.fill(0)
     for i in range(count):
         x, y = floor[pixel[i], 0] - x0, floor[pixel[i], 1] - y0
         r = math.sqrt(x * x + y * y) * per_radius
@@ -302,11 +296,13 @@ def _choose(
     candidate: Candidate,
     settings: FitSettings,
     start: Disc,
-    view: View,
     look: bool,
     patch: Any,
-) -> int:
-    """Which pixels are taken, and the weight of each; returns their number."""
+) -> tuple[int, int]:
+    """Which pixels are taken, and the weight of each; returns the shape and their number."""
+    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
+    if view.u_per_radius == 0.0:
+        return view.shape, 0
     height, width = floor_xy.shape[:2]
     u0, v0 = candidate.u, candidate.v
     most = 1.08 * settings.reach_radii
@@ -362,7 +358,7 @@ def _choose(
                 weight[count] = row[k]
                 count += 1
             turn = turn - 1 if turn > 0 else between
-    return count
+    return view.shape, count
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

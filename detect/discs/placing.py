@@ -96,8 +96,8 @@ _DISAGREEMENT = 0.5
 #: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
 #: the variance is larger than what that gives.
 _STRETCH, _INFLATION = 3, 1.6
-#: Fits of a whole disc that explain this much of the variance leave nothing to be asked, unless the
-#: disc is more blurred than this: movement blurs along one axis only.
+#: A whole disc's fit is final if it explains this much of the variance and the disc is sharper than
+#: this (pixels): movement blurs along one axis only, which that fit does not know.
 _EXPLAINS_ALL, _SHARP_PX = 0.985, 1.2
 #: It is fitted again if the blur is this much longer along one axis.
 _MOVED = 1.5
@@ -207,7 +207,7 @@ def place_by_sectors(scene: Scene, radius: float, start: Start, work: Any, resul
             chord_shares(patch, gathered.n, disc, edge.blur)
         _write_rows(patch, gathered.n, edge, level, rows)
         _multiply(rows, ends, sectors.products)
-        _see(sectors, per_pixel, settings.noise)
+        _eliminate_levels(sectors, per_pixel, settings.noise)
         if _weigh(sectors, step < _EARLY, settings.noise) < _LEAST_SECTORS:
             return Placed(False, given.blur_ratio)
         _add_up(sectors, edge, expected, settings, normal)
@@ -278,7 +278,9 @@ def _multiply(rows: NDArray[np.float32], ends: NDArray[np.int64], products: Floa
 
 
 @kernel()
-def _see(sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: float) -> None:
+def _eliminate_levels(
+    sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: float
+) -> None:
     """Eliminate levels and ramp of each sector; its contrast, residuals, and where its edge is."""
     for s in range(SECTORS):
         of_sector = sectors.products[s]

@@ -22,12 +22,7 @@ from detect.discs.evidence import (
 from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
-from detect.discs.placing import (
-    WELL_EXPLAINED,
-    apparent_radius,
-    place_by_rim,
-    place_fitted,
-)
+from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_rim, place_fitted
 from detect.discs.quality import Centres
 from detect.discs.rim import follow_rim
 from redetect.compiled import kernel

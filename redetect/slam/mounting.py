@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from camera.calibration.model import cross_matrices, left_jacobian, rotation_of
+from camera.rotations import cross_matrices, left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 

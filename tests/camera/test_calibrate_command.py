@@ -16,9 +16,9 @@ from camera import Camera, read_camera, write_camera
 from camera.boards.board import Board
 from camera.boards.points import find_board
 from camera.calibration.floor import on_floor, place_on_floor, read_floor_points
-from camera.calibration.model import rotation_of
 from camera.cli import main
 from camera.errors import CalibrationError
+from camera.rotations import rotation_of
 from camera.uncertainty import covariance_of
 from tests.camera.conftest import BOARD, PICTURES
 from tools.evaluation.boards import Rays, projection_difference, render_board

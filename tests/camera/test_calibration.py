@@ -31,9 +31,9 @@ from camera.calibration.model import (
     free_span,
     is_possible,
     project_points,
-    rotation_of,
 )
 from camera.errors import CalibrationError
+from camera.rotations import rotation_of
 from camera.uncertainty import (
     intrinsics_of,
     projection_sigma,

@@ -18,11 +18,12 @@ from camera.calibration.adjustment import Estimate, fit_points
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.command import camera_of, report_text
 from camera.calibration.consensus import demand_different_views
-from camera.calibration.model import CalibrationSettings, rotation_of
+from camera.calibration.model import CalibrationSettings
 from camera.calibration.pictures import pictures
 from camera.cli import main
 from camera.errors import CalibrationError
 from camera.options import Calibrate
+from camera.rotations import rotation_of
 from camera.uncertainty import UNPOSED, covariance_of, intrinsics_of
 from redetect.array_types import FloatArray
 from tests.camera.conftest import BOARD, CAMERA

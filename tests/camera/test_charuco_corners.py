@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.boards.board import Board
 from camera.boards.charuco import find_charuco
-from camera.calibration.model import rotation_of
 from camera.errors import CalibrationError
+from camera.rotations import rotation_of
 from redetect.array_types import FloatArray
 from tools.evaluation.boards import rays_of, render_board
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from camera import Camera, CameraError
 from camera.calibration.floor import place_on_floor, placed_camera
-from camera.calibration.model import COUNT, rotation_of
+from camera.calibration.model import COUNT
 from camera.camfile import format_camera, parse_camera
 from camera.model import PARAMETERS
+from camera.rotations import rotation_of
 from camera.uncertainty import (
     covariance_of,
     floor_by_parameters,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from camera.calibration.model import rotation_of
+from camera.rotations import rotation_of
 from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
 from redetect.slam.errors import SlamError

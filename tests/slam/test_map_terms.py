@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from camera.calibration.model import left_jacobian, rotation_of
+from camera.rotations import left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines

@@ -10,7 +10,8 @@ from tyro.conf import Positional
 
 from camera import Camera, read_camera
 from camera.boards.board import Board
-from camera.calibration.model import cross_matrices, project_points, rotation_of
+from camera.calibration.model import project_points
+from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError

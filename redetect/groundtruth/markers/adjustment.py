@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from camera.calibration.model import cross_matrices
+from camera.rotations import cross_matrices
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.trajectories.transforms import (

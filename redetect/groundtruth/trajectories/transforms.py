@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from camera.calibration.model import cross_matrices, left_jacobian, rotation_of
+from camera.rotations import cross_matrices, left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 
 

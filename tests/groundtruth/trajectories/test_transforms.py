@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from camera.calibration.model import cross_matrices
+from camera.rotations import cross_matrices
 from redetect.groundtruth.trajectories.transforms import (
     adjoint,
     apply,
