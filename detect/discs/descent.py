@@ -41,7 +41,7 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.patch import CHORDS_ALONG_V, EDGE, PATCH, SECTORS, FitSettings, Gathered
+from detect.discs.patch import CAPACITY, CHORDS_ALONG_V, EDGE, PATCH, SECTORS, FitSettings, Gathered
 from redetect.compiled import kernel
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
@@ -74,6 +74,7 @@ WORK = np.dtype(
         ("values", np.float64, UNKNOWNS),
         ("bare", np.float64, UNKNOWNS),
         ("sector_sums", np.float32, (SECTORS + 1, 8)),
+        ("by_sector", np.float32, (9, CAPACITY)),  # see `detect.discs.placing`
     ]
 )
 

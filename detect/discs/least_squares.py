@@ -35,7 +35,7 @@ from detect.discs.model import (
     Blur,
     Disc,
 )
-from detect.discs.patch import SECTORS
+from detect.discs.patch import SECTORS, sector_of
 from redetect.compiled import kernel
 
 #: Terms of the background, and unknowns of a step.
@@ -48,8 +48,6 @@ _MIDDLE = 0.3
 _LEAST_PIXELS, _LEAST_SPREAD = 3.0, 0.15
 #: A step is good if it has this much of the size of the whole disc's.
 _GOOD_STEP = 0.4
-# Where the sectors of a quadrant meet.
-_TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
 
 FloatArray = NDArray[np.float64]
 
@@ -221,12 +219,8 @@ def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
     for i in range(n):
         x = design[PLANE_X, i] - x0
         y = design[PLANE_Y, i] - y0
-        ax, ay = abs(x), abs(y)
-        k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
-        k = np.int32(7) - k if x < F32(0.0) else k
-        k = np.int32(15) - k if y < F32(0.0) else k
         counts = (design[ONE, i] > F32(0.0)) & (x * x + y * y >= middle)
-        patch.sector[i] = k if counts else np.int32(SECTORS)
+        patch.sector[i] = sector_of(x, y) if counts else np.int32(SECTORS)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

@@ -60,8 +60,11 @@ PATCH = np.dtype(
     ]
 )  # fmt: skip
 
-#: Sectors of a disc and what is about it.
+#: Sectors of a disc and what is about it, and where those of a quadrant meet.
 SECTORS = 16
+_TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
+#: Where pixels are sorted by sector, each has a multiple of so many.
+_SECTOR_WHOLE = 8
 
 #: By which formula discs are seen, and along which axis their chords run: see `detect.discs.model`.
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
@@ -256,7 +259,16 @@ def gather_by_sector(
     return Gathered(shape, padded(count), count)
 
 
-@kernel()
+@kernel(forceinline=True)
+def sector_of(x: float, y: float) -> int:
+    """In which sector a place is, relative to the disc's centre: from x to y."""
+    ax, ay = abs(x), abs(y)
+    k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
+    k = np.int32(7) - k if x < F32(0.0) else k
+    return np.int32(15) - k if y < F32(0.0) else k
+
+
+@kernel(fastmath=FASTMATH)
 def _sort_by_sector(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
@@ -266,27 +278,35 @@ def _sort_by_sector(
     patch: Any,
     ends: NDArray[np.int64],
 ) -> int:
-    """Sort pixels by sector, and leave out those that are not between the distances."""
+    """Sort pixels by sector, and leave out those that are not between the distances.
+
+    Sectors are filled up to whole numbers of pixels with more of the same, of no weight.
+    """
     floor, pixel = floor_xy.reshape(-1, 2), patch.pixel[:count].copy()
-    x0 = floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x
-    y0 = floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y
-    per_radius, per_sector = 1.0 / (candidate.radius * start.radius), SECTORS / (2.0 * math.pi)
-    ends.fill(0)
+    x0 = F32(floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x)
+    y0 = F32(floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y)
+    radius = candidate.radius * start.radius
+    nearest_2, farthest_2 = F32((between[0] * radius) ** 2), F32((between[1] * radius) ** 2)
     for i in range(count):
-        x, y = floor[pixel[i], 0] - x0, floor[pixel[i], 1] - y0
-        r = math.sqrt(x * x + y * y) * per_radius
-        patch.sector[i] = SECTORS
-        if between[0] <= r <= between[1]:
-            patch.sector[i] = math.floor(math.atan2(y, x) * per_sector) % SECTORS
-            ends[patch.sector[i] + 1] += 1
+        x, y = floor[np.uint64(pixel[i]), 0] - x0, floor[np.uint64(pixel[i]), 1] - y0
+        r_2 = x * x + y * y
+        fitted = (r_2 >= nearest_2) & (r_2 <= farthest_2)
+        patch.sector[i] = sector_of(x, y) if fitted else np.int32(SECTORS)
+    pixels = np.zeros(SECTORS + 1, np.int64)
+    for i in range(count):
+        pixels[patch.sector[i]] += 1
+    ends[0] = 0
     for s in range(SECTORS):
-        ends[s + 1] += ends[s]
+        ends[s + 1] = ends[s] + (pixels[s] + _SECTOR_WHOLE - 1) // _SECTOR_WHOLE * _SECTOR_WHOLE
     following = ends.copy()
     for i in range(count):
         s = patch.sector[i]
-        if s < SECTORS:
-            patch.pixel[following[s]] = pixel[i]
-            following[s] += 1
+        patch.pixel[following[s]] = pixel[i]
+        patch.weight[following[s]] = 1.0
+        following[s] += s < SECTORS
+    for s in range(SECTORS):
+        for i in range(following[s], ends[s + 1]):
+            patch.pixel[i], patch.weight[i] = patch.pixel[ends[s]], 0.0
     return int(ends[SECTORS])
 
 
@@ -340,7 +360,7 @@ def _choose(
         if look:
             begin, step, turn, between = begin + turn, every, 0, 0
         length = (v * width + last_u - begin) // step + 1
-        if count + length > CAPACITY:
+        if count + length > CAPACITY - SECTORS * _SECTOR_WHOLE:
             break
         if look:
             for k in range(length):

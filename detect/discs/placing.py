@@ -108,6 +108,9 @@ _LEAST_WHOLE = 3
 _OUTSIDE, _RAMP, _CONTRAST, _BLUR_1, _BLUR_2, _RADIUS, _X, _Y, _GREY = range(9)
 _TERMS = 9
 
+_MIDDLES = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
+_COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
+
 
 class Start(NamedTuple):
     """Where a fit starts; lengths in metres."""
@@ -131,7 +134,7 @@ class Sectors(NamedTuple):
     """What each sector says."""
 
     products: FloatArray
-    """(SECTORS, 9, 9) normal equations: lower halves; levels and ramp are eliminated."""
+    """(9, 9, SECTORS) normal equations: lower halves; levels and ramp are eliminated."""
     contrast: FloatArray
     """(SECTORS,) grey levels; 0 where there is no edge to be seen."""
     variance: FloatArray
@@ -152,16 +155,20 @@ class Placed(NamedTuple):
 
 
 @kernel()
-def eliminate(matrix: FloatArray, k: int) -> None:
+def eliminate(matrices: FloatArray, k: int) -> None:
     """Eliminate unknown k from the later ones of normal equations, of which the lower half is used.
 
-    What is left of the products is that of what the eliminated unknowns leave of all others.
+    `matrices` are (T, T, S), S of them at a time. What is left of the products is that of what the
+    eliminated unknowns leave of all others; an unknown that nothing depends on leaves all.
     """
-    per_pivot = 1.0 / matrix[k, k]
-    for i in range(k + 1, len(matrix)):
-        share = matrix[i, k] * per_pivot
+    terms, _, count = matrices.shape
+    per_pivot = np.empty(count)
+    for s in range(count):
+        per_pivot[s] = 1.0 / matrices[k, k, s] if matrices[k, k, s] > 0.0 else 0.0
+    for i in range(k + 1, terms):
         for j in range(k + 1, i + 1):
-            matrix[i, j] -= share * matrix[j, k]
+            for s in range(count):
+                matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
 
 
 @kernel()
@@ -189,35 +196,37 @@ def place_by_sectors(scene: Scene, radius: float, start: Start, work: Any, resul
     gathered = gather_by_sector(
         scene.image, scene.floor_xy, candidate, settings, begin, (_NEAREST, _FARTHEST), patch, ends
     )
-    rows = np.empty((_TERMS, gathered.n), np.float32)
     per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
     level = float(scene.image[candidate.v, candidate.u])
     expected = Edge(0.0, 0.0, 1.0, blur_of(gathered.shape, given.blur_px, given.blur_ratio))
     blur = blur_of(gathered.shape, start.blur_px, given.blur_ratio)
-    edge, normal = Edge(begin.x, begin.y, begin.radius, blur), np.zeros((_TERMS, _TERMS))
+    edge, normal = Edge(begin.x, begin.y, begin.radius, blur), np.zeros((_TERMS, _TERMS, 1))
     sectors = Sectors(
-        np.zeros((SECTORS, _TERMS, _TERMS)), np.zeros(SECTORS), np.zeros(SECTORS),
+        np.zeros((_TERMS, _TERMS, SECTORS)), np.zeros(SECTORS), np.zeros(SECTORS),
         np.zeros(SECTORS), np.zeros(SECTORS),
     )  # fmt: skip
+    movement = np.zeros(_TERMS)
     for step in range(_STEPS):
         disc = Disc(edge.x, edge.y, edge.radius, 0.0)
         if gathered.shape == EDGE:
             edge_shares(patch, gathered.n, disc, edge.blur)
         else:
             chord_shares(patch, gathered.n, disc, edge.blur)
-        _write_rows(patch, gathered.n, edge, level, rows)
-        _multiply(rows, ends, sectors.products)
+        _write_rows(patch, gathered.n, edge, level, work.by_sector)
+        _multiply(work.by_sector, ends, sectors.products)
         _eliminate_levels(sectors, per_pixel, settings.noise)
         if _weigh(sectors, step < _EARLY, settings.noise) < _LEAST_SECTORS:
             return Placed(False, given.blur_ratio)
         _add_up(sectors, edge, expected, settings, normal)
-        if step == _STEPS - 1 or (step > _EARLY and _is_short(normal.copy())):
+        _solve(normal.copy(), movement)
+        is_short = math.hypot(movement[_X], movement[_Y]) < _ARRIVED
+        if step == _STEPS - 1 or (step > _EARLY and is_short):
             break
-        edge = _moved(edge, normal)
+        edge = _moved(edge, movement)
     ratio = edge.blur.second / edge.blur.first
     ratio = 1.0 / ratio if gathered.shape == CHORDS_ALONG_V else ratio
-    (x, y), (xx, xy, yy) = _centre_and_covariance(sectors, normal)
-    x, y = edge.x + x, edge.y + y
+    x, y = edge.x + movement[_X], edge.y + movement[_Y]
+    xx, xy, yy = _covariance(sectors, normal)
     near = math.hypot(x - begin.x, y - begin.y) <= _MOST_OFF
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
         return Placed(False, ratio)
@@ -248,33 +257,41 @@ def _write_rows(patch: Any, n: int, edge: Edge, level: float, rows: NDArray[np.f
     x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
     for i in range(n):
         x, y = patch.x[i] - x0, patch.y[i] - y0
-        rows[_OUTSIDE, i] = F32(1.0)
+        weight = patch.weight[i]
+        rows[_OUTSIDE, i] = weight
         # Light that changes across the edge changes what either side gives back of it.
-        rows[_RAMP, i] = (math.sqrt(x * x + y * y) - r0) * (design[GREY, i] - black)
-        rows[_CONTRAST, i] = design[SHARE, i]
+        rows[_RAMP, i] = weight * (math.sqrt(x * x + y * y) - r0) * (design[GREY, i] - black)
+        rows[_CONTRAST, i] = weight * design[SHARE, i]
         # Which part of the blur across the edge is along the first axis.
         g_1 = patch.x1[i] * x + patch.y1[i] * y
         g_2 = patch.x2[i] * x + patch.y2[i] * y
         by_1, by_2 = variance_1 * g_1 * g_1, variance_2 * g_2 * g_2
         part = by_1 / (by_1 + by_2 + F32(1e-12))
-        rows[_BLUR_1, i] = part * design[BY_BLUR, i]
-        rows[_BLUR_2, i] = (F32(1.0) - part) * design[BY_BLUR, i]
-        rows[_RADIUS, i] = design[BY_RADIUS, i]
-        rows[_X, i] = design[BY_X, i]
-        rows[_Y, i] = design[BY_Y, i]
-        rows[_GREY, i] = design[GREY, i]
+        rows[_BLUR_1, i] = weight * part * design[BY_BLUR, i]
+        rows[_BLUR_2, i] = weight * (F32(1.0) - part) * design[BY_BLUR, i]
+        rows[_RADIUS, i] = weight * design[BY_RADIUS, i]
+        rows[_X, i] = weight * design[BY_X, i]
+        rows[_Y, i] = weight * design[BY_Y, i]
+        rows[_GREY, i] = weight * design[GREY, i]
 
 
 @kernel(fastmath=FASTMATH)
 def _multiply(rows: NDArray[np.float32], ends: NDArray[np.int64], products: FloatArray) -> None:
     """Sums of products of rows in each sector, lower halves."""
     for s in range(SECTORS):
-        for a in range(_TERMS):
-            for b in range(a + 1):
-                total = F32(0.0)
-                for i in range(ends[s], ends[s + 1]):
-                    total += rows[a, i] * rows[b, i]
-                products[s, a, b] = total
+        # Three by three at a time: each value that is loaded is used three times.
+        for a in range(0, _TERMS, 3):
+            for b in range(0, a + 1, 3):
+                s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = F32(0.0)
+                for i in range(np.uint64(ends[s]), np.uint64(ends[s + 1])):
+                    a0, a1, a2 = rows[a, i], rows[a + 1, i], rows[a + 2, i]
+                    b0, b1, b2 = rows[b, i], rows[b + 1, i], rows[b + 2, i]
+                    s00, s01, s02 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2
+                    s10, s11, s12 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2
+                    s20, s21, s22 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2
+                for j, row in enumerate(((s00, s01, s02), (s10, s11, s12), (s20, s21, s22))):
+                    for k, total in enumerate(row):
+                        products[a + j, b + k, s] = total
 
 
 @kernel()
@@ -282,28 +299,24 @@ def _eliminate_levels(
     sectors: Sectors, per_pixel: tuple[float, float, float, float], noise: float
 ) -> None:
     """Eliminate levels and ramp of each sector; its contrast, residuals, and where its edge is."""
+    by = sectors.products
     for s in range(SECTORS):
-        of_sector = sectors.products[s]
+        by[_RAMP, _RAMP, s] += (noise / _RAMP_SIGMA) ** 2
+    eliminate(by, _OUTSIDE)
+    spread = by[_CONTRAST, _CONTRAST].copy()
+    for k in range(_RAMP, _BLUR_1):
+        eliminate(by, k)
+    for s in range(SECTORS):
+        pixels = by[_OUTSIDE, _OUTSIDE, s]
         sectors.contrast[s] = 0.0
-        pixels = of_sector[_OUTSIDE, _OUTSIDE]
-        if pixels < _LEAST_PIXELS:
+        if pixels < _LEAST_PIXELS or spread[s] < _LEAST_SPREAD:
             continue
-        of_sector[_RAMP, _RAMP] += (noise / _RAMP_SIGMA) ** 2
-        for k in range(_RAMP):
-            eliminate(of_sector, k)
-        if of_sector[_CONTRAST, _CONTRAST] < _LEAST_SPREAD:
-            continue
-        for k in range(_RAMP, _CONTRAST):
-            eliminate(of_sector, k)
-        contrast = of_sector[_GREY, _CONTRAST] / of_sector[_CONTRAST, _CONTRAST]
-        for k in range(_CONTRAST, _BLUR_1):
-            eliminate(of_sector, k)
+        contrast = by[_GREY, _CONTRAST, s] / by[_CONTRAST, _CONTRAST, s]
         sectors.contrast[s] = contrast
-        sectors.variance[s] = of_sector[_GREY, _GREY] / (pixels - 3.0)
-        angle = 2.0 * math.pi * (s + 0.5) / SECTORS
-        per_u = per_pixel[0] * math.cos(angle) + per_pixel[1] * math.sin(angle)
-        per_v = per_pixel[2] * math.cos(angle) + per_pixel[3] * math.sin(angle)
-        off = of_sector[_GREY, _RADIUS] / (contrast * of_sector[_RADIUS, _RADIUS])
+        sectors.variance[s] = by[_GREY, _GREY, s] / (pixels - 3.0)
+        per_u = per_pixel[0] * _COSINES[s] + per_pixel[1] * _SINES[s]
+        per_v = per_pixel[2] * _COSINES[s] + per_pixel[3] * _SINES[s]
+        off = by[_GREY, _RADIUS, s] / (contrast * by[_RADIUS, _RADIUS, s])
         sectors.off_px[s] = off / math.hypot(per_u, per_v)
 
 
@@ -357,10 +370,19 @@ def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
 def _add_up(
     sectors: Sectors, edge: Edge, expected: Edge, settings: FitSettings, normal: FloatArray
 ) -> None:
-    """The normal equations of the step of the edge, of all sectors and what is expected of it."""
-    normal.fill(0.0)
-    for s in range(SECTORS):
-        _add_sector(sectors, s, 1.0, normal)
+    """The normal equations of the step of the edge, of all sectors and what is expected of it.
+
+    Those of the sectors become what they add: derivatives are by the shares, so times the contrast.
+    """
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            total = 0.0
+            for s in range(SECTORS):
+                contrast = sectors.contrast[s]
+                scale = sectors.weight[s] * contrast * (1.0 if a == _GREY else contrast)
+                sectors.products[a, b, s] *= scale
+                total += sectors.products[a, b, s]
+            normal[a, b, 0] = total
     _expect(normal, _RADIUS, settings.radius_sigma, expected.radius - edge.radius)
     for k, blur, usual in (
         (_BLUR_1, edge.blur.first, expected.blur.first),
@@ -370,50 +392,33 @@ def _add_up(
 
 
 @kernel()
-def _add_sector(sectors: Sectors, s: int, sign: float, normal: FloatArray) -> None:
-    """Add a sector's normal equations; derivatives are by the shares, so times the contrast."""
-    by, contrast = sectors.products[s], sectors.contrast[s]
-    weight = sign * sectors.weight[s]
-    if weight != 0.0:
-        for a in range(_BLUR_1, _GREY):
-            normal[_GREY, a] += weight * contrast * by[_GREY, a]
-            for b in range(_BLUR_1, a + 1):
-                normal[a, b] += weight * contrast * contrast * by[a, b]
-
-
-@kernel()
 def _expect(normal: FloatArray, k: int, sigma: float, off: float) -> None:
-    normal[k, k] += 1.0 / sigma**2
-    normal[_GREY, k] += off / sigma**2
+    normal[k, k, 0] += 1.0 / sigma**2
+    normal[_GREY, k, 0] += off / sigma**2
+
+
+@kernel(forceinline=True)
+def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre where everything else is eliminated."""
+    xx, xy, yy = normal[_X, _X, s], normal[_Y, _X, s], normal[_Y, _Y, s]
+    per_area = 1.0 / (xx * yy - xy * xy)
+    return per_area * yy, -per_area * xy, per_area * xx
 
 
 @kernel()
-def _centre(normal: FloatArray) -> tuple[tuple[float, float], tuple[float, float, float]]:
-    """The step of the centre, and the inverse (xx, xy, yy); everything else is eliminated."""
-    for k in range(_BLUR_1, _X):
+def _solve(normal: FloatArray, movement: FloatArray) -> None:
+    """Solve the normal equations (9, 9, 1); they are lost."""
+    for k in range(_BLUR_1, _GREY):
         eliminate(normal, k)
-    xx, xy, yy = normal[_X, _X], normal[_Y, _X], normal[_Y, _Y]
-    x, y, per_area = normal[_GREY, _X], normal[_GREY, _Y], 1.0 / (xx * yy - xy * xy)
-    step = per_area * (yy * x - xy * y), per_area * (xx * y - xy * x)
-    return step, (per_area * yy, -per_area * xy, per_area * xx)
-
-
-@kernel()
-def _is_short(normal: FloatArray) -> bool:
-    (x, y), _ = _centre(normal)
-    return math.hypot(x, y) < _ARRIVED
-
-
-@kernel()
-def _moved(edge: Edge, normal: FloatArray) -> Edge:
-    """The edge after the step that solves the normal equations."""
-    step = np.zeros(_TERMS)
-    (step[_X], step[_Y]), _ = _centre(normal)
-    for k in range(_RADIUS, _BLUR_1 - 1, -1):
-        rest = normal[_GREY, k]
+    for k in range(_Y, _BLUR_1 - 1, -1):
+        rest = normal[_GREY, k, 0]
         for i in range(k + 1, _GREY):
-            rest -= normal[i, k] * step[i]
-        step[k] = rest / normal[k, k]
+            rest -= normal[i, k, 0] * movement[i]
+        movement[k] = rest / normal[k, k, 0]
+
+
+@kernel()
+def _moved(edge: Edge, step: FloatArray) -> Edge:
     return Edge(
         edge.x + _within(step[_X], _LONGEST),
         edge.y + _within(step[_Y], _LONGEST),
@@ -433,27 +438,34 @@ def _scaled(blur: float, step: float) -> float:
 
 
 @kernel()
-def _centre_and_covariance(
-    sectors: Sectors, normal: FloatArray
-) -> tuple[tuple[float, float], tuple[float, float, float]]:
-    """Step of the centre, and covariance (xx, xy, yy) by leaving out neighbouring sectors."""
-    others = np.empty((SECTORS, 2))
+def _covariance(sectors: Sectors, normal: FloatArray) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors."""
+    some = np.empty((_TERMS, _TERMS, SECTORS))
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            for s in range(SECTORS):
+                some[a, b, s] = normal[a, b, 0]
+                for k in range(_STRETCH):
+                    some[a, b, s] -= sectors.products[a, b, (s + k) % SECTORS]
+    for k in range(_BLUR_1, _X):
+        eliminate(some, k)
+        eliminate(normal, k)
+    centres = np.empty((SECTORS, 2))
     mean_x = mean_y = 0.0
     count = 0
     for s in range(SECTORS):
-        some = normal.copy()
-        for k in range(_STRETCH):
-            _add_sector(sectors, (s + k) % SECTORS, -1.0, some)
-        (others[s, 0], others[s, 1]), _ = _centre(some)
-        mean_x, mean_y = mean_x + others[s, 0] / SECTORS, mean_y + others[s, 1] / SECTORS
+        xx, xy, yy = _inverse(some, s)
+        x, y = some[_GREY, _X, s], some[_GREY, _Y, s]
+        centres[s, 0], centres[s, 1] = xx * x + xy * y, xy * x + yy * y
+        mean_x, mean_y = mean_x + centres[s, 0] / SECTORS, mean_y + centres[s, 1] / SECTORS
         count += sectors.weight[s] > 0.0
     xx = xy = yy = 0.0
     for s in range(SECTORS):
-        x, y = others[s, 0] - mean_x, others[s, 1] - mean_y
+        x, y = centres[s, 0] - mean_x, centres[s, 1] - mean_y
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-    centre, (noise_xx, noise_xy, noise_yy) = _centre(normal)
+    noise_xx, noise_xy, noise_yy = _inverse(normal, 0)
     scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
-    return centre, (scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy)
+    return scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy
 
 
 @kernel(inline="always")
