@@ -260,10 +260,10 @@ def gather_by_sector(
 
 
 @kernel(forceinline=True)
-def sector_of(x: float, y: float) -> int:
-    """In which sector a place is, relative to the disc's centre: from x to y."""
+def sector_of(x: float, y: float) -> Any:
+    """(int32) In which sector a place is, relative to the disc's centre: from x to y."""
     ax, ay = abs(x), abs(y)
-    k = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
+    k: Any = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
     k = np.int32(7) - k if x < F32(0.0) else k
     return np.int32(15) - k if y < F32(0.0) else k
 

@@ -116,15 +116,16 @@ def test_movement_leaves_a_disc_in_its_place_and_its_covariance_right(
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7))
 def test_elimination_leaves_what_the_eliminated_do_not_explain(seed: int, eliminated: int) -> None:
-    rows = np.random.default_rng(seed).normal(size=(30, 8))
-    products = rows.T @ rows
+    several = np.random.default_rng(seed).normal(size=(3, 30, 8))
+    products = np.stack([rows.T @ rows for rows in several], axis=-1)
     for k in range(eliminated):
         eliminate(products, k)
-    first, later = rows[:, :eliminated], rows[:, eliminated:]
-    left = later - first @ np.linalg.lstsq(first, later, rcond=None)[0]
-    np.testing.assert_allclose(
-        np.tril(products[eliminated:, eliminated:]), np.tril(left.T @ left), rtol=1e-8, atol=1e-8
-    )
+    for rows, rest in zip(several, np.moveaxis(products, -1, 0), strict=True):
+        first, later = rows[:, :eliminated], rows[:, eliminated:]
+        left = later - first @ np.linalg.lstsq(first, later, rcond=None)[0]
+        np.testing.assert_allclose(
+            np.tril(rest[eliminated:, eliminated:]), np.tril(left.T @ left), rtol=1e-8, atol=1e-8
+        )
 
 
 def test_a_circle_of_another_size_needs_more_points() -> None:
