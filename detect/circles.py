@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima
+from detect.discs.evidence import lost_by_paleness
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.placing import place_all
@@ -28,7 +29,7 @@ from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
-from detect.discs.search import DiscSearch, FoundDiscs, Scene, search_discs
+from detect.discs.search import SURE_EVIDENCE, DiscSearch, FoundDiscs, Scene, search_discs
 from detect.discs.second_look import NO_LOOKS, SecondLooks, Sought, second_looks
 from detect.errors import FrameError
 from detect.grey_values import blank_margins, estimate_noise
@@ -54,9 +55,9 @@ _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where the polarity is
 #: stated.
 _DOUBTFUL = 1.0
-#: Where it is not, it is that of the discs of this evidence, if they are at least so many and all
-#: alike; a second look at the best candidates needs these log-odds more then.
-_CLEAR, _LEAST_CLEAR, _BEST, _UNSTATED = 4.0, 2, 20, 2.0
+#: Where it is not, it is that of the sure discs, if they are at least so many and all alike; a second
+#: look at the best candidates needs these log-odds more then.
+_LEAST_SURE, _BEST, _UNSTATED = 2, 60, 0.75
 
 
 @dataclass(frozen=True)
@@ -152,11 +153,15 @@ def _with_fit(
     more = second_look(image, camera, table, settings, first)
     discs = SecondLooks(*(values[more.log_odds >= 0.0] for values in more))
     if len(discs.step):
-        placed = place_all(first.scene, found.radius, discs, working_space())
-        more_xy, more_covariance = fitted_positions(placed)
-        last = [camera.width - 1, camera.height - 1]
-        more_pixels = np.clip(np.rint(camera.project_floor(more_xy)), 0, last).astype(np.int64)
-        pixels = np.concatenate([pixels, more_pixels])
+        more_xy, more_covariance = fitted_positions(
+            place_all(first.scene, found.radius, discs, working_space())
+        )
+        seen_at = np.rint(camera.project_floor(more_xy))
+        # Of a disc whose centre is out of sight too little is seen to say where it is.
+        in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
+        discs = SecondLooks(*(values[in_sight] for values in discs))
+        more_xy, more_covariance = more_xy[in_sight], more_covariance[in_sight]
+        pixels = np.concatenate([pixels, seen_at[in_sight].astype(np.int64)])
         order = np.argsort(pixels[:, 1] * image.shape[1] + pixels[:, 0], kind="stable")
         pixels = pixels[order]
         found_quality = np.concatenate([found_quality, discs.quality])[order]
@@ -212,18 +217,27 @@ def second_look(
     """
     if not (settings.verify and settings.refine):
         return NO_LOOKS
+    found, centres = first.found, first.centres
+    sure = found.evidence >= SURE_EVIDENCE
+    contrast = centres.contrast[found.centre]
     most, less = None, 0.0
     if settings.polarity == "any":
-        contrast = first.centres.contrast[first.found.centre]
-        contrast = contrast[first.found.evidence >= _CLEAR]
-        if len(contrast) < _LEAST_CLEAR or (np.sign(contrast) != np.sign(contrast[0])).any():
+        signs = np.sign(contrast[sure])
+        if len(signs) < _LEAST_SURE or (signs != signs[0]).any():
             return NO_LOOKS
-        settings = replace(settings, polarity="light" if contrast[0] > 0.0 else "dark")
+        settings = replace(settings, polarity="light" if signs[0] > 0.0 else "dark")
         most, less = _BEST, _UNSTATED
     candidates = candidates_at(image, camera, table, settings, first.noise)
     best = HoughCandidates(candidates.floor_xy[:most], candidates.score[:most])
-    looks = second_looks_at(image, camera, settings, best, first.found.floor_xy, first.noise)
-    return looks._replace(log_odds=looks.log_odds - less)
+    looks = second_looks_at(image, camera, settings, best, found.floor_xy, first.noise)
+    u, v = centres.pixels[found.centre].T
+    count = len(looks.step)
+    lost = lost_by_paleness(
+        np.concatenate([contrast, looks.step]),
+        np.concatenate([image[v, u] - contrast, looks.floor_grey]),
+        np.concatenate([sure, np.zeros(count, np.bool_)]),
+    )
+    return looks._replace(log_odds=looks.log_odds - less - lost[len(sure) :])
 
 
 def candidates_at(

@@ -12,7 +12,10 @@ from __future__ import annotations
 
 import math
 
-from detect.discs.rim import Rim
+import numpy as np
+from numpy.typing import NDArray
+
+from detect.discs.rim import Rim, median
 from redetect.compiled import kernel
 
 #: What no disc's fit violates: radius relative to the nominal one, explained variance, and the
@@ -78,6 +81,10 @@ RIM_RADIUS_RANGE = (0.83, 1.12)
 RIM_RADIUS = 0.95
 #: A rim is even whose step varies by less than this over the directions, relative to its mean.
 _EVEN = 0.3
+#: A disc of less than this share of the others' contrast is pale, and what it loses for each factor
+#: of e, log-odds; the least number of others, and the least grey value that a ratio is taken of.
+_PALE, _PER_FACTOR = 0.5, 4.0
+_LEAST_OTHERS, _DARKEST = 2, 5.0
 
 
 @kernel()
@@ -119,3 +126,47 @@ def evidence_with_rim(
 def _log_odds(share: float) -> float:
     bounded = min(max(share, 0.003), 0.997)
     return math.log(bounded / (1.0 - bounded))
+
+
+@kernel()
+def lost_by_paleness(
+    contrast: NDArray[np.float64], floor_grey: NDArray[np.float64], clear: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Log-odds that discs of an image lose because they are paler than its clear discs.
+
+    Discs of one place are mostly painted alike. What has much less contrast than the clear discs is
+    mostly the reflection of one in a polished floor or in glass. In shadow a disc has less contrast,
+    too, but its ratio to the floor stays what it is elsewhere: that speaks for it.
+
+    Parameters
+    ----------
+    contrast, floor_grey : (N,) float64
+        Grey levels: of each disc less its floor, and of the floor.
+    clear : (N,) bool
+        Which discs are certain; each is compared with the others of its sign, if they are two.
+
+    Returns
+    -------
+    (N,) float64
+        0 or more.
+    """
+    count = len(contrast)
+    ratio, lost = np.empty(count), np.zeros(count)
+    contrasts, ratios = np.empty(count), np.empty(count)
+    for k in range(count):
+        disc, floor = floor_grey[k] + contrast[k], floor_grey[k]
+        ratio[k] = abs(math.log(max(disc, _DARKEST) / max(floor, _DARKEST)))
+    for k in range(count):
+        others = 0
+        for j in range(count):
+            if clear[j] and j != k and contrast[j] * contrast[k] > 0.0:
+                contrasts[others], ratios[others] = abs(contrast[j]), ratio[j]
+                others += 1
+        if others >= _LEAST_OTHERS:
+            paleness = max(
+                abs(contrast[k]) / (_PALE * median(contrasts[:others])),
+                ratio[k] / max(median(ratios[:others]), 1e-3),
+                1e-3,
+            )
+            lost[k] = _PER_FACTOR * max(-math.log(paleness), 0.0)
+    return lost

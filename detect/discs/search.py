@@ -18,6 +18,7 @@ from detect.discs.evidence import (
     RADIUS_RANGE,
     evidence_of,
     evidence_with_rim,
+    lost_by_paleness,
 )
 from detect.discs.fit import RESULT, fit_disc, working_space
 from detect.discs.model import Disc
@@ -39,6 +40,8 @@ _CLEAR = 6.0
 _WITHIN = 0.75
 #: Looks that came to places nearer than this share of the separation are at the same disc.
 _SAME_DISC = 0.3
+#: Discs of this much more than the required evidence are sure: others are compared with them.
+SURE_EVIDENCE = 4.0
 #: In place of an evidence of minus infinity, where nothing is verified.
 _NO_EVIDENCE = -1e9
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
@@ -105,8 +108,9 @@ FATES = (
     "elsewhere",
     "beside a better disc",
     "of the rarer sign",
+    "pale",
 )
-_DISC, _IN_CLEAR, _FEW_STEPS, _LOOK, _SAME, _EVIDENCE, _ELSEWHERE, _BESIDE, _RARE = range(
+_DISC, _IN_CLEAR, _FEW_STEPS, _LOOK, _SAME, _EVIDENCE, _ELSEWHERE, _BESIDE, _RARE, _PALE = range(
     len(FATES)
 )
 
@@ -265,6 +269,8 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
     fate[best] = _RARE
     if search.verify:
         best = of_likely_sign(best, results.contrast, evidence, search.least_evidence)
+        fate[best] = _PALE
+        best = _not_pale(image, centres, keep, best, evidence, search.least_evidence)
     fate[best] = _DISC
     # In scan order, as the centres are: by insertion, for these are few.
     for i in range(1, len(best)):
@@ -340,6 +346,34 @@ def of_likely_sign(
             kept[count] = k
             count += 1
     return kept[:count]
+
+
+@kernel()
+def _not_pale(
+    image: NDArray[np.uint8],
+    centres: Centres,
+    keep: NDArray[np.int64],
+    found: NDArray[np.int64],
+    evidence: NDArray[np.float64],
+    least_evidence: float,
+) -> NDArray[np.int64]:
+    """Those discs that have evidence enough for how pale they are."""
+    count = len(found)
+    contrast, floor_grey = np.empty(count), np.empty(count)
+    clear = np.empty(count, np.bool_)
+    for i in range(count):
+        centre = keep[found[i]]
+        u, v = centres.pixels[centre, 0], centres.pixels[centre, 1]
+        contrast[i] = centres.contrast[centre]
+        floor_grey[i] = image[v, u] - contrast[i]
+        clear[i] = evidence[found[i]] >= least_evidence + SURE_EVIDENCE
+    lost = lost_by_paleness(contrast, floor_grey, clear)
+    kept, n = np.empty(count, np.int64), 0
+    for i in range(count):
+        if evidence[found[i]] - lost[i] >= least_evidence:
+            kept[n] = found[i]
+            n += 1
+    return kept[:n]
 
 
 @kernel(forceinline=True)

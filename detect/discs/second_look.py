@@ -85,8 +85,10 @@ class SecondLooks(NamedTuple):
         from the other start, metres.
     step : (N,) float64
         Of the grey value at the rim, inside minus outside.
+    floor_grey : (N,) float64
+        Mean grey value of the floor round it.
     quality : (N,) float64
-        Otsu's, of the disc and the floor round its rim.
+        Otsu's, of the disc and that floor.
     log_odds : (N,) float64
         That it is a disc; above 0 it is taken for one.
     """
@@ -96,11 +98,12 @@ class SecondLooks(NamedTuple):
     seen_from: FloatArray
     doubt: FloatArray
     step: FloatArray
+    floor_grey: FloatArray
     quality: FloatArray
     log_odds: FloatArray
 
 
-NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((3, 0, 2)), *np.empty((3, 0)))
+NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((3, 0, 2)), *np.empty((4, 0)))
 
 
 def second_looks(
@@ -141,7 +144,8 @@ def _look_at_all(
     n = len(candidates.score)
     features, place = np.empty((n, len(FEATURES))), np.empty((n, 2))
     seen_from, doubt = np.empty((n, 2)), np.empty((n, 2))
-    step, quality, log_odds, noted = np.empty(n), np.empty(n), np.empty(n), np.empty(len(FEATURES))
+    step, floor_grey, quality, log_odds = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    noted = np.empty(len(FEATURES))
     count = 0
     for i in range(n):
         x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
@@ -179,14 +183,15 @@ def _look_at_all(
             for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
                 features[count, k] = noted[k]
             log_odds[count] = odds
-            step[count], quality[count] = rim.step, _quality(grey)
+            step[count] = rim.step
+            quality[count], floor_grey[count] = _quality(grey)
             place[count, 0], place[count, 1] = rim.x, rim.y
             seen_from[count, 0], seen_from[count, 1] = from_x, from_y
             doubt[count, 0], doubt[count, 1] = again.x - first.x, again.y - first.y
         count += is_new
     return SecondLooks(
         features[:count], place[:count], seen_from[:count], doubt[:count], step[:count],
-        quality[:count], log_odds[:count],
+        floor_grey[:count], quality[:count], log_odds[:count],
     )  # fmt: skip
 
 
@@ -260,16 +265,17 @@ def _contrast(grey: FloatArray, sought: Sought) -> float:
 
 
 @kernel()
-def _quality(grey: FloatArray) -> float:
-    """Between-class over total variance of the grey values inside and outside."""
+def _quality(grey: FloatArray) -> tuple[float, float]:
+    """Between-class over total variance of the grey values inside and outside; mean outside."""
     inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
     seen = np.isfinite(inside) & np.isfinite(outside)
     inside, outside = inside[seen], outside[seen]
     if len(inside) == 0:
-        return 0.0
-    between = 0.25 * (np.mean(inside) - np.mean(outside)) ** 2
+        return 0.0, 0.0
+    floor_grey = np.mean(outside)
+    between = 0.25 * (np.mean(inside) - floor_grey) ** 2
     total = between + 0.5 * (np.var(inside) + np.var(outside))
-    return float(between / total) if total > 0.0 else 0.0
+    return (float(between / total) if total > 0.0 else 0.0), float(floor_grey)
 
 
 @kernel()

@@ -40,7 +40,7 @@ from lut import DiscTable, build_disc_table, cached_disc_table
 FloatArray = NDArray[np.float64]
 Stage = Literal[
     "disc", "quality", "polarity", "contrast", "few steps", "first look", "evidence", "elsewhere",
-    "beside a better disc", "of the rarer sign", "second look",
+    "beside a better disc", "of the rarer sign", "pale", "second look",
 ]  # fmt: skip
 
 #: Centres of at least this share of the least quality are candidates: anywhere, or near a place.
@@ -91,6 +91,7 @@ class Candidate(NamedTuple):
             else f"evidence {value} is less than {limit} (--evidence)",
             "elsewhere": "the fit wandered to something else",
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
+            "pale": f"evidence {value}, and much less contrast than the other discs",
             "of the rarer sign": f"evidence {value}, and nearly all discs are of the other sign",
             "second look": f"log-odds {value} by its rim, {limit} expected",
         }[self.stage]

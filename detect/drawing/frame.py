@@ -319,6 +319,7 @@ _STAGE_COLOURS: dict[str, Colour] = {
     "elsewhere": (200, 0, 200),
     "beside a better disc": (60, 120, 60),
     "of the rarer sign": (160, 80, 200),
+    "pale": (200, 160, 160),
     "second look": (0, 200, 255),
 }
 
