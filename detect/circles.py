@@ -55,8 +55,8 @@ _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where the polarity is
 #: stated.
 _DOUBTFUL = 1.0
-#: Where it is not, it is that of the sure discs, if they are at least so many and all alike; a second
-#: look at the best candidates needs these log-odds more then.
+#: Where it is not, it is that of the sure discs, if they are at least so many and all alike; the
+#: second look is at the best candidates then, which need these log-odds more.
 _LEAST_SURE, _BEST, _UNSTATED = 2, 60, 0.75
 
 
@@ -212,32 +212,32 @@ def second_look(
 ) -> SecondLooks:  # fmt: skip
     """Look again where the first look found no disc; other parameters as of `detect_circles`.
 
-    Candidates by edges have a sign. Where none is stated, that of the clear discs is taken, for
-    discs of one place are mostly alike; where these differ, or are few, there is no second look.
+    Candidates by edges have a sign. Where none is stated, that of the sure discs is taken, for
+    discs of one place are mostly alike: only the best candidates are looked at then, and pale ones
+    count for less. Where the signs of the sure discs differ, or these are few, there is no second
+    look.
     """
     if not (settings.verify and settings.refine):
         return NO_LOOKS
     found, centres = first.found, first.centres
-    sure = found.evidence >= SURE_EVIDENCE
-    contrast = centres.contrast[found.centre]
-    most, less = None, 0.0
-    if settings.polarity == "any":
-        signs = np.sign(contrast[sure])
-        if len(signs) < _LEAST_SURE or (signs != signs[0]).any():
-            return NO_LOOKS
-        settings = replace(settings, polarity="light" if signs[0] > 0.0 else "dark")
-        most, less = _BEST, _UNSTATED
+    if settings.polarity != "any":
+        candidates = candidates_at(image, camera, table, settings, first.noise)
+        return second_looks_at(image, camera, settings, candidates, found.floor_xy, first.noise)
+    contrast, sure = centres.contrast[found.centre], found.evidence >= SURE_EVIDENCE
+    signs = np.sign(contrast[sure])
+    if len(signs) < _LEAST_SURE or (signs != signs[0]).any():
+        return NO_LOOKS
+    settings = replace(settings, polarity="light" if signs[0] > 0.0 else "dark")
     candidates = candidates_at(image, camera, table, settings, first.noise)
-    best = HoughCandidates(candidates.floor_xy[:most], candidates.score[:most])
+    best = HoughCandidates(candidates.floor_xy[:_BEST], candidates.score[:_BEST])
     looks = second_looks_at(image, camera, settings, best, found.floor_xy, first.noise)
     u, v = centres.pixels[found.centre].T
-    count = len(looks.step)
     lost = lost_by_paleness(
         np.concatenate([contrast, looks.step]),
         np.concatenate([image[v, u] - contrast, looks.floor_grey]),
-        np.concatenate([sure, np.zeros(count, np.bool_)]),
+        np.concatenate([sure, np.zeros(len(looks.step), np.bool_)]),
     )
-    return looks._replace(log_odds=looks.log_odds - less - lost[len(sure) :])
+    return looks._replace(log_odds=looks.log_odds - _UNSTATED - lost[len(sure) :])
 
 
 def candidates_at(
