@@ -230,14 +230,14 @@ def second_look(
     settings = replace(settings, polarity="light" if signs[0] > 0.0 else "dark")
     candidates = candidates_at(image, camera, table, settings, first.noise)
     best = HoughCandidates(candidates.floor_xy[:_BEST], candidates.score[:_BEST])
-    looks = second_looks_at(image, camera, settings, best, found.floor_xy, first.noise)
+    looks = second_looks_at(image, camera, settings, best, found.floor_xy, first.noise, _UNSTATED)
     u, v = centres.pixels[found.centre].T
     lost = lost_by_paleness(
         np.concatenate([contrast, looks.step]),
         np.concatenate([image[v, u] - contrast, looks.floor_grey]),
         np.concatenate([sure, np.zeros(len(looks.step), np.bool_)]),
     )
-    return looks._replace(log_odds=looks.log_odds - _UNSTATED - lost[len(sure) :])
+    return looks._replace(log_odds=looks.log_odds - lost[len(sure) :])
 
 
 def candidates_at(
@@ -260,6 +260,7 @@ def second_looks_at(
     candidates: HoughCandidates,
     found_xy: FloatArray,
     noise: float,
+    needed: float = 0.0,
     networks: Networks | None = None,
 ) -> SecondLooks:
     """Look a second time where no disc was found (see `detect.discs.second_look`).
@@ -274,12 +275,16 @@ def second_looks_at(
         Discs found already, metres.
     noise : float
         Of the image, grey levels.
+    needed : float
+        Log-odds that a disc needs more than usual.
     networks : Networks, optional
         Others than the trained ones.
     """
     sign = float(_SIGNS[settings.polarity])
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    sought = Sought(settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP))
+    sought = Sought(
+        settings.radius_m, settings.separation_m, sign, max(weakest, _LEAST_STEP), needed
+    )
     return second_looks(
         image, candidates, np.ascontiguousarray(found_xy), sought, _kernel_camera(camera).numbers,
         networks or trained_networks(),

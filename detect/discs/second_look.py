@@ -70,6 +70,8 @@ class Sought(NamedTuple):
     """1 for light discs, -1 for dark ones."""
     least_step: float
     """Least step of the grey value at a rim, grey levels."""
+    needed: float
+    """Log-odds that a disc needs more than usual."""
 
 
 class SecondLooks(NamedTuple):
@@ -158,7 +160,7 @@ def _look_at_all(
         inputs, scales = network_inputs(grey, scale, sought.sign)
         score = candidates.score[i : i + 1]
         least = _LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE
-        if network_log_odds(inputs, scales, score, networks.glance) < least:
+        if network_log_odds(inputs, scales, score, networks.glance) < least + sought.needed:
             continue
         first = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
         if first.agreeing < _LEAST_RIM:
@@ -176,7 +178,7 @@ def _look_at_all(
             _note_rim(rim, sought.radius, candidates.score[i], noted)
             grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
             inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
-            odds = network_log_odds(inputs, scales, noted, networks.look) - _TAKEN
+            odds = network_log_odds(inputs, scales, noted, networks.look) - _TAKEN - sought.needed
             if is_new and odds <= log_odds[count]:
                 continue
             is_new = True

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.discs.evidence import lost_by_paleness
 from detect.discs.search import of_likely_sign
 from detect.settings import CircleSettings
 from lut import DiscTable, build_disc_table
@@ -153,3 +154,54 @@ def test_a_doubtful_disc_of_the_other_sign_among_many_clear_ones_is_dropped(
     likely = of_likely_sign(np.arange(clear + 2), contrast, evidence, 1.1)
     assert clear in likely
     assert (clear + 1 in likely) == kept
+
+
+def lost(contrast: float, floor_grey: float, clear: int = 3) -> float:
+    """What one more disc loses beside clear ones of 100 grey levels on a floor of 80."""
+    contrasts = np.array([100.0] * clear + [contrast])
+    floors = np.array([80.0] * clear + [floor_grey])
+    losses = lost_by_paleness(contrasts, floors, np.arange(clear + 1) < clear)
+    assert (losses[:clear] == 0.0).all()
+    return float(losses[clear])
+
+
+def test_pale_discs_lose_the_more_the_paler_they_are() -> None:
+    losses = [lost(contrast, 80.0) for contrast in (10.0, 20.0, 40.0, 60.0, 100.0, 150.0)]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[0] > 6.0
+    assert losses[3:] == [0.0, 0.0, 0.0]
+
+
+def test_discs_in_shadow_are_not_pale_and_others_need_comparison() -> None:
+    assert lost(25.0, 20.0) == pytest.approx(0.0)  # a quarter of the light, for disc and floor
+    assert lost(25.0, 80.0) > 2.0
+    assert lost(-25.0, 80.0) == 0.0  # none of its sign to compare with
+    assert lost(25.0, 80.0, clear=1) == 0.0
+
+
+@pytest.mark.parametrize(("others", "rows"), [([], 6), (CLEAR_PLACES, 0)])
+def test_a_very_pale_disc_is_one_only_where_no_others_are_clear(
+    published_camera: Camera, table: DiscTable, others: list[tuple[float, float]], rows: int
+) -> None:
+    found_here = 0
+    for seed in range(6):
+        floor = PaintedFloor(published_camera).disc(PLACES[0], FLOOR + 9.0, blur_px=1.1)
+        for other in others:
+            floor.disc(other, LIGHT)
+        found = detect_circles(floor.image(seed=seed), published_camera, table, CircleSettings())
+        found_here += bool((found_at(found, PLACES[0]) < 0.03).any())
+    assert abs(found_here - rows) <= 1
+
+
+@pytest.mark.parametrize(("row", "listed"), [(284.0, True), (287.0, True), (289.5, False)])
+def test_a_disc_is_listed_if_its_centre_is_in_sight(
+    published_camera: Camera, table: DiscTable, row: float, listed: bool
+) -> None:
+    place = published_camera.floor_from_pixel(np.array([400.0, row]))
+    floor = PaintedFloor(published_camera).disc(place, LIGHT)
+    for other in CLEAR_PLACES:
+        floor.disc(other, LIGHT)
+    for settings in (SETTINGS, CircleSettings()):
+        found = detect_circles(floor.image(), published_camera, table, settings)
+        assert (found_at(found, place) < 0.02).any() == listed
+        assert len(found) == len(CLEAR_PLACES) + listed
