@@ -185,7 +185,7 @@ def test_a_very_pale_disc_is_one_only_where_no_others_are_clear(
 ) -> None:
     found_here = 0
     for seed in range(6):
-        floor = PaintedFloor(published_camera).disc(PLACES[0], FLOOR + 9.0, blur_px=1.1)
+        floor = PaintedFloor(published_camera).disc(PLACES[0], FLOOR + 9.0, blur_px=1.0)
         for other in others:
             floor.disc(other, LIGHT)
         found = detect_circles(floor.image(seed=seed), published_camera, table, CircleSettings())
