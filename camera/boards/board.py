@@ -34,36 +34,24 @@ from redetect.storage import demand_place, write_bytes
 class Board:
     """A printed board.
 
-    Attributes
-    ----------
-    kind : str
-        `checkerboard`, `charuco`, `circles` or `asymmetric-circles`.
-    columns, rows : int
-        Checkerboard: inner corners. ChArUco: squares. Circles: circles in a row, and rows; of
-        asymmetric circles every other row is moved by `square_m`.
-    square_m : float
-        Side of a square, or distance of neighbouring circles in a symmetric grid; of an asymmetric
-        one half the distance of neighbours in a row, which is that of rows. Metres.
-    marker_m : float
-        Side of a ChArUco board's markers, metres.
-    dictionary : str
-        The markers' dictionary, as OpenCV names it.
-    circle_m : float
-        Diameter of the circles, metres; 0 if unknown. With it, the shift of a circle's image
-        against the image of its centre is taken into account.
-
     Raises
     ------
     CalibrationError
         If there can be no such board.
     """
 
-    kind: BoardKind
+    kind: BoardKind  #: `checkerboard`, `charuco`, `circles` or `asymmetric-circles`
+    #: Checkerboard: inner corners. ChArUco: squares. Circles: circles in a row, and rows; of
+    #: asymmetric circles every other row is moved by `square_m`.
     columns: int
     rows: int
+    #: Side of a square, or distance of neighbouring circles in a symmetric grid; of an asymmetric
+    #: one half the distance of neighbours in a row, which is that of rows. Metres.
     square_m: float
-    marker_m: float = 0.0
-    dictionary: str = "DICT_5X5_100"
+    marker_m: float = 0.0  #: Side of a ChArUco board's markers, metres
+    dictionary: str = "DICT_5X5_100"  #: The markers' dictionary, as OpenCV names it
+    #: Diameter of the circles, metres; 0 if unknown. With it, the shift of a circle's image against
+    #: the image of its centre is taken into account.
     circle_m: float = 0.0
 
     def __post_init__(self) -> None:

@@ -52,23 +52,12 @@ _SCALE_ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of boards, where they were seen.
+    """Points of boards, where they were seen."""
 
-    Attributes
-    ----------
-    board : (N, 3) float64
-        Points in their board's frame, metres.
-    pixels : (N, 2) float64
-        Where they were seen.
-    views : (N,) int64
-        The view of each, counted from 0; no view is empty.
-    width, height : int
-        Image size.
-    """
-
-    board: FloatArray
-    pixels: FloatArray
-    views: IntArray
+    board: FloatArray  #: (N, 3) points in their board's frame, metres
+    pixels: FloatArray  #: (N, 2) where they were seen
+    views: IntArray  #: (N,) the view of each, counted from 0; no view is empty
+    #: Size of the image, pixels
     width: int
     height: int
 
@@ -89,16 +78,10 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A camera and the poses of the boards it saw.
+    """A camera and the poses of the boards it saw."""
 
-    Attributes
-    ----------
-    intrinsics : (14,) float64
-    rotations, translations : (V, 3, 3) and (V, 3) float64
-        `camera_from_board` of each view, metres.
-    """
-
-    intrinsics: FloatArray
+    intrinsics: FloatArray  #: (14,)
+    #: `camera_from_board` of each view: (V, 3, 3), and (V, 3) in metres
     rotations: FloatArray
     translations: FloatArray
 

@@ -114,53 +114,26 @@ _ASPECT_SIGMA = 0.003
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """A board in a picture.
+    """A board in a picture."""
 
-    Attributes
-    ----------
-    name : str
-        The picture's.
-    indices : (K,) int64
-        Which of the board's points were seen.
-    pixels : (K, 2) float64
-        Where.
-    """
-
-    name: str
-    indices: IntArray
-    pixels: FloatArray
+    name: str  #: of the picture
+    indices: IntArray  #: (K,) which of the board's points were seen
+    pixels: FloatArray  #: (K, 2) where they were seen
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibrated camera.
-
-    Attributes
-    ----------
-    adjusted : Adjusted
-    points : Points
-        The points that it was fitted to, corrected for the circles' shifts.
-    names : tuple of str
-        The views' names.
-    outliers : tuple of (str, float)
-        Views left out, with the RMS of their residuals (px).
-    lens : FreeLens
-        Which coefficients of the distortion are free.
-    holdout_px : dict of FreeLens to float
-        RMS reprojection error (u and v together) in views that the intrinsics were not fitted to,
-        by what was free; all that was tried.
-    spread_deg : float
-        Largest angle between two boards' normals.
-    warnings : tuple of str
-    """
+    """A calibrated camera."""
 
     adjusted: Adjusted
-    points: Points
-    names: tuple[str, ...]
-    outliers: tuple[tuple[str, float], ...]
-    lens: FreeLens
+    points: Points  #: The points that it was fitted to, corrected for the circles' shifts
+    names: tuple[str, ...]  #: The views' names
+    outliers: tuple[tuple[str, float], ...]  #: Views left out, with the RMS of their residuals (px)
+    lens: FreeLens  #: Which coefficients of the distortion are free
+    #: RMS reprojection error (u and v together) in views that the intrinsics were not fitted to, by
+    #: what was free; all that was tried
     holdout_px: dict[FreeLens, float]
-    spread_deg: float
+    spread_deg: float  #: Largest angle between two boards' normals
     warnings: tuple[str, ...] = field(default=())
 
     @property

@@ -41,24 +41,14 @@ _WIDE_SPREAD_DEG = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """A camera that was fitted to some views, and how well it explains each.
+    """A camera that was fitted to some views, and how well it explains each."""
 
-    Attributes
-    ----------
-    fit : Adjusted
-        To those views.
-    estimate : Estimate
-        With the poses of all views.
-    rms_px : (V,) float64
-        RMS residual of each view; infinite where the camera sees its board in no pose.
-    agree : (V,) bool
-        Whether the residuals of a view, all but those of single points, are not far above those of
-        the views that it was fitted to.
-    """
-
-    fit: Adjusted
-    estimate: Estimate
+    fit: Adjusted  #: to those views
+    estimate: Estimate  #: With the poses of all views
+    #: (V,) RMS residual of each view; infinite where the camera sees its board in no pose
     rms_px: FloatArray
+    #: (V,) whether the residuals of a view, all but those of single points, are not far above those
+    #: of the views that it was fitted to
     agree: BoolArray
 
 

@@ -185,34 +185,22 @@ class FreeLens(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How to calibrate.
+    """How to calibrate."""
 
-    Attributes
-    ----------
-    aspect : float or None
-        scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
-        are free.
-    coefficients : int or None
-        Number of free radial coefficients (0 to 5, of the polynomial 0 to 3); None: as many as make
-        the hold-out error smaller. Of the rational function, unless `polynomial` is true.
-    tangential : bool or None
-        Whether the tangential terms p1 and p2 are free; None: if that makes the hold-out error
-        smaller and they are more than noise.
-    polynomial : bool or None
-        Whether the radial distortion is the polynomial k1, k2, k3, not the rational one; None: if
-        that needs fewer coefficients, or makes the hold-out error much smaller.
-    robust : bool
-        Huber's loss; points found wrongly pull less.
-    keep_outliers : bool
-        Keep pictures whose residuals are far above the others'.
-    """
-
+    #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
+    #: are free
     aspect: float | None = 1.0
+    #: Number of free radial coefficients (0 to 5, of the polynomial 0 to 3); None: as many as make
+    #: the hold-out error smaller. Of the rational function, unless `polynomial` is true.
     coefficients: int | None = None
+    #: Whether the tangential terms p1 and p2 are free; None: if that makes the hold-out error
+    #: smaller and they are more than noise
     tangential: bool | None = None
+    #: Whether the radial distortion is the polynomial k1, k2, k3, not the rational one; None: if
+    #: that needs fewer coefficients, or makes the hold-out error much smaller
     polynomial: bool | None = None
-    robust: bool = True
-    keep_outliers: bool = False
+    robust: bool = True  #: Huber's loss; points found wrongly pull less
+    keep_outliers: bool = False  #: Keep pictures whose residuals are far above the others'
 
     def __post_init__(self) -> None:
         if self.aspect is not None:

@@ -49,31 +49,22 @@ _SMALLEST_STEP = 1e-6
 class ForeignCamera:
     """A camera in another program's model.
 
-    Attributes
-    ----------
-    model : str
-        `radtan`, `rational` or `fisheye`.
-    width, height : int
-        Image size in pixels.
-    fx, fy, cx, cy : float
-        Focal lengths and principal point in pixels; the top left pixel's centre is (0, 0).
-    distortion : tuple of float
-        All coefficients of the model, in the order above.
-
     Raises
     ------
     ConversionError
         If a number is not finite, or a size or focal length not positive.
     """
 
-    model: Model
+    model: Model  #: `radtan`, `rational` or `fisheye`
+    #: Size of the image, pixels
     width: int
     height: int
+    #: Focal lengths and principal point in pixels; the top left pixel's centre is (0, 0)
     fx: float
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...]
+    distortion: tuple[float, ...]  #: All coefficients of the model, in the order above
 
     def __post_init__(self) -> None:
         for name, side in (("width", self.width), ("height", self.height)):

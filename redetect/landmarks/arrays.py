@@ -17,24 +17,12 @@ from redetect.landmarks.records import CircleLandmark, LandmarkError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleArrays:
-    """N rows of discs as arrays.
+    """N rows of discs as arrays."""
 
-    Attributes
-    ----------
-    xy : (N, 2) float64
-        Centres in the robot frame (m).
-    quality : (N,) float64
-        Confidence, 0 to 1.
-    covariance : (N, 2, 2) float64
-        Of `xy` (m^2).
-    ids : (N,) int64
-        Each row's first identifier; -1 where it is unknown or missing.
-    """
-
-    xy: FloatArray
-    quality: FloatArray
-    covariance: FloatArray
-    ids: IntArray
+    xy: FloatArray  #: (N, 2) centres in the robot frame (m)
+    quality: FloatArray  #: (N,) confidence, 0 to 1
+    covariance: FloatArray  #: (N, 2, 2) of `xy` (m^2)
+    ids: IntArray  #: (N,) each row's first identifier; -1 where it is unknown or missing
 
 
 def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
@@ -125,19 +113,13 @@ IndexArray = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """Pairs of rows of two sets; no row is in two pairs.
+    """Pairs of rows of two sets; no row is in two pairs."""
 
-    Attributes
-    ----------
-    first, second : (M,) intp
-        The pairs: row `first[k]` of the first set belongs to row `second[k]` of the second. `first`
-        ascends.
-    first_alone, second_alone : intp
-        The rows of each set that are in no pair, ascending.
-    """
-
+    #: (M,) the pairs: row `first[k]` of the first set belongs to row `second[k]` of the second.
+    #: `first` ascends.
     first: IndexArray
     second: IndexArray
+    #: The rows of each set that are in no pair, ascending
     first_alone: IndexArray
     second_alone: IndexArray
 

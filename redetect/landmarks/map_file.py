@@ -41,24 +41,12 @@ _SAME = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Landmarks of one kind in the map.
+    """Landmarks of one kind in the map."""
 
-    Attributes
-    ----------
-    ids : (M,) int64
-        Identifiers, each once.
-    xy : (M, 2) float64
-        Places in the map (m).
-    covariance : (M, 2, 2) float64
-        Of `xy` (m^2).
-    rows : (M,) int64
-        Number of rows that each was estimated from.
-    """
-
-    ids: IntArray
-    xy: FloatArray
-    covariance: FloatArray
-    rows: IntArray
+    ids: IntArray  #: (M,) identifiers, each once
+    xy: FloatArray  #: (M, 2) places in the map (m)
+    covariance: FloatArray  #: (M, 2, 2) of `xy` (m^2)
+    rows: IntArray  #: (M,) number of rows that each was estimated from
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -74,21 +62,11 @@ class LandmarkMap:
 
 @dataclass(frozen=True, eq=False)
 class Path2D:
-    """The poses of a run: the start, and one after each step.
+    """The poses of a run: the start, and one after each step."""
 
-    Attributes
-    ----------
-    prefixes : tuple of N str
-        Name of each pose; of the start ``start``.
-    poses : (N, 3) float64
-        x, y (m), theta (rad).
-    covariance : (N, 3, 3) float64 or None
-        Of the poses.
-    """
-
-    prefixes: tuple[str, ...]
-    poses: FloatArray
-    covariance: FloatArray | None = None
+    prefixes: tuple[str, ...]  #: Name of each pose; of the start ``start``
+    poses: FloatArray  #: (N, 3) x, y (m), theta (rad)
+    covariance: FloatArray | None = None  #: (N, 3, 3) of the poses
 
     def part(self, first: int, end: int) -> Path2D:
         """The poses from one on, up to another."""

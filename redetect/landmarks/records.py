@@ -59,23 +59,16 @@ _WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A movement of the robot and the image taken after it.
+    """A movement of the robot and the image taken after it."""
 
-    Attributes
-    ----------
-    prefix : str
-        The image's name, usually without extension. Bytes of the file that are not UTF-8 are kept
-        as surrogates, as in Python's file names.
-    dx, dy, dphi : float
-        Pose after the movement in the robot frame before it (m, m, rad).
-    cxx, cxy, cyy, cxphi, cyphi, cphiphi : float
-        Covariance of (dx, dy, dphi) (m^2, m rad, rad^2).
-    """
-
+    #: The image's name, usually without extension. Bytes of the file that are not UTF-8 are kept as
+    #: surrogates, as in Python's file names.
     prefix: str
+    #: Pose after the movement in the robot frame before it (m, m, rad)
     dx: float
     dy: float
     dphi: float
+    #: Covariance of (dx, dy, dphi) (m^2, m rad, rad^2)
     cxx: float
     cxy: float
     cyy: float
@@ -90,26 +83,17 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class CircleLandmark:
-    """A disc on the floor as seen in one image.
+    """A disc on the floor as seen in one image."""
 
-    Attributes
-    ----------
-    px, py : float
-        The disc's centre in the robot frame (m).
-    quality : float
-        The detector's confidence, 0 (bad) to 1 (good).
-    cxx, cxy, cyy : float
-        Covariance of (px, py) (m^2).
-    ids : tuple of int
-        The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none.
-    """
-
+    #: The disc's centre in the robot frame (m)
     px: float
     py: float
-    quality: float
+    quality: float  #: The detector's confidence, 0 (bad) to 1 (good)
+    #: Covariance of (px, py) (m^2)
     cxx: float
     cxy: float
     cyy: float
+    #: The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none
     ids: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -124,33 +108,18 @@ class CircleLandmark:
 
 @dataclass(frozen=True, slots=True)
 class LineLandmark:
-    """A vertical line of the building as seen in one image.
+    """A vertical line of the building as seen in one image."""
 
-    Attributes
-    ----------
-    xtop, ytop, xbottom, ybottom : float
-        The line's ends in undistorted normalised image coordinates.
-    alpha : float
-        Bearing of the line, 0 forward and positive to the left (rad).
-    beta : float
-        Inclination of the plane through the camera's centre and the line (rad).
-    quality : float
-        The detector's confidence; always 0 in the data set's own files.
-    sigma : float
-        Standard deviation of `alpha` (rad).
-    ids : tuple of int
-        The line's identifiers, as in `CircleLandmark`.
-    """
-
+    #: The line's ends in undistorted normalised image coordinates
     xtop: float
     ytop: float
     xbottom: float
     ybottom: float
-    alpha: float
-    beta: float
-    quality: float
-    sigma: float
-    ids: tuple[int, ...] = ()
+    alpha: float  #: Bearing of the line, 0 forward and positive to the left (rad)
+    beta: float  #: Inclination of the plane through the camera's centre and the line (rad)
+    quality: float  #: The detector's confidence; always 0 in the data set's own files
+    sigma: float  #: Standard deviation of `alpha` (rad)
+    ids: tuple[int, ...] = ()  #: The line's identifiers, as in `CircleLandmark`
 
     def __post_init__(self) -> None:
         _demand_finite(LINE_NUMBERS, numbers_of_line(self))
@@ -164,18 +133,12 @@ class LineLandmark:
 
 @dataclass(frozen=True, slots=True)
 class MarkerCorner:
-    """A corner of a square marker in an image.
+    """A corner of a square marker in an image."""
 
-    Attributes
-    ----------
-    u, v : float
-        Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0).
-    cuu, cuv, cvv : float
-        Covariance of (u, v) (px^2).
-    """
-
+    #: Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0)
     u: float
     v: float
+    #: Covariance of (u, v) (px^2)
     cuu: float
     cuv: float
     cvv: float
@@ -187,23 +150,12 @@ class MarkerCorner:
 
 @dataclass(frozen=True, slots=True)
 class MarkerLandmark:
-    """A square marker as seen in one image.
+    """A square marker as seen in one image."""
 
-    Attributes
-    ----------
-    dictionary : str
-        Which set of markers it is from; an identifier means nothing without it.
-    id : int
-        The marker's number in that set.
-    quality : float
-        How well the marker's cells agree with the pattern: 1 is perfect.
-    corners : tuple of 4 MarkerCorner
-        Top left, top right, bottom right, bottom left of the marker as it is printed.
-    """
-
-    dictionary: str
-    id: int
-    quality: float
+    dictionary: str  #: Which set of markers it is from; an identifier means nothing without it
+    id: int  #: The marker's number in that set
+    quality: float  #: How well the marker's cells agree with the pattern: 1 is perfect
+    #: Top left, top right, bottom right, bottom left of the marker as it is printed
     corners: tuple[MarkerCorner, MarkerCorner, MarkerCorner, MarkerCorner]
 
     def __post_init__(self) -> None:
@@ -221,19 +173,12 @@ Record = Step | Landmark
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A step and the landmarks in the image taken after it.
-
-    Attributes
-    ----------
-    step : Step
-    landmarks : tuple of Landmark
-    levelled_by : (float, float) or None
-        Pitch and roll (rad) by which the positions of its discs were levelled; None if they are
-        where the camera as calibrated sees them.
-    """
+    """A step and the landmarks in the image taken after it."""
 
     step: Step
     landmarks: tuple[Landmark, ...] = ()
+    #: Pitch and roll (rad) by which the positions of its discs were levelled; None if they are
+    #: where the camera as calibrated sees them
     levelled_by: tuple[float, float] | None = None
 
     @property
@@ -254,21 +199,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a landmark file together with the text it was read from.
+    """A row of a landmark file together with the text it was read from."""
 
-    Attributes
-    ----------
-    record : Record or None
-        None for comments, blank lines and settings of a detector.
-    source : bytes or None
-        The row's text in the file, continuation lines and line end included; None for a row that
-        was not read from a file, or was changed since.
-    line : int
-        The number of the row's first line in its file, counted from 1; 0 without a file.
-    """
-
-    record: Record | None
+    record: Record | None  #: None for comments, blank lines and settings of a detector
+    #: The row's text in the file, continuation lines and line end included; None for a row that was
+    #: not read from a file, or was changed since
     source: bytes | None = None
+    #: The number of the row's first line in its file, counted from 1; 0 without a file
     line: int = 0
 
     def with_record(self, record: Record) -> Row:

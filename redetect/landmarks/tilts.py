@@ -26,27 +26,17 @@ from redetect.storage.messages import excerpt
 
 @dataclass(frozen=True, slots=True)
 class FrameTilt:
-    """The tilt of one frame.
+    """The tilt of one frame."""
 
-    Attributes
-    ----------
-    prefix : str
-        The frame's image.
-    pitch, roll : float
-        Rotation vector about the robot's X and Y that turns measured directions level (rad).
-    cpp, cpr, crr : float
-        Its covariance (rad^2).
-    lines : int
-        Verticals that agree with it, or discs that show it.
-    """
-
-    prefix: str
+    prefix: str  #: The frame's image
+    #: Rotation vector about the robot's X and Y that turns measured directions level (rad)
     pitch: float
     roll: float
+    #: Its covariance (rad^2)
     cpp: float
     cpr: float
     crr: float
-    lines: int
+    lines: int  #: Verticals that agree with it, or discs that show it
 
 
 def format_tilt(tilt: FrameTilt) -> str:
