@@ -14,7 +14,6 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from camera.options import Level
@@ -28,9 +27,8 @@ from detect.seen import level_matrix
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar
+from redetect.array_types import FloatArray
 from redetect.storage import demand_place
-
-FloatArray = NDArray[np.float64]
 
 #: Outlines of discs are tried at heights that differ by these shares of the calibrated one.
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)

@@ -9,13 +9,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera import Camera
 from camera.rotations import rotation_of
+from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
 
-FloatArray = NDArray[np.float64]
 Tilt = tuple[float, float]
 
 _POINTS = 64

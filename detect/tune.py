@@ -15,7 +15,6 @@ from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect import __version__
 from detect.comparison.compare import compare_frames, compare_line_frames
@@ -32,6 +31,7 @@ from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Tune
+from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Frame,
     FrameTilt,
@@ -193,7 +193,6 @@ def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Comb
 
 
 Settings = CircleSettings | LineSettings
-FloatArray = NDArray[np.float64]
 
 # Largest number of points that are labelled.
 _MOST_NAMED = 12

@@ -23,9 +23,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
-from numpy.typing import NDArray
-
 from detect.circles import detect_circles, disc_shape
 from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
@@ -36,6 +33,7 @@ from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
 from lut import cached_disc_table
+from redetect.array_types import GreyImage
 from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
 from redetect.storage import OutputExistsError, write_bytes
@@ -64,7 +62,7 @@ class TuningSession:
     def __post_init__(self) -> None:
         self.image = lru_cache(maxsize=16)(self._image)
 
-    def _image(self, number: int) -> NDArray[np.uint8]:
+    def _image(self, number: int) -> GreyImage:
         return read_image(self.frames[number], self.run.camera)
 
     def described(self) -> dict[str, Any]:

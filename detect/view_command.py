@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.comparison.compare import numbers
@@ -21,11 +20,10 @@ from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import View
+from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.storage import demand_place, write_bytes
-
-FloatArray = NDArray[np.float64]
 
 _EDGE, _LINE, _SIGMA, _MAP = (255, 170, 0), (60, 220, 60), (255, 170, 0), (80, 140, 220)
 # Times of this and more are assumed to be UNIX time: no recording is three years long.

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.calibration.adjustment import project_estimate
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
-from redetect.array_types import FloatArray
+from redetect.array_types import ByteArray, FloatArray, GreyImage
 from redetect.reporting.page import figure_file
 
 if TYPE_CHECKING:
@@ -123,8 +122,6 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
     axes.set_title("Standard deviation of the projection")
 
 
-Picture = NDArray[np.uint8]
-
 #: Blue, green, red.
 _FOUND, _PROJECTED, _GRID, _HORIZON = (0, 200, 0), (0, 0, 255), (0, 200, 255), (255, 120, 0)
 #: Width that small pictures are enlarged to (px), and of the rectified floor.
@@ -134,7 +131,7 @@ _ASIDE_M, _AHEAD_M, _GRID_M = 3.0, 6.0, 0.5
 _STEPS = 400
 
 
-def drawn_corners(image: Picture, calibration: Calibration, view: int) -> Picture:
+def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> ByteArray:
     """A board's points where they were found (circles) and where they project (crosses)."""
     points, estimate = calibration.points, calibration.adjusted.estimate
     rows = points.views == view
@@ -153,7 +150,7 @@ def drawn_corners(image: Picture, calibration: Calibration, view: int) -> Pictur
     )
 
 
-def drawn_floor(image: Picture, camera: Camera) -> Picture:
+def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
     """The floor's grid and the horizon in a photograph."""
     picture, scale = _enlarged(image)
     along = np.linspace(-_ASIDE_M, _ASIDE_M, _STEPS)
@@ -174,7 +171,7 @@ def drawn_floor(image: Picture, camera: Camera) -> Picture:
     )
 
 
-def rectified_floor(image: Picture, camera: Camera) -> Picture:
+def rectified_floor(image: GreyImage, camera: Camera) -> ByteArray:
     """The floor from above, ahead is up: what lies flat on it has its true shape."""
     per_metre = _RECTIFIED_PX / (2.0 * _ASIDE_M)
     height = round(_AHEAD_M * per_metre)
@@ -194,7 +191,7 @@ def rectified_floor(image: Picture, camera: Camera) -> Picture:
     return _captioned(picture, "the floor from above; ahead is up, a line every metre")
 
 
-def _enlarged(image: Picture) -> tuple[Picture, float]:
+def _enlarged(image: GreyImage) -> tuple[ByteArray, float]:
     """The image in colour and large enough to draw into, and how much it is enlarged."""
     scale = float(max(1, round(_LEAST_WIDTH_PX / image.shape[1])))
     size = int(scale * image.shape[1]), int(scale * image.shape[0])
@@ -209,7 +206,7 @@ def _place(place: FloatArray, scale: float, parts: int = 1) -> tuple[int, int]:
 
 
 def _polyline(
-    picture: Picture, line: FloatArray, scale: float, colour: tuple[int, int, int], width: int
+    picture: ByteArray, line: FloatArray, scale: float, colour: tuple[int, int, int], width: int
 ) -> None:
     """Draw what of a line is seen, in pieces."""
     reach = 2.0 * max(picture.shape)
@@ -221,14 +218,14 @@ def _polyline(
 
 
 def _label(
-    picture: Picture, place: FloatArray, scale: float, text: str, colour: tuple[int, int, int]
+    picture: ByteArray, place: FloatArray, scale: float, text: str, colour: tuple[int, int, int]
 ) -> None:
     if np.isfinite(place).all() and np.abs(place).max() < 1e4:
         u, v = _place(place, scale)
         cv2.putText(picture, text, (u + 4, v - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
 
 
-def _captioned(picture: Picture, text: str) -> Picture:
+def _captioned(picture: ByteArray, text: str) -> ByteArray:
     band = np.full((24, picture.shape[1], 3), 255, np.uint8)
     cv2.putText(band, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
     return np.vstack([picture, band])

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.comparison.floor import floor_bin, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
@@ -38,6 +37,7 @@ from detect.errors import CompareError
 from detect.seen import Sight
 from detect.sources.image_files import image_name
 from detect.viewing_options import CompareOptions
+from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Association,
     CircleArrays,
@@ -52,8 +52,6 @@ from redetect.landmarks import (
     read_frames,
     wrap_angle,
 )
-
-FloatArray = NDArray[np.float64]
 
 # The forward distances for which the data set's own qualities are known.
 _EDGES_M = (None, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, None)

@@ -7,7 +7,6 @@ None where there is nothing to compute them from.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
 from scipy.special import chdtri
 
@@ -21,9 +20,8 @@ from detect.comparison.result import (
     NormalisedError,
 )
 from detect.seen import image_positions, level_seen
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
-
-FloatArray = NDArray[np.float64]
 
 
 def quantile(values: FloatArray, q: float = 0.5) -> float | None:
@@ -58,7 +56,7 @@ def common_lean(
     camera: Camera,
     reference_xy: FloatArray,
     detected_xy: FloatArray,
-    frame: NDArray[np.int64],
+    frame: IntArray,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Fit the lean to matched rows: robust least squares of their differences in the image.
 
@@ -104,7 +102,7 @@ def floor_pairs(
     reference_xy: FloatArray,
     detected_xy: FloatArray,
     covariance: FloatArray,
-    frame: NDArray[np.int64],
+    frame: IntArray,
 ) -> tuple[CommonLean | None, DiscPairs]:
     """Matched rows on the floor, before and after their common lean (None without a camera).
 

@@ -10,13 +10,13 @@ from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from redetect.array_types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from detect.seen import Sight
     from detect.viewing_options import CompareOptions
 
-FloatArray = NDArray[np.float64]
 Kind = Literal["circles", "lines"]
 
 #: How many of the worst frames are listed.
@@ -78,7 +78,7 @@ class ForwardRange:
     from_m: float | None
     to_m: float | None
 
-    def holds(self, floor_xy: FloatArray) -> NDArray[np.bool_]:
+    def holds(self, floor_xy: FloatArray) -> BoolArray:
         """(N,) which of some positions are in it."""
         low = -np.inf if self.from_m is None else self.from_m
         high = np.inf if self.to_m is None else self.to_m

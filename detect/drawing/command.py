@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.drawing.frame import draw_rows, png_of
 from detect.drawing.inputs import open_rows, picture_name, select_frames
@@ -19,6 +18,7 @@ from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import print_failures, progress_bar
 from detect.viewing_options import CompareOptions, Draw
+from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
 
 
@@ -75,9 +75,7 @@ def perform(options: Draw) -> int:
 
 
 @contextmanager
-def mp4(
-    path: Path, fps: float, *, overwrite: bool
-) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Callable[[ByteArray], None]]:
     """A video that appears once it is complete; yields what takes its pictures.
 
     Raises DetectError if OpenCV cannot write such videos, or pictures are not all of one size.
@@ -88,7 +86,7 @@ def mp4(
     with tempfile.TemporaryDirectory() as folder:
         raw = Path(folder) / "video.mp4"
 
-        def add(picture: NDArray[np.uint8]) -> None:
+        def add(picture: ByteArray) -> None:
             nonlocal size
             # The coder wants even numbers of rows and columns.
             height, width = picture.shape[:2]

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
@@ -29,9 +29,8 @@ from detect.settings import CircleSettings
 from detect.verticals.tracking import LineTracks
 from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
+from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
 from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
-
-FloatArray = NDArray[np.float64]
 
 _POINTS = 33
 #: Size of the ellipses of markers' corners, in standard deviations.
@@ -47,13 +46,13 @@ _WORDS_COLOUR: Colour = (230, 230, 230)
 
 
 def draw_rows(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     sight: Sight | None,
     rows: SeenRows,
     settings: CircleSettings,
     options: CompareOptions,
     title: str = "",
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """Draw rows of a frame into its image (H, W), and words below it.
 
     Without a calibrated camera only markers are drawn. The settings have the radii of the discs'
@@ -122,7 +121,7 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: NDArray[np.uint8], match: FrameMatch, settings: CircleSettings, compared: bool
+    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool
 ) -> None:
     view = match.frame.view
     assert view is not None
@@ -140,9 +139,7 @@ def _draw_discs(
         )
 
 
-def _draw_lines(
-    canvas: NDArray[np.uint8], camera: Camera, match: FrameMatch, compared: bool
-) -> None:
+def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
     for curve in line_curves(camera, ends_of(match.missed)):
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
@@ -160,7 +157,7 @@ def _draw_lines(
         draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
-def _draw_markers(canvas: NDArray[np.uint8], found: Sequence[MarkerLandmark]) -> None:
+def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark]) -> None:
     """Edges, a circle at the top left corner, and ellipses of 20 standard deviations."""
     times = enlargement(canvas)
     circle = circle_on_floor((0.0, 0.0), 1.0, _POINTS)
@@ -180,7 +177,7 @@ def _count(what: str, match: FrameMatch, compared: bool) -> str:
 
 
 def _outline_disc(
-    canvas: NDArray[np.uint8],
+    canvas: ByteArray,
     project: Callable[[FloatArray], FloatArray],
     centre_xy: FloatArray,
     settings: CircleSettings,
@@ -207,7 +204,7 @@ _FARTHEST_PX = 1e6
 _COLUMNS = 1500
 
 
-def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
+def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
     """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
 
     Pixels that see nothing through the lens of the calibrated camera are dark and red.
@@ -220,24 +217,24 @@ def canvas_of(image: NDArray[np.uint8], camera: Camera | None = None) -> NDArray
     return canvas
 
 
-def png_of(picture: NDArray[np.uint8]) -> bytes:
+def png_of(picture: ByteArray) -> bytes:
     """A picture, blue, green, red, as a PNG file."""
     return cv2.imencode(".png", picture)[1].tobytes()
 
 
 @lru_cache(maxsize=2)
-def _unseen(camera: Camera) -> NDArray[np.bool_]:
+def _unseen(camera: Camera) -> BoolArray:
     u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
     return np.isnan(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))[..., 0])
 
 
-def enlargement(canvas: NDArray[np.uint8]) -> int:
+def enlargement(canvas: ByteArray) -> int:
     """How many times as wide strokes and words are, to be seen when the picture is shown whole."""
     return max(1, round(int(canvas.shape[1]) / _COLUMNS))
 
 
 def draw_curve(
-    canvas: NDArray[np.uint8], points: FloatArray, colour: Colour, *, closed: bool = False
+    canvas: ByteArray, points: FloatArray, colour: Colour, *, closed: bool = False
 ) -> None:
     """Draw a curve through (N, 2) points u, v; nothing is drawn if one is not finite."""
     if np.all(np.abs(points) < _FARTHEST_PX):
@@ -246,7 +243,7 @@ def draw_curve(
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def draw_bar(canvas: NDArray[np.uint8], ends: FloatArray, colour: Colour) -> None:
+def draw_bar(canvas: ByteArray, ends: FloatArray, colour: Colour) -> None:
     """Draw an error bar between two points (2, 2) u, v, with a tick at each."""
     tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
     for points in (ends, ends[0] + tick, ends[1] + tick):
@@ -254,7 +251,7 @@ def draw_bar(canvas: NDArray[np.uint8], ends: FloatArray, colour: Colour) -> Non
 
 
 def draw_text(
-    canvas: NDArray[np.uint8],
+    canvas: ByteArray,
     text: str,
     at: ArrayLike,
     colour: Colour,
@@ -276,8 +273,8 @@ def draw_text(
 
 
 def with_legend(
-    canvas: NDArray[np.uint8], words: Sequence[tuple[str, Colour]], column_px: int, size: float
-) -> NDArray[np.uint8]:
+    canvas: ByteArray, words: Sequence[tuple[str, Colour]], column_px: int, size: float
+) -> ByteArray:
     """The picture, and below it words in columns of some width."""
     times = enlargement(canvas)
     width = int(canvas.shape[1])
@@ -324,9 +321,7 @@ _STAGE_COLOURS: dict[str, Colour] = {
 }
 
 
-def draw_tracks(
-    image: NDArray[np.uint8], table: VerticalTable, found: LineDetections
-) -> NDArray[np.uint8]:
+def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -> ByteArray:
     """Draw the points of tracks, coloured by their fates, with a legend below."""
     canvas = canvas_of(image)
     for t, fate in enumerate(found.fate):
@@ -337,7 +332,7 @@ def draw_tracks(
     return with_legend(canvas, words, 190, 0.38)
 
 
-def draw_candidates(picture: NDArray[np.uint8], found: MarkerDetections) -> NDArray[np.uint8]:
+def draw_candidates(picture: ByteArray, found: MarkerDetections) -> ByteArray:
     """The picture with candidates that are no markers, and below it why any were rejected."""
     for candidate in found.candidates:
         if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
@@ -348,12 +343,12 @@ def draw_candidates(picture: NDArray[np.uint8], found: MarkerDetections) -> NDAr
 
 
 def draw_disc_candidates(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     camera: Camera,
     radius_m: float,
     candidates: Sequence[Candidate],
     at: tuple[float, float] | None = None,
-) -> NDArray[np.uint8]:
+) -> ByteArray:
     """Draw candidates for discs by what became of them, numbered as they come, with a legend."""
     canvas = canvas_of(image, camera)
     for number, candidate in enumerate(candidates, start=1):

@@ -18,6 +18,7 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import SeenRows
 from detect.seen import ellipses, summed_steps
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-
-FloatArray = NDArray[np.float64]
 
 #: Colours that stay apart in print and for the colour-blind; differences remain without them.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
@@ -363,7 +362,7 @@ class RateCurve(NamedTuple):
     threshold: FloatArray
     recall: FloatArray
     precision: FloatArray
-    kept: NDArray[np.int64]
+    kept: IntArray
 
 
 def rates_over(comparison: DiscComparison | LineComparison, thresholds: ArrayLike) -> RateCurve:

@@ -46,6 +46,7 @@ from detect.sources.poses import (
     carried,
     heading_rad,
 )
+from redetect.array_types import FloatArray, GreyImage
 from redetect.storage.messages import OneLineError, excerpt, one_line
 
 if TYPE_CHECKING:
@@ -207,8 +208,6 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 # A pose's covariance has not grown where that is less definite than this, against its own.
 _INDEFINITE = 1e-9
 
-Matrix = NDArray[np.float64]
-
 
 class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
@@ -241,7 +240,7 @@ class Bag(Source):
             for number, (kind, recorded_s, message) in enumerate(said):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
-                content: bytes | NDArray[np.uint8] | None = None
+                content: bytes | GreyImage | None = None
                 failure = None
                 try:
                     with understood(name):
@@ -273,7 +272,7 @@ class Bag(Source):
         return PoseStream(name, self.path, lambda: _summed(_odometry_poses(self.path, found, name)))
 
 
-def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPose, Matrix]]:
+def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPose, FloatArray]]:
     """Poses of a topic, each with the (3, 3) covariance of its twist, in the robot's frame."""
     with opened_bag(path) as reader:
         for _, recorded_s, message in messages(reader, path, topic):
@@ -296,7 +295,7 @@ def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPo
             yield TimedPose(time_s, float(p.x), float(p.y), theta, planar), twist
 
 
-def _summed(poses: Iterator[tuple[TimedPose, Matrix]]) -> Generator[TimedPose, None, None]:
+def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPose, None, None]:
     """Poses with the sum of what each movement adds to the covariance since the first.
 
     That is what the pose's own has grown by or, where it has not grown as by a movement (a driver
@@ -381,9 +380,9 @@ def _camera_of_info(message: Any, name: str) -> Camera:
     return converted.camera
 
 
-def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Matrix]]:
+def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, FloatArray]]:
     """Parent and 4x4 parent_from_child of each child frame, of a bag's ``/tf_static``."""
-    found: dict[str, tuple[str, Matrix]] = {}
+    found: dict[str, tuple[str, FloatArray]] = {}
     if all((c.topic, c.msgtype) != _STATIC for c in reader.connections):
         return found
     with understood(f"{path}: {_STATIC[0]}"):
@@ -398,8 +397,8 @@ def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, Mat
 
 
 def pose_in_dataset(
-    transforms: dict[str, tuple[str, Matrix]], base: str, optical: str
-) -> Matrix | None:
+    transforms: dict[str, tuple[str, FloatArray]], base: str, optical: str
+) -> FloatArray | None:
     """The (3, 4) `robot_from_camera` of an optical frame; None if no chain leads to the base."""
     placed, frame = np.eye(4), optical.lstrip("/")
     for _ in range(len(transforms) + 1):
@@ -413,7 +412,7 @@ def pose_in_dataset(
     return None  # a circle
 
 
-def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
+def rotation_of(qx: float, qy: float, qz: float, qw: float) -> FloatArray:
     """The rotation matrix of a quaternion of any length but zero; else a ValueError."""
     q = np.array([qx, qy, qz, qw], dtype=np.float64)
     largest = np.abs(q).max()
@@ -423,7 +422,7 @@ def rotation_of(qx: float, qy: float, qz: float, qw: float) -> Matrix:
     return np.asarray(Rotation.from_quat(q / largest).as_matrix())
 
 
-def _field(message: Any, letter: str) -> Matrix:
+def _field(message: Any, letter: str) -> FloatArray:
     """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
     name = letter.upper() if hasattr(message, letter.upper()) else letter
     return np.array(getattr(message, name), dtype=np.float64)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from detect.errors import DetectError, FrameError
+from redetect.array_types import GreyImage
 from redetect.landmarks import Step
 from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded, without_orientation
 
@@ -41,7 +42,7 @@ class RunFrame:
     step: Step
     image: Path | None  # its file, where it has one
     #: The encoded image or (H, W) uint8 grey values, where it comes from no file of its own.
-    content: bytes | NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
+    content: bytes | GreyImage | None = field(default=None, compare=False, repr=False)
     time_s: float | None = None  # when it was taken, where that is known
     bits: int = 16  # significant bits of a file with more than 8
     failure: str | None = None  # why there is no image, although there should be
@@ -193,7 +194,7 @@ class Run(ImageRun):
 
 def read_image(
     frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
-) -> NDArray[np.uint8]:
+) -> GreyImage:
     """The grey image of a frame (H, W); 16 bits are brought to 8 (see `detect.sources.interface`).
 
     It must have the size of the camera, if any. Relative paths start from `working_folder`, by
@@ -234,7 +235,7 @@ _BYTES_BESIDE = 1 << 23
 
 def decode_gray(
     content: bytes, name: object, bits: int = 16, size: tuple[int, int] | None = None
-) -> NDArray[np.uint8]:
+) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
     Parameters
@@ -263,7 +264,7 @@ def decode_gray(
     return gray_of_pixels(image, name, bits)
 
 
-def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> NDArray[np.uint8]:
+def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> GreyImage:
     """Bring pixels to (H, W) uint8 grey values, contiguous and writable.
 
     They are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps

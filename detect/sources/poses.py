@@ -18,15 +18,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.options import Axes
 from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source, text_rows
+from redetect.array_types import FloatArray
 from redetect.landmarks import Step, read_steps, wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 #: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
