@@ -5,6 +5,8 @@
 >>> camera.floor_from_pixel([384, 200])             # doctest: +SKIP
 """
 
+from camera.camfile import camera_file_in as camera_file_in
+from camera.camfile import camera_in as camera_in
 from camera.camfile import format_camera as format_camera
 from camera.camfile import parse_camera as parse_camera
 from camera.camfile import read_camera as read_camera

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import re
 from itertools import pairwise
+from pathlib import Path
 
 from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL
 from camera.errors import CameraError
@@ -54,6 +55,25 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     """
     text = read_text(path, LARGEST_FILE_BYTES, "calibration file", CameraError)
     return parse_camera(text, name=os.fspath(path))
+
+
+def camera_file_in(folder: Path, stem: str = "") -> Path | None:
+    """The ``.cam`` file of a stem in a folder, or the only one there; None if there is none.
+
+    The stem is by default the folder's own name. Raises CameraError if there are several others.
+    """
+    own = folder / f"{stem or folder.resolve().name}.cam"
+    found = [own] if own.is_file() else sorted(folder.glob("*.cam"))
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found[:4])
+        raise CameraError(f"{folder}: several calibrations ({names}): name one by --camera")
+    return found[0] if found else None
+
+
+def camera_in(folder: Path, stem: str = "") -> Camera | None:
+    """The calibration in a folder, as `camera_file_in` finds it; None if there is none."""
+    path = camera_file_in(folder, stem)
+    return None if path is None else read_camera(path)
 
 
 def parse_camera(text: str, name: str = "<text>") -> Camera:

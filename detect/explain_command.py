@@ -6,11 +6,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from camera import Camera, read_camera
+from camera import Camera, camera_in, read_camera
 from detect.discs.unfound import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.errors import DetectError
-from detect.sources.interface import RunFrame, camera_in, read_image, still
+from detect.sources.interface import RunFrame, read_image, still
 from detect.viewing_options import Explain
 from redetect.storage import demand_place, write_bytes
 
@@ -40,8 +40,7 @@ def perform(command: Explain) -> int:
 def _camera(command: Explain) -> Camera:
     if command.camera is not None:
         return read_camera(command.camera)
-    folders = [command.image.absolute().parent, command.image.absolute().parent.parent]
-    for folder in folders:
+    for folder in command.image.absolute().parents[:2]:
         camera = camera_in(folder)
         if camera is not None:
             return camera

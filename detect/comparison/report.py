@@ -11,7 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from camera import Camera, read_camera
+from camera import Camera, camera_in, read_camera
 from detect.comparison.compare import compare_with_file
 from detect.comparison.result import (
     WORST_FRAMES,
@@ -28,7 +28,6 @@ from detect.comparison.result import (
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.seen import Sight
-from detect.sources.interface import camera_in
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera, read_camera
+from camera import Camera, camera_in
 from detect.errors import DetectError, FrameError
 from redetect.array_types import GreyImage
 from redetect.landmarks import Step
@@ -78,7 +78,7 @@ class Source(Frames):
 
         One of several is refused, and, if `posed`, one whose pose above the floor is not known.
         """
-        return None if self.beside is None else only_calibration(*self.beside)
+        return None if self.beside is None else camera_in(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry that it has itself: of a topic, or the only one; None if there is none."""
@@ -100,16 +100,6 @@ def numbered_prefix(stem: str, number: int) -> str:
 def still(prefix: str) -> Step:
     """The STEP row of a robot that does not move."""
     return Step(prefix, *[0.0] * 9)
-
-
-def only_calibration(folder: Path, stem: str) -> Camera | None:
-    """The ``.cam`` of a stem in a folder, or the only one there; None if there is none."""
-    own = folder / f"{stem}.cam"
-    found = [own] if own.is_file() else sorted(folder.glob("*.cam"))
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found[:4])
-        raise DetectError(f"{folder}: several calibrations ({names}): name one by --camera")
-    return read_camera(found[0]) if found else None
 
 
 #: The head of a file of times.
@@ -217,11 +207,6 @@ def read_image(
     if camera is not None and image.shape != (camera.height, camera.width):
         raise wrong_size(name, (image.shape[1], image.shape[0]), (camera.width, camera.height))
     return image
-
-
-def camera_in(folder: Path) -> Camera | None:
-    """The calibration in a run folder; None where there is none."""
-    return only_calibration(folder, folder.resolve().name)
 
 
 #: Significant bits of a 16-bit image.

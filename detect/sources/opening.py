@@ -6,7 +6,7 @@ import math
 import re
 from pathlib import Path
 
-from camera import read_camera
+from camera import camera_in, read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import (
@@ -17,7 +17,7 @@ from detect.sources.image_files import (
     bits_of_images,
     images_of_folder,
 )
-from detect.sources.interface import Frames, ImageRun, Run, Source, camera_in
+from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
     PoseStream,
@@ -50,10 +50,9 @@ def open_run(
     Raises
     ------
     DetectError
-        If there is no such thing, it cannot be read, or there is no calibration, or more than one
-        to choose from.
+        If there is no such thing, it cannot be read, or there is no calibration.
     camera.CameraError, redetect.landmarks.LandmarkFileError
-        If the calibration or the odometry cannot be read.
+        If the calibration or the odometry cannot be read, or there are several calibrations.
     """
     run = _open(name, camera_path, options or SourceOptions(), posed=True)
     if isinstance(run, Run):

@@ -189,7 +189,7 @@ def test_of_several_calibrations_the_runs_own(run_folder: Path, published_camera
 def test_several_calibrations_none_its_own(run_folder: Path) -> None:
     touch(run_folder, "a.png", "l.cam")
     (run_folder / "k.cam").rename(run_folder / "r.cam")
-    with pytest.raises(DetectError, match=r"several calibrations \(l\.cam, r\.cam\).*--camera"):
+    with pytest.raises(CameraError, match=r"several calibrations \(l\.cam, r\.cam\).*--camera"):
         open_run(run_folder)
 
 

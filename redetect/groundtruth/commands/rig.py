@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from camera import read_camera
+from camera import camera_file_in, read_camera
 from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.commands.outputs import (
     check_outputs,
@@ -119,13 +119,10 @@ def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]
 
 
 def _calibration(run: Path) -> Path:
-    own = run / f"{run.resolve().name}.cam"
-    found = sorted(run.glob("*.cam"))
-    if own in found:
-        return own
-    if len(found) != 1:
-        raise GroundTruthError(f"{run}: {len(found)} calibrations: expected one .cam file")
-    return found[0]
+    found = camera_file_in(run)
+    if found is None:
+        raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
+    return found
 
 
 def _markers(

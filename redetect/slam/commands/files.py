@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from camera import Camera, read_camera
+from camera import Camera, camera_in, read_camera
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
@@ -60,23 +60,19 @@ def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
 def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
     """Read the calibration that belongs to a run, a folder or a file in one.
 
-    By default it is the one ``.cam`` in the folder, ``<run>.cam`` if there are several. Raises
-    `SlamError` if there is none, or it is not clear which.
+    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
+    there is none, `camera.CameraError` if it is not clear which.
     """
     if camera is not None:
         return read_camera(camera)
     folder = run if run.is_dir() else run.parent
-    found = sorted(folder.glob("*.cam"))
-    own = folder / f"{folder.resolve().name}.cam"
-    if len(found) > 1 and own not in found:
-        names = ", ".join(path.name for path in found)
-        raise SlamError(f"{folder}: several calibrations ({names}): expected one by --camera")
-    if not found:
+    found = camera_in(folder)
+    if found is None:
         raise SlamError(
             f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
             "calibrate` makes one, `camera convert` brings one over from other programs"
         )
-    return read_camera(own if own in found else found[0])
+    return found
 
 
 def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from camera import Camera
+from camera import Camera, camera_in
 from detect.circles import CircleDetections
 from detect.cli import main
 from detect.comparison.compare import compare_frames
@@ -224,8 +224,6 @@ def test_without_a_calibration_the_floor_is_compared(
 
 def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path: Path) -> None:
     """All shipped rows, levelled by any tilt, are found again."""
-    from detect.sources.interface import camera_in
-
     folder = shared_data / "dlr" / "e"
     camera = camera_in(folder)
     assert camera is not None

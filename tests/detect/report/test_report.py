@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera import camera_in
 from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
-from detect.sources.interface import camera_in
 from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
 from tests.detect.test_cli import assert_refused
