@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from detect.errors import DetectError
-from detect.sources.interface import read_image_times
 from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
+from redetect.landmarks.times import read_times
 from redetect.storage import demand_place, write_whole
 
 if TYPE_CHECKING:
@@ -89,13 +89,13 @@ def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]
 
 def _times(command: Export) -> dict[str, float] | None:
     if command.times is not None:
-        return read_image_times(command.times)
+        return read_times(command.times)
     if command.rate_hz is not None:
         return None
     for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
         beside = command.file.with_name(name)
         if beside.is_file():
-            return read_image_times(beside)
+            return read_times(beside)
     return None
 
 

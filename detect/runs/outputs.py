@@ -19,8 +19,9 @@ from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.settings import CircleSettings
-from detect.sources.interface import TIMES_HEAD, ImageRun
+from detect.sources.interface import ImageRun
 from redetect.landmarks import format_head
+from redetect.landmarks.times import TIMES_HEAD
 
 #: In the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"

@@ -20,7 +20,7 @@ from detect.discs.identity import MappedDisc
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from detect.sources.image_files import image_name
-from detect.sources.interface import ImageRun, RunFrame, format_time
+from detect.sources.interface import ImageRun, RunFrame
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -34,6 +34,7 @@ from redetect.landmarks import (
     read_rows,
 )
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.landmarks.times import format_time
 
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt

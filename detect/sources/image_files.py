@@ -18,11 +18,11 @@ from detect.sources.interface import (
     RunFrame,
     Source,
     frame_prefix,
-    read_image_times,
     significant_bits_of_file,
     still,
 )
 from redetect.landmarks import read_steps
+from redetect.landmarks.times import read_times
 from redetect.storage.bounded import leads_out, link_out
 from redetect.storage.messages import excerpt
 
@@ -185,7 +185,7 @@ class ImageFiles(Source):
         self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names)
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
-        self._times = read_image_times(times_file) if times or times_file.is_file() else {}
+        self._times = read_times(times_file) if times or times_file.is_file() else {}
         self.has_times = bool(times) or times_file.is_file()
         self._bits = bits_of_images(self._names) if bits is None else bits
 

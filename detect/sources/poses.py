@@ -22,7 +22,7 @@ import numpy as np
 from detect.errors import DetectError
 from detect.options import Axes
 from detect.sources.image_files import last_part
-from detect.sources.interface import Frames, RunFrame, Source, text_rows
+from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, read_steps, wrap_angle
 
@@ -40,6 +40,7 @@ _INDEFINITE, _ROUNDING = 1e-8, 1e-12
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
+_LONGEST_ROW = 65536
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,18 +181,33 @@ def tick_poses(
 
 
 def _number_rows(path: Path, what: str, columns: str) -> Iterator[tuple[str, list[float]]]:
-    """The place and the finite numbers of each row of a file of some columns."""
+    """The place and the finite numbers of each row of a file of some columns.
+
+    Between them are blanks or commas; ``#`` begins a comment.
+    """
     count = len(columns.split())
-    for number, words in text_rows(path, what):
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise DetectError(
-                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
-            )
-        yield f"{path}:{number}", values
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            for number, line in enumerate(stream, start=1):
+                words = line[:_LONGEST_ROW].partition("#")[0].replace(",", " ").split()
+                if not words:
+                    continue
+                try:
+                    values = [float(word) for word in words]
+                except ValueError:
+                    values = []
+                if len(values) != count or not all(map(math.isfinite, values)):
+                    raise DetectError(
+                        f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: "
+                        f"{columns}"
+                    )
+                yield f"{path}:{number}", values
+    except FileNotFoundError:
+        raise DetectError(f"{path}: no such {what}") from None
+    except UnicodeDecodeError:
+        raise DetectError(f"{path}: is no text: expected a {what}") from None
+    except OSError as error:
+        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

@@ -23,7 +23,6 @@ from detect.sources.interface import (
     bounded_content,
     decode_gray,
     gray_of_pixels,
-    read_image_times,
     significant_bits_of_file,
 )
 from detect.sources.poses import step_between, tick_poses, tum_poses
@@ -222,8 +221,6 @@ DETECT_READERS: tuple[Reader, ...] = (
     Reader("trajectory", "e.tum", _trajectory, _DETECT,
            (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
     Reader("wheel ticks", "e.ticks", _ticks, _DETECT, (b"# t left right\n0 0 0\n1 500 510\n",),
-           NUMBERS),
-    Reader("image times", "e.times", read_image_times, _DETECT, (b"e.0000 0.1\ne.0001 0.2\n",),
            NUMBERS),
     Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),

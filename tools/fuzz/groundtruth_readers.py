@@ -17,7 +17,7 @@ from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
 from redetect.groundtruth.markers.boards import read_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
-from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
+from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.validation.reference_poses import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.scoring import read_relations
 from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NPZ_WORDS, NUMBERS, Reader
@@ -100,7 +100,6 @@ _RIGS = (
 
 GROUNDTRUTH_READERS: tuple[Reader, ...] = (
     _reader("poses", "laser.csv", read_planar_poses, _RAWSEEDS, b"0 1 2 3\n1 1 2 3\n"),
-    _reader("times", "a.times", read_times, b"e.0000 0.1\ne.0001 0.2\n"),
     _reader("rows", "rows.csv", lambda p: read_table(p, "x,y,z"), b"1,2,3\n4 5 6\n"),
     _reader("relations", "relations.csv", read_relations,
             b"0,1,0.5,0,0,0,0,0.1\n0 1 0.5 0 0 0 0 0.1\n"),

@@ -10,6 +10,7 @@ import numpy as np
 from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
 from redetect.landmarks.map_file import covariance_file, read_joint_covariance, read_map, read_path
 from redetect.landmarks.tilts import read_tilts
+from redetect.landmarks.times import read_times
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o import read_g2o
 from redetect.slam.formats.tum import read_tum
@@ -85,6 +86,7 @@ LANDMARK_READERS: tuple[Reader, ...] = (
     Reader("tilts", "e.tilt", read_tilts, _LANDMARK,
            (b"# x\nTILT e.0000 0.01 -0.02 1e-6 0 1e-6 9\nNOTILT e.0001 2\n",),
            (b"TILT", b"NOTILT", *NUMBERS)),
+    Reader("times", "e.times", read_times, _LANDMARK, (b"e.0000 0.1\ne.0001 0.2\n",), NUMBERS),
     Reader("map", "map.csv", read_map, _LANDMARK, (_MAP.encode(),),
            (b"disc,", b"line,", b'"', *NUMBERS)),
     Reader("path", "path.csv", read_path, _LANDMARK, (_PATH.encode(),),

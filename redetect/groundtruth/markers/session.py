@@ -20,9 +20,9 @@ from camera import Camera, read_camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.streams import read_times
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
 from redetect.landmarks import MarkerLandmark, read_frames
+from redetect.landmarks.times import read_times
 from redetect.storage.bounds import Bounds
 from redetect.storage.messages import excerpt
 

@@ -1,6 +1,6 @@
 """Poses over time: their files, poses at other times, and paths moved rigidly onto others.
 
-Files are RAWSEEDS' comma-separated streams, TUM trajectories and ``.times``. A RAWSEEDS stream has
+Files are RAWSEEDS' comma-separated streams and TUM trajectories. A RAWSEEDS stream has
 a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth the 3x3 covariance of
 (x, y, theta) row by row. It has no comments and no header.
 """
@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import parse_numbers, read_rows, read_table
+from redetect.groundtruth.files import parse_numbers, read_rows
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
-from redetect.storage.messages import excerpt
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
 RAWSEEDS_ROUNDING = 5e-7
@@ -149,22 +148,6 @@ def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
         " ".join([f"{t:.6f}", *(f"{v:.6f}" for v in pose[:3, 3]), *(f"{v:.9f}" for v in q)]) + "\n"
         for t, pose, q in zip(times_s, world_from_robot, quaternions)
     )
-
-
-def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Read a ``.times`` file, rows ``prefix seconds`` with `#` comments: seconds by image prefix.
-
-    Raises `GroundTruthError` if the file cannot be read, a row is malformed or a prefix is listed
-    twice.
-    """
-    times: dict[str, float] = {}
-    for line, (prefix,), (seconds,) in read_table(path, "prefix,seconds", ("prefix",)):
-        if prefix in times:
-            raise GroundTruthError(
-                f"{path}:{line}: prefix {excerpt(prefix)} is listed a second time"
-            )
-        times[prefix] = seconds
-    return times
 
 
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:

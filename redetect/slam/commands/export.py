@@ -18,6 +18,7 @@ from redetect.landmarks.map_file import (
     write_path,
     write_table,
 )
+from redetect.landmarks.times import read_times
 from redetect.slam.commands.files import camera_xy_of, demand_free, print_assumed, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import data_sets
@@ -37,7 +38,7 @@ from redetect.slam.formats.text import (
     from_dataset,
     text_rows,
 )
-from redetect.slam.formats.tum import read_times, read_tum, write_tum
+from redetect.slam.formats.tum import read_tum, write_tum
 from redetect.slam.options import Export, Import
 from redetect.slam.recording import landmark_files
 from redetect.storage.bounds import ABOVE_0, demand

@@ -58,18 +58,6 @@ def write_tum(
     write_text(path, rows, overwrite=overwrite)
 
 
-def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Read a file of times."""
-    times = {}
-    for line, text in text_rows(path):
-        words = text.partition("#")[0].replace(",", " ").split()
-        if words:
-            if len(words) != 2:
-                raise SlamError(f"{path}:{line}: {len(words)} words: expected a name and seconds")
-            times[words[0]] = finite(path, line, "t", words[1])
-    return times
-
-
 def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D:
     """Read a TUM trajectory of a path on the floor; the result is in the data set's axes.
 

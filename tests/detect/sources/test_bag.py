@@ -23,8 +23,8 @@ from detect.options import SourceOptions
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import gray_of_pixels, read_image
 from detect.sources.opening import open_source
-from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
+from redetect.landmarks.times import read_times
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 
 Captured = pytest.CaptureFixture[str]

@@ -19,8 +19,8 @@ from detect.options import SourceOptions
 from detect.sources import video as live
 from detect.sources.interface import read_image
 from detect.sources.opening import open_source
-from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
+from redetect.landmarks.times import read_times
 from tests.detect.recordings import write_video
 
 

@@ -14,11 +14,10 @@ from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import RunFrames
-from detect.sources.interface import format_time, read_image_times
 from detect.sources.opening import open_source
 from detect.sources.poses import TimedPose, pose_between, step_between, tick_poses, tum_poses
-from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
+from redetect.landmarks.times import format_time, read_times
 
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 
@@ -127,13 +126,6 @@ def test_a_missing_trajectory(timed_run: Path, tmp_path: Path) -> None:
     run = open_source(timed_run, None, SourceOptions(odometry=str(tmp_path / "gone.tum")))
     with pytest.raises(DetectError, match="no such TUM trajectory"):
         list(run.frames)
-
-
-@pytest.mark.parametrize("content", ["s.0000\n", "s.0000 1 2\n", "s.0000 inf\n", "s.0000 x\n"])
-def test_malformed_times(tmp_path: Path, content: str) -> None:
-    (tmp_path / "a.times").write_text("# head\n" + content)
-    with pytest.raises(DetectError, match=r"a\.times:2: .*expected an image's prefix and seconds"):
-        read_image_times(tmp_path / "a.times")
 
 
 def test_headings_of_quaternions(tmp_path: Path) -> None:

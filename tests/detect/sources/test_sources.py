@@ -16,8 +16,8 @@ from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import open_run, open_source
-from redetect.groundtruth.trajectories.streams import read_times
 from redetect.landmarks import read_frames
+from redetect.landmarks.times import read_times
 from tests.detect.recordings import write_video
 
 Captured = pytest.CaptureFixture[str]

@@ -15,7 +15,6 @@ from redetect.groundtruth.trajectories.streams import (
     format_planar_poses,
     format_tum,
     read_planar_poses,
-    read_times,
     write_planar_poses,
 )
 from redetect.groundtruth.trajectories.transforms import exp_se3, transform_from_quaternion
@@ -107,13 +106,12 @@ def test_any_bytes_are_poses_or_a_typed_error(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "poses.csv"
         path.write_bytes(content)
-        for read in (read_planar_poses, read_times):
-            message = str(path)
-            try:
-                read(path)
-            except GroundTruthError as error:
-                message = str(error)
-            assert message.startswith(str(path))
+        message = str(path)
+        try:
+            read_planar_poses(path)
+        except GroundTruthError as error:
+            message = str(error)
+        assert message.startswith(str(path))
 
 
 def test_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
@@ -146,15 +144,3 @@ def test_tum_rows_are_the_pose(tmp_path: Path) -> None:
         assert row[0] == time
         np.testing.assert_allclose(transform_from_quaternion(row[4:], row[1:4]), pose, atol=1e-6)
     assert format_tum(np.zeros(0), np.zeros((0, 4, 4))) == ""
-
-
-def test_times_are_read_by_prefix(tmp_path: Path) -> None:
-    path = tmp_path / "a.times"
-    path.write_text("# prefix seconds\na0001 1235.250000\na0002 1235.300000 # late\n")
-    assert read_times(path) == {"a0001": 1235.25, "a0002": 1235.3}
-    path.write_text("a 1\na 2\n")
-    with pytest.raises(GroundTruthError, match="a second time"):
-        read_times(path)
-    path.write_text("a 1 2\n")
-    with pytest.raises(GroundTruthError, match="expected prefix,seconds"):
-        read_times(path)

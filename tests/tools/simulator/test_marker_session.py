@@ -15,7 +15,7 @@ from camera import parse_camera, read_camera
 from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
 from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
-from redetect.groundtruth.trajectories.streams import read_planar_poses, read_times
+from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
@@ -23,6 +23,7 @@ from redetect.groundtruth.trajectories.transforms import (
     planar_transform,
     transform_from_quaternion,
 )
+from redetect.landmarks.times import read_times
 from tools.simulator.__main__ import main
 from tools.simulator.markers.calibration_set import (
     DOUBLE,
