@@ -30,6 +30,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import Polynomial as PowerSeries
 from numpy.polynomial.polynomial import polyroots
 
 from redetect.array_types import FloatArray
@@ -102,23 +103,17 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     Past it the image folds back on itself and the projection is undefined.
     """
     a2, a3, b1, b2, b3 = coef
-    # Coefficients of the powers of r, from 0 on.
-    numerator, its_slope = np.array([0.0, a2, a3]), np.array([a2, 2.0 * a3])
-    denominator, slope = np.array([1.0, b1, b2, b3]), np.array([b1, 2.0 * b2, 3.0 * b3])
-    # g' D^2 = D^2 + N D + r (N' D - N D'); at r = 0 it is 1, so g grows until the first positive
-    # root.
-    squared = np.convolve(denominator, denominator)
-    growth = np.zeros(13)
-    growth[:7] = squared
-    growth[:6] += np.convolve(numerator, denominator)
-    growth[1:6] += np.convolve(its_slope, denominator) - np.convolve(numerator, slope)
-    if any(polynomial):
-        k1, k2, k3 = polynomial
-        growth += np.convolve([0.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3], squared)
+    k1, k2, k3 = polynomial
+    r, numerator = PowerSeries([0.0, 1.0]), PowerSeries([0.0, a2, a3])
+    denominator = PowerSeries([1.0, b1, b2, b3])
+    # g' D^2; at r = 0 it is 1, so g grows until the first positive root.
+    growth = denominator**2 * PowerSeries([1.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
+    growth += numerator * denominator
+    growth += r * (numerator.deriv() * denominator - numerator * denominator.deriv())
     # Stay a little short of a root, so that rounding does not reach past it: near a pole even of
     # second order the denominator must remain more than rounding.
-    fold = _first_positive_root(growth) * (1.0 - 1e-12)
-    pole = _first_positive_root(denominator) * (1.0 - 1e-7)
+    fold = _first_positive_root(growth.coef) * (1.0 - 1e-12)
+    pole = _first_positive_root(denominator.coef) * (1.0 - 1e-7)
     return min(fold, pole)
 
 

@@ -115,9 +115,8 @@ class Camera:
         for name in ("width", "height", "mount_index"):
             object.__setattr__(self, name, checked_whole(name, getattr(self, name)))
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
-        object.__setattr__(self, "coef", tuple(float(c) for c in self.coef))
-        object.__setattr__(self, "tangential", tuple(float(p) for p in self.tangential))
-        object.__setattr__(self, "polynomial", tuple(float(k) for k in self.polynomial))
+        for name in ("coef", "tangential", "polynomial"):
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         pose = checked_pose("sensor2World", self.robot_from_camera)
         object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from camera.calibration.model import COUNT, project_points
 from camera.model import PARAMETERS, Camera, Pose
+from camera.model_checks import checked_pose
 from camera.rotations import cross_matrices
 from redetect.array_types import FloatArray
 
@@ -52,7 +53,7 @@ def with_pose(camera: Camera, pose: FloatArray) -> Camera:
     A ``sensor2Tcp`` that it has stays: it belongs to its mount. One that has none gets the
     identity, which says that the sensor is its own tool.
     """
-    rows: Pose = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
+    rows = checked_pose("sensor2World", pose)
     return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
 
 

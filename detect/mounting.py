@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera import Camera, write_camera
+from camera.model_checks import checked_pose
 from camera.options import Level
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import DetectError
@@ -153,5 +154,5 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
     up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
-    a, b, c = ((float(x), float(y), float(z), float(t)) for x, y, z, t in pose)
-    return replace(camera, robot_from_camera=(a, b, c), covariance=None)
+    rows = checked_pose("sensor2World", pose)
+    return replace(camera, robot_from_camera=rows, covariance=None)

@@ -60,9 +60,8 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
     )
     detector = cv2.aruco.CharucoDetector(pattern)
     best = np.empty(0, dtype=np.int64), np.empty((0, 2))
-    height, width = image.shape
     for taller in (False, True):
-        picture = cv2.resize(image, (width, 2 * height)) if taller else image
+        picture = twice_as_high(image) if taller else image
         try:
             corners, identities, _, _ = detector.detectBoard(picture)
         except cv2.error as error:
@@ -70,13 +69,24 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
         if identities is None or len(identities) <= len(best[0]):
             continue
         found = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        if taller:
-            # Row v of the image is at 2 v + 0.5 of the taller one.
-            found = np.column_stack([found[:, 0], 0.5 * (found[:, 1] - 0.5)])
+        found = of_half_height(found) if taller else found
         best = np.asarray(identities, dtype=np.int64).ravel(), found
         if len(best[0]) == (board.columns - 1) * (board.rows - 1):
             break
     return best
+
+
+def twice_as_high(image: GreyImage) -> GreyImage:
+    """The image stretched: half-height ones flatten what is square or round."""
+    height, width = image.shape
+    return np.asarray(
+        cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+    )
+
+
+def of_half_height(pixels: FloatArray) -> FloatArray:
+    """(N, 2) pixels of `twice_as_high` in the image itself: row v is at 2 v + 0.5 there."""
+    return np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)])
 
 
 def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:
@@ -216,10 +226,8 @@ def _agreement(window: FloatArray, away_px: FloatArray, weight: FloatArray, pari
     """Weighted correlation of grey values with the print: +1 as printed, -1 its negative."""
     soft = np.clip(away_px / _REACH_PX, -1.0, 1.0)
     light = soft[:, 0] * soft[:, 1] * (-1.0 if parity == 0 else 1.0)
-    total = weight.sum()
-    if total <= 0.0:
+    if weight.sum() <= 0.0:
         return 0.0
-    grey = window - np.sum(weight * window) / total
-    light = light - np.sum(weight * light) / total
-    both = np.sum(weight * grey * grey) * np.sum(weight * light * light)
-    return float(np.sum(weight * grey * light) / np.sqrt(both)) if both > 0.0 else 0.0
+    covariance = np.cov(window, light, bias=True, aweights=weight)
+    both = covariance[0, 0] * covariance[1, 1]
+    return float(covariance[0, 1] / np.sqrt(both)) if both > 0.0 else 0.0

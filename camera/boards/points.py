@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.boards.board import Board
-from camera.boards.charuco import find_charuco
+from camera.boards.charuco import find_charuco, of_half_height, twice_as_high
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
@@ -71,12 +71,12 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
         per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
         # Half-height images flatten the squares.
         for taller in (False, True):
-            searched = _twice_as_high(reduced) if taller else reduced
+            searched = twice_as_high(reduced) if taller else reduced
             found, corners = cv2.findChessboardCorners(searched, size)
             if not found:
                 continue
             flat = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-            flat = _of_half_height(flat) if taller else flat
+            flat = of_half_height(flat) if taller else flat
             flat = (flat + 0.5) * per_pixel - 0.5
             grid = flat.astype(np.float32).reshape(board.rows, board.columns, 2)
             return _in_order(image, _refined(image, grid, window))
@@ -90,7 +90,7 @@ def corners_counted(image: GreyImage) -> tuple[int, int] | None:
     """
     reduced = next(_reductions(image), image)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for searched in (reduced, _twice_as_high(reduced)):
+    for searched in (reduced, twice_as_high(reduced)):
         found, _, meta = cv2.findChessboardCornersSBWithMeta(searched, (3, 3), flags)
         if found:
             rows, columns = np.asarray(meta).shape[:2]
@@ -199,32 +199,19 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
     for taller in (False, True):
         for negative in (False, True):
             picture = 255 - image if negative else image
-            searched = _twice_as_high(picture) if taller else picture
+            searched = twice_as_high(picture) if taller else picture
             for extra in (0, cv2.CALIB_CB_CLUSTERING):
                 found, centres = cv2.findCirclesGrid(searched, size, flags=flag | extra)
                 if not found:
                     continue
                 flat = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
-                grid = (_of_half_height(flat) if taller else flat).reshape(
+                grid = (of_half_height(flat) if taller else flat).reshape(
                     board.rows, board.columns, 2
                 )
                 if board.kind == "circles":
                     grid = _from_the_front(grid)
                 return circle_centroids(picture, grid)
     raise _not_found(board)
-
-
-def _twice_as_high(image: GreyImage) -> GreyImage:
-    """The image stretched: half-height ones flatten what is square or round."""
-    height, width = image.shape
-    return np.asarray(
-        cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
-    )
-
-
-def _of_half_height(pixels: FloatArray) -> FloatArray:
-    """(N, 2) pixels of `_twice_as_high` in the image itself: row v is at 2 v + 0.5 there."""
-    return np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)])
 
 
 def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:

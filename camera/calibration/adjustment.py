@@ -89,6 +89,12 @@ class Estimate:
         """With the poses of some views only."""
         return Estimate(self.intrinsics, self.rotations[views], self.translations[views])
 
+    def with_poses(self, views: IntArray, other: Estimate) -> Estimate:
+        """With another one's poses, which are of some views, in the place of its own."""
+        rotations, translations = self.rotations.copy(), self.translations.copy()
+        rotations[views], translations[views] = other.rotations, other.translations
+        return replace(self, rotations=rotations, translations=translations)
+
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:

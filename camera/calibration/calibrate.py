@@ -76,11 +76,9 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
 
 def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
     """Number of points in each cell of the image, (rows, columns)."""
-    u = np.clip(((points.pixels[:, 0] + 0.5) * columns / points.width).astype(int), 0, columns - 1)
-    v = np.clip(((points.pixels[:, 1] + 0.5) * rows / points.height).astype(int), 0, rows - 1)
-    counts = np.zeros((rows, columns), dtype=np.int64)
-    np.add.at(counts, (v, u), 1)
-    return counts
+    shape, size = np.array([columns, rows]), np.array([points.width, points.height])
+    u, v = np.clip(((points.pixels + 0.5) * shape / size).astype(int), 0, shape - 1).T
+    return np.bincount(v * columns + u, minlength=rows * columns).reshape(rows, columns)
 
 
 def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:

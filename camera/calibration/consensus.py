@@ -123,21 +123,19 @@ def _fitted(
     """Fit to the views that are used; of the others the poses alone."""
     views, others = np.flatnonzero(used), np.flatnonzero(~used)
     fit, _ = fit_points(estimate.of(views), points.of(views), settings, lens, radius_m)
-    rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
-    rotations[views], translations[views] = fit.estimate.rotations, fit.estimate.translations
+    found = replace(estimate, intrinsics=fit.estimate.intrinsics).with_poses(views, fit.estimate)
     residuals = np.empty_like(points.pixels)
     residuals[used[points.views]] = fit.residuals
     if len(others):
         rest = points.of(others)
-        start = replace(estimate.of(others), intrinsics=fit.estimate.intrinsics)
-        posed = best_poses(start, rest)
-        rotations[others], translations[others] = posed.rotations, posed.translations
+        posed = best_poses(found.of(others), rest)
+        found = found.with_poses(others, posed)
         residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
     typical = view_rms(residuals, points, _COUNTED_SHARE)
     rms = view_rms(residuals, points)
     return Consensus(
         fit=fit,
-        estimate=Estimate(fit.estimate.intrinsics, rotations, translations),
+        estimate=found,
         rms_px=rms,
         agree=(typical <= _FAR * np.median(typical[used])) & np.isfinite(rms),
     )

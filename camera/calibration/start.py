@@ -85,11 +85,11 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
     candidates = [estimate, *board_poses(estimate.intrinsics, points)]
     fits = [_poses_alone(candidate, points) for candidate in candidates]
     errors = np.stack([view_errors(fit, points) for fit in fits])
-    use = np.argmin(errors, axis=0)
-    every = np.arange(len(points.counts))
-    rotations = np.stack([fit.rotations for fit in fits])[use, every]
-    translations = np.stack([fit.translations for fit in fits])[use, every]
-    return Estimate(estimate.intrinsics, rotations, translations)
+    best = fits[0]
+    for k, fit in enumerate(fits[1:], start=1):
+        better = np.flatnonzero(np.argmin(errors, axis=0) == k)
+        best = best.with_poses(better, fit.of(better))
+    return best
 
 
 def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
@@ -98,14 +98,10 @@ def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
     if not len(seen):
         return estimate
     try:
-        fit = adjust(
-            estimate.of(seen), points.of(seen), np.zeros((COUNT, 0)), tolerance=_LOOSE
-        ).estimate
+        fit = adjust(estimate.of(seen), points.of(seen), np.zeros((COUNT, 0)), tolerance=_LOOSE)
     except (StartError, np.linalg.LinAlgError):
         return estimate
-    rotations, translations = estimate.rotations.copy(), estimate.translations.copy()
-    rotations[seen], translations[seen] = fit.rotations, fit.translations
-    return Estimate(estimate.intrinsics, rotations, translations)
+    return estimate.with_poses(seen, fit.estimate)
 
 
 def view_errors(estimate: Estimate, points: Points) -> FloatArray:
