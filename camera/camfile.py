@@ -37,16 +37,6 @@ _Entries = dict[str, list[tuple[str, int]]]
 def read_camera(path: str | os.PathLike[str]) -> Camera:
     """Read a ``.cam`` file.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Returns
-    -------
-    Camera
-        The calibrated camera.
-
     Raises
     ------
     CameraError

@@ -22,15 +22,9 @@ class LandmarkError(OneLineError, ValueError):
 
 
 class LandmarkFileError(LandmarkError):
-    """A landmark file that cannot be read.
+    """A landmark file that cannot be read: what was found and what was expected.
 
-    Parameters
-    ----------
-    file : path
-    line : int or None
-        The wrong line, counted from 1; None if the error concerns the whole file.
-    problem : str
-        What was found and what was expected.
+    The wrong line is counted from 1; None if the error concerns the whole file.
     """
 
     def __init__(self, file: str | os.PathLike[str], line: int | None, problem: str) -> None:
