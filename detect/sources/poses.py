@@ -25,6 +25,7 @@ from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, read_steps, wrap_angle
+from redetect.storage.bounded import read_text
 
 #: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
@@ -40,7 +41,7 @@ _INDEFINITE, _ROUNDING = 1e-8, 1e-12
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
-_LONGEST_ROW = 65536
+_LARGEST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,28 +187,20 @@ def _number_rows(path: Path, what: str, columns: str) -> Iterator[tuple[str, lis
     Between them are blanks or commas; ``#`` begins a comment.
     """
     count = len(columns.split())
-    try:
-        with path.open(encoding="utf-8-sig") as stream:
-            for number, line in enumerate(stream, start=1):
-                words = line[:_LONGEST_ROW].partition("#")[0].replace(",", " ").split()
-                if not words:
-                    continue
-                try:
-                    values = [float(word) for word in words]
-                except ValueError:
-                    values = []
-                if len(values) != count or not all(map(math.isfinite, values)):
-                    raise DetectError(
-                        f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: "
-                        f"{columns}"
-                    )
-                yield f"{path}:{number}", values
-    except FileNotFoundError:
-        raise DetectError(f"{path}: no such {what}") from None
-    except UnicodeDecodeError:
-        raise DetectError(f"{path}: is no text: expected a {what}") from None
-    except OSError as error:
-        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
+    lines = read_text(path, _LARGEST_BYTES, what, DetectError).split("\n")
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise DetectError(
+                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
+            )
+        yield f"{path}:{number}", values
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
