@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
+from redetect.storage.bounds import MaybePath
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 Format = Literal["auto", "cam", "opencv", "ros", "kalibr", "colmap"]

@@ -7,20 +7,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
-from redetect.storage.bounds import NotNegative, demand_fields, whole
-
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
+from redetect.storage.bounds import (
+    MaybeFloat,
+    MaybeInt,
+    MaybePath,
+    MaybeStr,
+    NotNegative,
+    demand_fields,
+    whole,
+)
 
 Preset = Literal["default", "published"]
 DiscPreset = Literal["default", "published", "report"]

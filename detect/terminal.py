@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import NoReturn
 
+from detect.errors import EXIT_FRAMES_FAILED
 from redetect.storage.messages import is_quiet
 
 _received = threading.Event()
@@ -161,11 +162,12 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
         progress.stop()
 
 
-def print_failures(count: int, first: Sequence[str]) -> None:
-    """Print which frames could not be processed, as many as fit on a screen."""
+def report_failures(count: int, first: Sequence[str]) -> int:
+    """Print which frames could not be processed, as many as fit on a screen; the exit code."""
     if not count:
-        return
+        return 0
     shown = [f"  {line}" for line in first[:_SHOWN_FAILURES]]
     if count > _SHOWN_FAILURES:
         shown.append(f"  and {count - _SHOWN_FAILURES} more")
     print(f"{count} frames could not be worked on:", *shown, sep="\n", file=sys.stderr)
+    return EXIT_FRAMES_FAILED

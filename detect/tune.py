@@ -20,7 +20,7 @@ from detect import __version__
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.drawing.inputs import select_frames
-from detect.errors import EXIT_FRAMES_FAILED, DetectError
+from detect.errors import DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
 from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
@@ -29,7 +29,7 @@ from detect.settings import PUBLISHED, CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
-from detect.terminal import print_failures, progress_bar
+from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
@@ -116,8 +116,7 @@ def perform(options: Tune) -> int:
                 f"precision {record['precision']:.3f}"
             )
     failures = sorted({failure for trial in trials for failure in trial.failures})
-    print_failures(len(failures), failures)
-    return EXIT_FRAMES_FAILED if failures else 0
+    return report_failures(len(failures), failures)
 
 
 def _base(options: Tune) -> Settings:

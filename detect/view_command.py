@@ -14,11 +14,11 @@ from camera import Camera
 from detect.comparison.compare import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, open_rows, select_frames
-from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
+from detect.errors import DetectError, FrameError
 from detect.seen import circle_on_floor, image_positions, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
-from detect.terminal import print_failures, progress_bar
+from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import View
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
@@ -78,8 +78,7 @@ def perform(options: View) -> int:
         if options.output is not None:
             write_bytes(options.output, raw.read_bytes(), overwrite=options.force)
             print(f"{options.output}: open it by: rerun {options.output}")
-    print_failures(len(failures), failures)
-    return EXIT_FRAMES_FAILED if failures else 0
+    return report_failures(len(failures), failures)
 
 
 def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:

@@ -7,24 +7,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import CompareError
 from detect.line_settings import LineSettings
-from detect.options import (
+from detect.options import PickedFrames, Preset, RunFlags, SourceOptions
+from detect.settings import CircleSettings
+from redetect.storage.bounds import (
+    ABOVE_0,
     MaybeFloat,
     MaybeInt,
     MaybePath,
+    MaybePixel,
     MaybeStr,
-    PickedFrames,
-    Preset,
-    RunFlags,
-    SourceOptions,
+    NotNegative,
+    Positive,
+    demand_fields,
+    whole,
 )
-from detect.settings import CircleSettings
-from redetect.storage.bounds import ABOVE_0, NotNegative, Positive, demand_fields, whole
 
 ErrorCovariance = Literal["detected", "reference", "sum"]
 
@@ -95,10 +97,6 @@ class Compare:
     json: MaybePath = None  #: Write the result as JSON; -: to standard output, alone.
     force: bool = False  #: Replace an existing JSON file.
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
-
-
-# As in `detect.flags`.
-MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
 
 
 @dataclass(frozen=True)

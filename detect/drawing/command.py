@@ -13,10 +13,10 @@ import numpy as np
 
 from detect.drawing.frame import draw_rows, png_of
 from detect.drawing.inputs import open_rows, picture_name, select_frames
-from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError
+from detect.errors import DetectError, FrameError
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.terminal import print_failures, progress_bar
+from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import CompareOptions, Draw
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
@@ -70,8 +70,7 @@ def perform(options: Draw) -> int:
     for where in (options.output, options.video):
         if where is not None:
             print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
-    print_failures(len(failures), failures)
-    return EXIT_FRAMES_FAILED if failures else 0
+    return report_failures(len(failures), failures)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.drawing.inputs import read_head
-from detect.errors import EXIT_FRAMES_FAILED, DetectError, FrameError, WorkerError
+from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.runs.outputs import frames_tilt_place
 from detect.runs.plan import Drawing, FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
@@ -23,7 +23,7 @@ from detect.runs.workers import Workers, cluster_workers, default_jobs, local_wo
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import open_run, open_source
-from detect.terminal import print_failures, progress_bar
+from detect.terminal import progress_bar, report_failures
 from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
@@ -51,8 +51,7 @@ def perform(command: DetectorFlags) -> int:
         print(hint, file=sys.stderr)
     if summary.images_without_step:
         print(f"{summary.images_without_step} {job.run.frames.why_left_out}")
-    print_failures(summary.failed, summary.failures)
-    return EXIT_FRAMES_FAILED if summary.failed else 0
+    return report_failures(summary.failed, summary.failures)
 
 
 def _job_of(command: DetectorFlags) -> Job:

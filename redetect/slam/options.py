@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from redetect.slam.models import OdometryNoise
 from redetect.slam.settings import AddedNoise, AssociateSettings
-
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
+from redetect.storage.bounds import MaybePath, MaybeStr
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -213,6 +213,6 @@ def test_a_trajectory_with_times(tmp_path: Path, capsys: Capture) -> None:
     named = [*arguments, str(tmp_path / "f.tum"), "--times"]
     refused([*named, str(run / "a.times")], f"no time of {prefixes[-1]}: expected", capsys)
     (tmp_path / "c.times").write_text(rows[0] + "e.0001 x\n")
-    refused([*named, str(tmp_path / "c.times")], "c.times:2: t is 'x': expected", capsys)
+    refused([*named, str(tmp_path / "c.times")], "c.times:2: 'e.0001 x': expected", capsys)
     (tmp_path / "c.times").write_text("e.0001\n")
-    refused([*named, str(tmp_path / "c.times")], "c.times:1: 1 words: expected", capsys)
+    refused([*named, str(tmp_path / "c.times")], "c.times:1: 'e.0001': expected", capsys)

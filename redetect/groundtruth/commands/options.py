@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -17,11 +17,7 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-
-# For `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
+from redetect.storage.bounds import MaybeInt, MaybePath, MaybeStr
 
 
 @dataclass(frozen=True)
