@@ -32,13 +32,7 @@ from redetect.storage import demand_place, write_bytes
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board.
-
-    Raises
-    ------
-    CalibrationError
-        If there can be no such board.
-    """
+    """A printed board; a CalibrationError if there can be no such board."""
 
     kind: BoardKind  #: `checkerboard`, `charuco`, `circles` or `asymmetric-circles`
     #: Checkerboard: inner corners. ChArUco: squares. Circles: circles in a row, and rows; of

@@ -49,10 +49,7 @@ _SMALLEST_STEP = 1e-6
 class ForeignCamera:
     """A camera in another program's model.
 
-    Raises
-    ------
-    ConversionError
-        If a number is not finite, or a size or focal length not positive.
+    A ConversionError is raised if a number is not finite, or a size or focal length not positive.
     """
 
     model: Model  #: `radtan`, `rational` or `fisheye`

@@ -242,34 +242,13 @@ _ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items(
 _ROS_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
-def camera_from_message(
-    width: int,
-    height: int,
-    distortion_model: str,
-    d: Sequence[float],
-    k: Sequence[float],
-    name: str = "camera_info",
-) -> ForeignCamera:
-    """A camera of the numbers of a ``sensor_msgs/CameraInfo`` message."""
-    if not any(k):
-        raise ConversionError(f"{name}: the camera matrix is 0: the camera is not calibrated")
-    pinhole = pinhole_matrix(list(k), "camera matrix", name)
-    d = [float(value) for value in d]
-    label = distortion_model or ("plumb_bob" if not any(d) else "")
-    if label not in _ROS_MODELS:
-        raise ConversionError(
-            f"{name}: distortion model {excerpt(distortion_model)}: expected "
-            f"{', '.join(_ROS_MODELS)}"
-        )
-    model = _ROS_MODELS[label]
-    if opencv_model(d, fisheye=model == "fisheye", name=name) != model:
-        raise ConversionError(f"{name}: {len(d)} coefficients, which are not of {label}")
-    return foreign(name, model, width, height, pinhole, d)
-
-
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of a camera_info YAML file, or of an echoed message."""
-    content = parse_yaml(text, name)
+    return camera_of_info(parse_yaml(text, name), name)
+
+
+def camera_of_info(content: dict[str, Any], name: str) -> ForeignCamera:
+    """A camera of the fields of a ``sensor_msgs/CameraInfo``, as a message or a file has them."""
     width, height = image_size(content, name)
     for key in ("binning_x", "binning_y"):
         binning = content.get(key)
@@ -277,16 +256,22 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
             raise ConversionError(f"{name}: {key} is {binning}: only unbinned images are converted")
     _demand_whole_image(content.get("roi"), width, height, name)
     matrix = first_of(content, ("camera_matrix", "k", "K"), name)
+    if not any(numbers(matrix, "camera_matrix", name)):
+        raise ConversionError(f"{name}: the camera matrix is 0: the camera is not calibrated")
+    pinhole = pinhole_matrix(matrix, "camera_matrix", name)
     coefficients = first_of(content, ("distortion_coefficients", "d", "D"), name)
+    d = numbers(coefficients, "distortion_coefficients", name)
     label = content.get("distortion_model", "plumb_bob")
-    return camera_from_message(
-        width,
-        height,
-        label if isinstance(label, str) else excerpt(label),
-        numbers(coefficients, "distortion_coefficients", name),
-        numbers(matrix, "camera_matrix", name),
-        name,
-    )
+    if label == "" and not any(d):
+        label = "plumb_bob"
+    if not isinstance(label, str) or label not in _ROS_MODELS:
+        raise ConversionError(
+            f"{name}: distortion model {excerpt(label)}: expected {', '.join(_ROS_MODELS)}"
+        )
+    model = _ROS_MODELS[label]
+    if opencv_model(d, fisheye=model == "fisheye", name=name) != model:
+        raise ConversionError(f"{name}: {len(d)} coefficients, which are not of {label}")
+    return foreign(name, model, width, height, pinhole, d)
 
 
 def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None:

@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
-from camera.formats.yaml_files import camera_from_message
+from camera.formats.yaml_files import camera_of_info
 from camera.uncertainty import with_pose
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import (
@@ -362,13 +363,14 @@ def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
 
 def _camera_of_info(message: Any, name: str) -> Camera:
     """The camera of a whole image's camera_info, without its pose, in the project's model."""
-    part = message.roi.width or message.roi.height
-    if part or max(message.binning_x, message.binning_y) > 1:
-        raise DetectError(f"{name}: binning or roi is set: name a calibration by --camera")
-    d, k = (_field(message, letter).tolist() for letter in "dk")
-    foreign = camera_from_message(
-        message.width, message.height, message.distortion_model, d, k, name
-    )
+    fields = {letter: _field(message, letter).tolist() for letter in "dk"} | {
+        key: getattr(message, key)
+        for key in ("width", "height", "distortion_model", "binning_x", "binning_y")
+    }
+    try:
+        foreign = camera_of_info({**fields, "roi": vars(message.roi)}, name)
+    except ConversionError as error:
+        raise DetectError(f"{error}: name a calibration by --camera") from None
     converted = convert_to_camera(foreign)
     if not converted.deviation_px <= LIMIT_PX:
         raise DetectError(

@@ -57,11 +57,8 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     first row is requested. A row's record is None for comments, blank lines and the settings of a
     detector, as the data set's files have them at their head.
 
-    Raises
-    ------
-    LandmarkFileError
-        If the file cannot be opened, a row is malformed, or a landmark precedes the first STEP; the
-        message names the file, the line and what was expected.
+    Raises LandmarkFileError if the file cannot be opened, a row is malformed, or a landmark
+    precedes the first STEP; the message names the file, the line and what was expected.
     """
     with opened(path, "landmark file") as stream:
         yield from parse_rows(stream, name=os.fspath(path))
@@ -119,10 +116,7 @@ def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
 def parse_record(text: str) -> Record | None:
     """Make a record of one row's text; None for a comment, a blank line or detector settings.
 
-    Raises
-    ------
-    LandmarkError
-        If the row is malformed; the message says what was expected.
+    Raises LandmarkError if the row is malformed; the message says what was expected.
     """
     return _record(_words(text.encode("utf-8", "surrogateescape")))
 

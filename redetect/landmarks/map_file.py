@@ -103,11 +103,8 @@ def read_map(path: FilePath) -> LandmarkMap:
 
     The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0.
 
-    Raises
-    ------
-    LandmarkFileError
-        If the file cannot be read, a row is malformed, a landmark is listed twice or a covariance
-        is negative; names file and line.
+    Raises LandmarkFileError if the file cannot be read, a row is malformed, a landmark is listed
+    twice or a covariance is negative; names file and line.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     what = "a map: map.csv of `slam map`"
@@ -152,10 +149,8 @@ def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite:
 def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArray | None:
     """Read the joint covariance (2 M, 2 M) of a map, None if there is no file of it beside.
 
-    Raises
-    ------
-    LandmarkFileError
-        If it is malformed, or not of this map, whose content is `landmark_map`.
+    Raises LandmarkFileError if it is malformed, or not of this map, whose content is
+    `landmark_map`.
     """
     path = covariance_file(map_file)
     if not path.is_file():

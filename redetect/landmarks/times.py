@@ -16,10 +16,7 @@ TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     """The times of images (s), by their prefixes; between the two may be a comma.
 
-    Raises
-    ------
-    LandmarkFileError
-        If the file cannot be read, a row is malformed or an image has two.
+    Raises LandmarkFileError if the file cannot be read, a row is malformed or an image has two.
     """
     times: dict[str, float] = {}
     with opened(path, "file of times") as stream:

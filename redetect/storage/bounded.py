@@ -129,10 +129,8 @@ def link_out(path: Path, *folders: Path) -> bool:
 def path_inside(folder: Path, name: str) -> Path:
     """Path of a file that another file names, in the other file's folder.
 
-    Raises
-    ------
-    ValueError
-        If it would be elsewhere; the message says why, as the end of one that starts with the name.
+    Raises ValueError if it would be elsewhere; the message says why, as the end of one that starts
+    with the name.
     """
     why = leads_out(name)
     if why is None and link_out(folder / name, folder):

@@ -23,7 +23,7 @@ from camera.formats.colmap import (
 from camera.formats.conversion import convert_to_camera, convert_to_foreign
 from camera.formats.models import ForeignCamera
 from camera.formats.yaml_files import (
-    camera_from_message,
+    camera_of_info,
     format_kalibr,
     format_opencv,
     format_ros,
@@ -125,7 +125,7 @@ def test_an_echoed_ros_message_is_read() -> None:
 
 def test_an_uncalibrated_ros_camera_is_refused() -> None:
     with pytest.raises(ConversionError, match="not calibrated"):
-        camera_from_message(640, 480, "", [], [0.0] * 9)
+        camera_of_info({"width": 640, "height": 480, "d": [], "k": [0.0] * 9}, "info")
 
 
 @pytest.mark.long

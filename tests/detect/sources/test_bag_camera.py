@@ -140,7 +140,7 @@ def test_camera_infos_that_say_nothing_or_too_little(
     for name, changed in (("binned", {"binning_x": 2}), ("cut", {"roi_width": 100})):
         said = [Said("/front/camera_info", 1.0, info(ros, plumb_bob, **changed))]
         path = ros.write(tmp_path / name, recorded(small_run, ros, said))
-        with pytest.raises(DetectError, match="binning or roi is set: name a calibration"):
+        with pytest.raises(DetectError, match="are converted: name a calibration"):
             open_source(path)
 
 
