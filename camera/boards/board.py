@@ -32,18 +32,19 @@ from redetect.storage import demand_place, write_bytes
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board; a CalibrationError if there can be no such board."""
+    """A printed board, as its flags describe it (`camera.options.BoardFlags`).
 
-    kind: BoardKind  #: `checkerboard`, `charuco`, `circles` or `asymmetric-circles`
-    #: Checkerboard: inner corners. ChArUco: squares. Circles: circles in a row, and rows; of
-    #: asymmetric circles every other row is moved by `square_m`.
+    Raises CalibrationError if there can be no such board.
+    """
+
+    kind: BoardKind
     columns: int
     rows: int
     #: Side of a square, or distance of neighbouring circles in a symmetric grid; of an asymmetric
     #: one half the distance of neighbours in a row, which is that of rows. Metres.
     square_m: float
-    marker_m: float = 0.0  #: Side of a ChArUco board's markers, metres
-    dictionary: str = "DICT_5X5_100"  #: The markers' dictionary, as OpenCV names it
+    marker_m: float = 0.0
+    dictionary: str = "DICT_5X5_100"
     #: Diameter of the circles, metres; 0 if unknown. With it, the shift of a circle's image against
     #: the image of its centre is taken into account.
     circle_m: float = 0.0

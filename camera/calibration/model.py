@@ -185,22 +185,17 @@ class FreeLens(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How to calibrate."""
+    """How to calibrate: what is None is chosen, as by the flags (`camera.options.Calibrate`)."""
 
     #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
     #: are free
     aspect: float | None = 1.0
-    #: Number of free radial coefficients (0 to 5, of the polynomial 0 to 3); None: as many as make
-    #: the hold-out error smaller. Of the rational function, unless `polynomial` is true.
+    #: Number of free radial coefficients: 0 to 5 of the rational function, 0 to 3 of a polynomial
     coefficients: int | None = None
-    #: Whether the tangential terms p1 and p2 are free; None: if that makes the hold-out error
-    #: smaller and they are more than noise
-    tangential: bool | None = None
-    #: Whether the radial distortion is the polynomial k1, k2, k3, not the rational one; None: if
-    #: that needs fewer coefficients, or makes the hold-out error much smaller
-    polynomial: bool | None = None
+    tangential: bool | None = None  #: Whether the tangential terms p1 and p2 are free
+    polynomial: bool | None = None  #: Whether the radial distortion is the polynomial k1, k2, k3
     robust: bool = True  #: Huber's loss; points found wrongly pull less
-    keep_outliers: bool = False  #: Keep pictures whose residuals are far above the others'
+    keep_outliers: bool = False
 
     def __post_init__(self) -> None:
         if self.aspect is not None:

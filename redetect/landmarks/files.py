@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 from redetect.landmarks.records import (
     CIRCLE_NUMBERS,
@@ -233,8 +233,6 @@ def _ids(words: list[bytes]) -> tuple[int, ...]:
     return tuple(map(int, words))
 
 
-LineEnd = Literal["\n", "\r\n"]
-
 _STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
 _CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
 _LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
@@ -265,18 +263,18 @@ def format_levelling(levelled_by: tuple[float, float]) -> str:
     return f"# levelled {pitch:.9f} {roll:.9f}"
 
 
-def format_head(head: str, line_end: LineEnd = "\n") -> bytes:
+def format_head(head: str) -> bytes:
     """A text as the comments at the head of a file: a ``#`` before each of its lines."""
     lines = head.split("\n") if head else []
-    return b"".join(_encode(f"# {line}".rstrip() + line_end) for line in lines)
+    return b"".join(_encode(f"# {line}".rstrip() + "\n") for line in lines)
 
 
-def format_frame(frame: Frame, line_end: LineEnd = "\n") -> bytes:
+def format_frame(frame: Frame) -> bytes:
     """The rows of a frame in a file: its STEP, its levelling and its landmarks."""
     rows = [format_record(record) for record in (frame.step, *frame.landmarks)]
     if frame.levelled_by is not None:
         rows.insert(1, format_levelling(frame.levelled_by))
-    return _encode("".join([row + line_end for row in rows]))
+    return _encode("".join(f"{row}\n" for row in rows))
 
 
 def write_frames(
@@ -284,28 +282,17 @@ def write_frames(
     frames: Iterable[Frame],
     *,
     head: str = "",
-    line_end: LineEnd = "\n",
     overwrite: bool = False,
 ) -> None:
-    """Write frames to a landmark file, whole or not at all.
+    """Write frames to a landmark file, whole or not at all, with a text as comments above them.
 
-    Parameters
-    ----------
-    path : path
-    frames : iterable of Frame
-        Written as they come: they need not be in memory at once.
-    head : str
-        Text to write above them, each line as a comment.
-    line_end : str
-        LF, or CRLF as in the data set's own files.
-    overwrite : bool
-        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
-        raised.
+    They are written as they come: they need not be in memory at once. An existing file is a
+    `redetect.storage.OutputExistsError` unless it may be overwritten.
     """
     with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(format_head(head, line_end))
+        stream.write(format_head(head))
         for frame in frames:
-            stream.write(format_frame(frame, line_end))
+            stream.write(format_frame(frame))
 
 
 def write_rows(
@@ -313,15 +300,8 @@ def write_rows(
 ) -> None:
     """Write rows to a landmark file, whole or not at all; unchanged ones byte by byte.
 
-    Parameters
-    ----------
-    path : path
-        May be the file that the rows are being read from.
-    rows : iterable of Row
-        Rows that have their text are copied; the others are laid out by `format_record` and end
-        like the row before them.
-    overwrite : bool
-        As in `write_frames`.
+    Rows that have their text are copied; the others are laid out by `format_record` and end like
+    the row before them. The path may be that of the file that the rows are being read from.
     """
     line_end = b"\n"
     text = line_end

@@ -69,8 +69,6 @@ def test_frames_are_written_in_the_data_sets_layout(tmp_path: Path) -> None:
     write_frames(path, iter(frames), head="Simulated.\n\nSee README.")
     assert path.read_text() == "# Simulated.\n#\n# See README.\n" + PUBLISHED
     assert list(read_frames(path)) == frames
-    write_frames(path, frames, line_end="\r\n", overwrite=True)
-    assert path.read_bytes() == PUBLISHED.replace("\n", "\r\n").encode()
 
 
 def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:

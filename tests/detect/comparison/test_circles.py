@@ -358,7 +358,9 @@ def test_text_escapes_what_a_terminal_would_obey() -> None:
 
 
 def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
-    write_frames(tmp_path / "map.circles", REFERENCE, line_end="\r\n")
+    write_frames(tmp_path / "map.circles", REFERENCE)
+    text = (tmp_path / "map.circles").read_bytes()
+    (tmp_path / "map.circles").write_bytes(text.replace(b"\n", b"\r\n"))
     write_frames(tmp_path / "detected.circles", DETECTED)
     found = comparison_of(Compare(tmp_path))
     assert (found.matched, found.missed, found.extra) == (4, 1, 1)
