@@ -13,8 +13,10 @@ import os
 import re
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from camera.distortion import NO_POLYNOMIAL, NOT_TANGENTIAL
+import numpy as np
+
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
 from redetect.storage import write_bytes
@@ -79,36 +81,30 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             raise CameraError(f"{name}:{line}: {key} is {value}: expected a whole number")
         return int(value)
 
-    pose = _rows(numbers("sensor2World", 12))
-    tcp = _rows(numbers("sensor2Tcp", 12)) if "sensor2Tcp" in entries else None
-    mount_index = whole("mountIndex") if "mountIndex" in entries else 0
-    width, height = whole("width"), whole("height")
-    scale_x, scale_y = numbers("scaleX", 1)[0], numbers("scaleY", 1)[0]
-    offset_x, offset_y = numbers("offsetX", 1)[0], numbers("offsetY", 1)[0]
-    a2, a3, b1, b2, b3 = numbers("coef", 5)
-    p1, p2 = numbers("tangential", 2) if "tangential" in entries else NOT_TANGENTIAL
-    k1, k2, k3 = numbers("polynomial", 3) if "polynomial" in entries else NO_POLYNOMIAL
-    covariance = None
-    if "covariance" in entries:
-        covariance = tuple(numbers("covariance", PARAMETERS * (PARAMETERS + 1) // 2))
-    unknown = tuple((key, " ".join(token for token, _ in value)) for key, value in entries.items())
+    def number(key: str) -> float:
+        return numbers(key, 1)[0]
+
+    fields: dict[str, Any] = {
+        "robot_from_camera": np.reshape(numbers("sensor2World", 12), (3, 4)),
+        "width": whole("width"),
+        "height": whole("height"),
+        "scale_x": number("scaleX"),
+        "scale_y": number("scaleY"),
+        "offset_x": number("offsetX"),
+        "offset_y": number("offsetY"),
+        "coef": numbers("coef", 5),
+    }
+    if "sensor2Tcp" in entries:
+        fields["sensor_to_tcp"] = np.reshape(numbers("sensor2Tcp", 12), (3, 4))
+    if "mountIndex" in entries:
+        fields["mount_index"] = whole("mountIndex")
+    triangle = PARAMETERS * (PARAMETERS + 1) // 2
+    for key, count in (("tangential", 2), ("polynomial", 3), ("covariance", triangle)):
+        if key in entries:
+            fields[key] = numbers(key, count)
+    unknown = [(key, " ".join(token for token, _ in value)) for key, value in entries.items()]
     try:
-        return Camera(
-            width=width,
-            height=height,
-            scale_x=scale_x,
-            scale_y=scale_y,
-            offset_x=offset_x,
-            offset_y=offset_y,
-            coef=(a2, a3, b1, b2, b3),
-            robot_from_camera=pose,
-            sensor_to_tcp=tcp,
-            mount_index=mount_index,
-            unknown=unknown,
-            tangential=(p1, p2),
-            polynomial=(k1, k2, k3),
-            covariance=covariance,
-        )
+        return Camera(**fields, unknown=tuple(unknown))
     except CameraError as error:
         raise CameraError(f"{name}: {error}") from None
 
@@ -200,12 +196,6 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
         where = f":{value[0][1]}" if value else ""
         raise CameraError(f"{name}{where}: {key} has {len(numbers)} numbers: expected {count}")
     return numbers
-
-
-def _rows(numbers: list[float]) -> Pose:
-    return tuple(
-        (numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3]) for k in range(0, 12, 4)
-    )
 
 
 def _pose_lines(key: str, pose: Pose) -> list[str]:

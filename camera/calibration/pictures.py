@@ -40,8 +40,8 @@ def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
     return contents
 
 
-def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: int) -> Axes:
-    axes = figure.add_subplot(1, columns, place)
+def _image_axes(figure: Figure, place: int, calibration: Calibration) -> Axes:
+    axes = figure.add_subplot(1, 2, place)
     axes.set_xlim(-0.5, calibration.points.width - 0.5)
     axes.set_ylim(calibration.points.height - 0.5, -0.5)
     # Half-height images are shown as the scene looks.
@@ -53,7 +53,7 @@ def _image_axes(figure: Figure, place: int, calibration: Calibration, columns: i
 
 def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
     points, residuals = calibration.points, calibration.adjusted.residuals
-    axes = _image_axes(figure, 1, calibration, 2)
+    axes = _image_axes(figure, 1, calibration)
     typical = float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
     gain = _ARROW_SHARE * points.width / max(3.0 * typical, 1e-9)
     axes.quiver(
@@ -100,7 +100,7 @@ def _draw_views(calibration: Calibration, figure: Figure) -> None:
 
 def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:
     points = calibration.points
-    axes = _image_axes(figure, 1, calibration, 2)
+    axes = _image_axes(figure, 1, calibration)
     counts = coverage(points)
     extent = (-0.5, points.width - 0.5, points.height - 0.5, -0.5)
     aspect = axes.get_aspect()
@@ -114,7 +114,7 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
             ha="center", va="center", color="tab:red", fontsize=8,
         )  # fmt: skip
     axes.set_title("Points in the image")
-    axes = _image_axes(figure, 2, calibration, 2)
+    axes = _image_axes(figure, 2, calibration)
     sigma = projection_sigma(camera, calibration.adjusted.covariance)
     shown = axes.imshow(sigma, cmap="magma_r", extent=extent, aspect=aspect, vmin=0.0)
     bar = figure.colorbar(shown, ax=axes, shrink=0.8)

@@ -66,16 +66,8 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
     """The numbers of a list, of nested lists, or of a mapping with `data`, flat."""
     if isinstance(value, dict):
         value = value.get("data")
-    flat: list[Any] = []
-    pending = [value]
-    while pending:
-        item = pending.pop()
-        if isinstance(item, list):
-            pending += reversed(item)
-        else:
-            flat.append(item)
     result = []
-    for item in flat:
+    for item in np.array(value, dtype=object).ravel():
         # YAML 1.1 takes 1e-3 for text, because it lacks the dot.
         try:
             number = float(item) if not isinstance(item, bool) else float("nan")
