@@ -50,14 +50,6 @@ def published_camera_numbers(camera: Camera) -> FloatArray:
     return numbers
 
 
-def lens_numbers(camera: Camera) -> FloatArray:
-    """The distortion alone, as `straightened_point` takes it.
-
-    Order: a2, a3, b1, b2, b3; k1, k2, p1, p2, k3; r_max.
-    """
-    return np.array([*camera.coef, *camera.brown, camera.r_max])
-
-
 @kernel()
 def brown_shift_point(
     k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
@@ -81,7 +73,7 @@ def straightened_point(
     Parameters
     ----------
     lens : (11,) float64
-        a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max (`camera.kernels.lens_numbers`).
+        a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max.
     x_seen, y_seen : float
         The distorted point, normalised.
     x, y : float

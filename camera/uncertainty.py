@@ -87,11 +87,6 @@ def with_covariance(camera: Camera, covariance: FloatArray) -> Camera:
     return replace(camera, covariance=tuple(numbers))
 
 
-def exact(camera: Camera) -> Camera:
-    """The camera with a covariance of zero: what it is in a simulation."""
-    return with_covariance(camera, np.zeros((PARAMETERS, PARAMETERS)))
-
-
 def covariance_of(camera: Camera) -> FloatArray | None:
     """The (20, 20) covariance of a camera's parameters, if it states any."""
     if camera.covariance is None:

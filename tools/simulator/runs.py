@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
-from camera.uncertainty import exact
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from tools.published_camera import PUBLISHED_CAM
@@ -23,7 +22,7 @@ from tools.simulator.driving import (
     step_record,
     tilted_camera,
 )
-from tools.simulator.files import encoded, rounded, write_bytes, write_truth
+from tools.simulator.files import encoded, exact, rounded, write_bytes, write_truth
 from tools.simulator.furniture import DISC_RADIUS_M, lay_discs
 from tools.simulator.observation import (
     SeenDisc,

@@ -13,11 +13,11 @@ import pytest
 from scipy.stats import chi2
 
 from camera import Camera, read_camera
-from camera.uncertainty import exact
 from redetect.landmarks import read_frames
 from redetect.slam.models import disc_in_robot
 from tools.simulator.__main__ import main
 from tools.simulator.driving import tilted_camera
+from tools.simulator.files import exact
 from tools.simulator.observation import published_covariance
 from tools.simulator.runs import DEMO, RunPlan, RunSettings, plan_run, render_frame, write_rows
 
