@@ -198,21 +198,23 @@ def sheet_of_board(board: Board) -> Sheet:
     if board.kind == "checkerboard":
         columns, rows = columns + 1, rows + 1
     left, top = -0.5 * columns * side, 0.5 * rows * side
-    black = [
-        Rectangle((left + column * side, top - (row + 1) * side), side, side, **_INK)
+    squares = {
+        (row, column): Rectangle((left + column * side, top - (row + 1) * side), side, side, **_INK)
         for row in range(rows)
         for column in range(columns)
-        if (row + column) % 2 == 0
-    ]
+    }
     text = f"{board}: squares {millimetres:g} mm"
     if board.kind == "charuco":
-        black = _charuco(board, left, top)
+        markers, white = _markers(board, left, top)
+        black = [square for place, square in squares.items() if place not in white] + markers
         text += f", markers {1e3 * board.marker_m:g} mm, {board.dictionary}"
+    else:
+        black = [square for place, square in squares.items() if sum(place) % 2 == 0]
     return Sheet(black, columns * side, rows * side, text)
 
 
-def _charuco(board: Board, left: float, top: float) -> list[Rectangle]:
-    """Markers, and the squares in which OpenCV puts none."""
+def _markers(board: Board, left: float, top: float) -> tuple[list[Rectangle], set[tuple[int, int]]]:
+    """A ChArUco board's markers, and the rows and columns of the squares that they are in."""
     dictionary = dictionary_of(board)
     pattern = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square_m, board.marker_m, dictionary
@@ -230,13 +232,7 @@ def _charuco(board: Board, left: float, top: float) -> list[Rectangle]:
             Rectangle((left + x + column * cell, top - y - (row + 1) * cell), cell, cell, **_INK)
             for row, column in np.argwhere(bits < 128).tolist()
         ]
-    squares = [
-        Rectangle((left + column * side, top - (row + 1) * side), side, side, **_INK)
-        for row in range(board.rows)
-        for column in range(board.columns)
-        if (row, column) not in white
-    ]
-    return squares + shapes
+    return shapes, white
 
 
 def sheet_of_discs(diameter_m: float, columns: int, rows: int) -> Sheet:

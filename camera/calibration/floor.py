@@ -261,12 +261,6 @@ def _check(pixels: FloatArray, floor: FloatArray, size: tuple[int, int]) -> None
             "the points of pictures of this size?"
         )
     for what, values in (("on the floor", floor[:, :2]), ("in the image", pixels)):
-        spread = np.linalg.svd(values - values.mean(axis=0), compute_uv=False)
-        if spread[1] < 1e-3 * spread[0]:
-            raise CalibrationError(
-                f"the points lie in a line {what}: add some beside it, or the camera's tilt about "
-                "the line stays open"
-            )
         away = values - values.mean(axis=0)
         spreads = np.linalg.eigvalsh(
             # Of all but one, each in turn.
@@ -274,8 +268,8 @@ def _check(pixels: FloatArray, floor: FloatArray, size: tuple[int, int]) -> None
         )
         if np.any(spreads[:, 0] < 1e-6 * spreads[:, 1]):
             raise CalibrationError(
-                f"all but one of the points lie in a line {what}: add another beside it, or poses "
-                "are ambiguous"
+                f"all points, or all but one, lie in a line {what}: add others beside it, or the "
+                "camera's tilt about the line stays open"
             )
 
 

@@ -239,7 +239,7 @@ def test_a_line_and_a_point_beside_it_are_told(published_camera: Camera) -> None
     line = np.column_stack([np.zeros(3), np.linspace(-2.0, -1.0, 3)])
     for floor_xy in ([*line, [0.5, -1.5]], [*line[:2], [0.5, -1.5], [0.5, -1.5]]):
         pixels = published_camera.project_floor(floor_xy)
-        with pytest.raises(CalibrationError, match="all but one of the points lie in a line"):
+        with pytest.raises(CalibrationError, match="all but one, lie in a line"):
             place_on_floor(published_camera, pixels, np.array(floor_xy))
     square = np.array([[-0.5, -2.0], [0.5, -2.0], [0.5, -1.0], [-0.5, -1.0]])
     found = place_on_floor(published_camera, published_camera.project_floor(square), square)
