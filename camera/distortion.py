@@ -112,15 +112,16 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     growth += r * (numerator.deriv() * denominator - numerator * denominator.deriv())
     # Stay a little short of a root, so that rounding does not reach past it: near a pole even of
     # second order the denominator must remain more than rounding.
-    fold = _first_positive_root(growth.coef) * (1.0 - 1e-12)
-    pole = _first_positive_root(denominator.coef) * (1.0 - 1e-7)
+    fold = _first_positive_root(growth) * (1.0 - 1e-12)
+    pole = _first_positive_root(denominator) * (1.0 - 1e-7)
     return min(fold, pole)
 
 
-def _first_positive_root(coefficients: FloatArray) -> float:
+def _first_positive_root(series: PowerSeries) -> float:
     """The smallest positive root of a polynomial in r whose constant term is 1."""
     # In 1/r the polynomial is monic and the root sought the largest one, so that it is found well
     # even when the higher coefficients all but vanish.
+    coefficients = np.asarray(series.coef, dtype=np.float64)
     last = np.flatnonzero(np.abs(coefficients) > _NEGLIGIBLE)[-1]
     inverse = polyroots(coefficients[last::-1])
     # Rounding can make a conjugate pair of a double root.
