@@ -21,11 +21,11 @@ from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_text
+from redetect.storage.messages import excerpt
 
 CLASS_NAME = "SmRadialDistortedCamera"
 #: More than any calibration has.
 LARGEST_FILE_BYTES = 1 << 20
-_LARGEST_EXCERPT = 40
 
 _TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
 _LINE_END = re.compile(r"\r\n|\r|\n")
@@ -147,7 +147,7 @@ def _split(text: str, name: str) -> _Entries:
     ]
     words = [token for token, _ in tokens]
     if words[:2] != ["{", CLASS_NAME]:
-        found = _excerpt(" ".join(words[:2])) if words else "nothing"
+        found = excerpt(" ".join(words[:2])) if words else "nothing"
         raise CameraError(f"{name}: begins with {found}: expected {{ {CLASS_NAME}")
     entries: _Entries = {}
     closing = {"{": "}", "[": "]"}
@@ -159,7 +159,7 @@ def _split(text: str, name: str) -> _Entries:
         is_key = not open_until and position + 1 < len(tokens) and words[position + 1] == ":"
         if is_key and token not in "{}[]:":
             if token in entries:
-                raise CameraError(f"{name}:{line}: {_excerpt(token)} is given twice")
+                raise CameraError(f"{name}:{line}: {excerpt(token)} is given twice")
             key = token
             entries[key] = []
             position += 2
@@ -170,7 +170,7 @@ def _split(text: str, name: str) -> _Entries:
                 raise CameraError(f"{name}:{following}: text after the closing brace")
             return entries
         if (token == ":" and not open_until) or not key:
-            raise CameraError(f"{name}:{line}: unexpected {_excerpt(token)}: expected 'key: value'")
+            raise CameraError(f"{name}:{line}: unexpected {excerpt(token)}: expected 'key: value'")
         if token in closing:
             open_until.append(closing[token])
         elif token in closing.values() and (not open_until or open_until.pop() != token):
@@ -186,11 +186,11 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
         if token in "{}[]":
             continue
         if not _NUMBER.fullmatch(token):
-            raise CameraError(f"{name}:{line}: {key} has {_excerpt(token)}: expected a number")
+            raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: expected a number")
         numbers.append(float(token))
         if not abs(numbers[-1]) < float("inf"):
             raise CameraError(
-                f"{name}:{line}: {key} has {_excerpt(token)}: expected a number that fits a double"
+                f"{name}:{line}: {key} has {excerpt(token)}: expected a number that fits a double"
             )
     if len(numbers) != count:
         where = f":{value[0][1]}" if value else ""
@@ -207,8 +207,3 @@ def _shortest(number: float) -> str:
     """The shortest text that reads back as the same float."""
     text = repr(float(number))
     return text.removesuffix(".0")
-
-
-def _excerpt(text: str) -> str:
-    shown = ascii(text[:_LARGEST_EXCERPT])
-    return shown if len(text) <= _LARGEST_EXCERPT else f"{shown}..."

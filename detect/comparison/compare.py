@@ -52,6 +52,7 @@ from redetect.landmarks import (
     read_frames,
     wrap_angle,
 )
+from redetect.storage.messages import excerpt
 
 # The forward distances for which the data set's own qualities are known.
 _EDGES_M = (None, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, None)
@@ -260,7 +261,6 @@ def _levelling(
 
 #: Of discs that are compared on the floor, where nothing else is said (m).
 FLOOR_GATE_M = 0.10
-_LONGEST_SHOWN_NAME = 80
 # Equally good pairs of lines must not depend on the file's order.
 _line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
 
@@ -271,7 +271,7 @@ def frames_by_image(frames: Iterable[Frame], name: str) -> dict[str, Frame]:
     for frame in frames:
         image = image_name(frame.step.prefix)
         if image in by_image:
-            raise CompareError(f"{name}: two frames of image {_shown(image)}: expected one")
+            raise CompareError(f"{name}: two frames of image {excerpt(image)}: expected one")
         by_image[image] = frame
     return by_image
 
@@ -437,10 +437,6 @@ def _demand_measurable(frame: FramePair, options: CompareOptions) -> None:
     covariance = circle_arrays(frame.reference).covariance
     if options.sigma is not None and not is_positive_definite(covariance).all():
         raise CompareError(
-            f"frame {_shown(frame.name)}: a reference row's covariance is not positive definite: "
+            f"frame {excerpt(frame.name)}: a reference row's covariance is not positive definite: "
             "expected one to measure sigmas in; a gate in metres needs none"
         )
-
-
-def _shown(image: str) -> str:
-    return repr(image[:_LONGEST_SHOWN_NAME])

@@ -32,6 +32,7 @@ from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
+from redetect.storage.messages import one_line
 
 
 def perform(command: Compare) -> int:
@@ -135,8 +136,8 @@ def summary_rows(c: Comparison) -> dict[str, str]:
     rows |= {
         "recall": number(c.recall, 4),
         "precision": number(c.precision, 4),
-        "reference": printable(c.reference_name) + (", rows with an ID only" if only else ""),
-        "detected": printable(c.detected_name),
+        "reference": one_line(c.reference_name) + (", rows with an ID only" if only else ""),
+        "detected": one_line(c.detected_name),
         "frames": f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the "
         f"reference, {len(c.frames_only_in_detected)} only detected ({counted})",
     }
@@ -278,10 +279,5 @@ def _rich_table(figures: FigureTable) -> Table:
     for k, heading in enumerate(figures.head):
         table.add_column(heading, justify="right" if k else "left", overflow="fold")
     for row in figures.rows:
-        table.add_row(*(Text(printable(word)) for word in row))
+        table.add_row(*(Text(one_line(word)) for word in row))
     return table
-
-
-def printable(name: str) -> str:
-    """A name from a file, with control characters escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
