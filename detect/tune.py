@@ -47,10 +47,8 @@ from redetect.storage import OutputExistsError, write_bytes
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
     base = _base(options)
-    if options.serve:
-        return _serve(options, base)
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
-    grid = combinations(type(base), varied, options.most)
+    grid = () if options.serve else combinations(type(base), varied, options.most)
     settings = [replace(base, **combination) for combination in grid]
     if options.verticals and options.tilt is not None:
         raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
@@ -58,6 +56,15 @@ def perform(options: Tune) -> int:
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
+    _, selection = select_frames(run.frames, options.frames, options.every)
+    if options.serve:
+        from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
+
+        if not isinstance(base, CircleSettings):
+            raise DetectError("--serve and --verticals: the page is for discs")
+        frames = [frame for _, frame in selection]
+        return serve(TuningSession(run, frames, base, output, options.force), options.port)
+
     outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}
     for path in outputs.values():
         if path.exists() and not options.force:
@@ -66,28 +73,27 @@ def perform(options: Tune) -> int:
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     reference = FramesByImage(path)
-    _, selection = select_frames(run.frames, options.frames, options.every)
     chosen = [
         frame for _, frame in selection if frame.image is not None or frame.content is not None
     ]
     wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
-    frames = [(frame, rows) for frame, rows in wanted if rows is not None]
-    if not frames:
+    pairs = [(frame, rows) for frame, rows in wanted if rows is not None]
+    if not pairs:
         raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
 
     gates = CompareOptions(**vars(options.gates), only_identified=options.only_identified)
-    count = len(grid) * len(frames)
+    count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     tilts = None if options.tilt is None else read_tilts(options.tilt)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(run, frames, settings, gates, workers, tilts=tilts, on_progress=advance)
+        tuned = tune_run(run, pairs, settings, gates, workers, tilts=tilts, on_progress=advance)
         trials = list(tuned)
     records = trial_records(grid, trials)
     head = {
         "version": __version__,
         "run": run.name,
         "reference": path.name,
-        "frames": [frame.step.prefix for frame, _ in frames],
+        "frames": [frame.step.prefix for frame, _ in pairs],
         "gate": asdict(gates),
         "camera": run.camera.content_hash,
         "settings": {name: _plain(value) for name, value in asdict(base).items()},
@@ -98,7 +104,7 @@ def perform(options: Tune) -> int:
     writer.writeheader()
     writer.writerows({**r, "front": int(r["front"]), "knee": int(r["knee"])} for r in records)
     document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
-    title = f"{len(grid)} settings on {len(frames)} frames of {run.name}"
+    title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     contents = {
         "table.csv": table.getvalue().encode(),
         "table.json": f"{document}\n".encode(),
@@ -127,19 +133,6 @@ def _base(options: Tune) -> Settings:
     if options.verticals:
         return PRESETS[options.preset]
     return PUBLISHED if options.preset == "published" else CircleSettings()
-
-
-def _serve(options: Tune, base: Settings) -> int:
-    from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
-
-    if not isinstance(base, CircleSettings):
-        raise DetectError("--serve and --verticals: the page is for discs")
-    demand_recording(options.run)
-    run = open_run(options.run, options.camera, options.source)
-    _, selection = select_frames(run.frames, options.frames, options.every)
-    frames = [frame for _, frame in selection]
-    output = run.output("tune") if options.output is None else options.output
-    return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
 
 def _plain(value: Any) -> Any:
