@@ -207,7 +207,7 @@ def detect_run(
             files.add(frames)
             for _, rows in frames:
                 count(rows)
-        summary.images_without_step = job.run.images_without_step
+        summary.images_without_step = job.run.frames.left_out
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
             from detect.runs.frame import level_run  # loads the compiler

@@ -117,11 +117,6 @@ class ImageRun:
         recording = self.output_base.name.removesuffix(".detected")
         return self.folder.resolve().name if recording == "detected" else recording
 
-    @property
-    def images_without_step(self) -> int:
-        """How many images, so far, are not part of the run, as there are no steps of theirs."""
-        return self.frames.left_out
-
     def output(self, kind: str) -> Path:
         """The file that a kind of result is written to."""
         return self.output_base.with_name(f"{self.output_base.name}.{kind}")

@@ -61,7 +61,7 @@ def test_demo_run_is_complete(project_root: Path) -> None:
     run = open_run(project_root / "images" / "e")
     assert 60 <= sum(1 for _ in run.frames) <= 100
     assert all(frame.image is not None for frame in run.frames)
-    assert run.images_without_step == 0
+    assert run.frames.left_out == 0
     size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file())
     assert size <= 4_000_000
 

@@ -59,7 +59,7 @@ def test_run_folder_of_the_data_set(run_folder: Path, published_camera: Camera) 
     assert first == Step("k.0000", 0.5, 0.1, 0.01, 1e-5, 0.0, 1e-5, 0.0, 0.0, 1e-4)
     assert second.dx == -0.25
     assert run.frames.expected == 2
-    assert run.images_without_step == 0
+    assert run.frames.left_out == 0
 
 
 def test_flat_folder_of_images(run_folder: Path) -> None:
@@ -110,7 +110,7 @@ def test_prefixes_name_images(run_folder: Path, prefix: str) -> None:
     run = open_run(run_folder)
     assert [frame.image for frame in run.frames] == [run_folder / "images" / "k.0007.jpg"]
     assert next(iter(run.frames)).step.prefix == prefix
-    assert run.images_without_step == 1
+    assert run.frames.left_out == 1
 
 
 def test_step_without_image(run_folder: Path, published_camera: Camera) -> None:

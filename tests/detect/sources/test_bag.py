@@ -181,7 +181,7 @@ def test_images_between_poses_and_beyond_them(tmp_path: Path) -> None:
     run = open_source(ros.write(tmp_path / "d", sorted(said, key=lambda s: s.time_s)))
     frames = list(run.frames)
     assert [frame.time_s for frame in frames] == pytest.approx([1.0, 1.2, 1.5, 5.0])
-    assert run.images_without_step == 3
+    assert run.frames.left_out == 3
     assert "images without a pose of" in run.frames.why_left_out
     half_turn = np.pi - 3.1
     assert frames[1].step.dphi == pytest.approx(half_turn)  # the shorter way round

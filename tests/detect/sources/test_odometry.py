@@ -72,9 +72,9 @@ def test_times_can_be_named(timed_run: Path, tmp_path: Path) -> None:
     frames = list(run.frames)
     assert [frame.step.prefix for frame in frames] == PREFIXES[:2]  # 101 s: the path has ended
     assert frames[1].step.dy == pytest.approx(-0.5)
-    assert run.images_without_step == 1
+    assert run.frames.left_out == 1
     assert list(run.frames)[1].step == frames[1].step  # begun anew
-    assert run.images_without_step == 1
+    assert run.frames.left_out == 1
 
 
 def test_a_run_folder_as_it_is_has_no_times_file(timed_run: Path) -> None:
@@ -101,7 +101,7 @@ def test_rows_and_images_without_each_other(small_run: Path, tmp_path: Path) -> 
     frames = list(run.frames)
     assert [frame.step.prefix for frame in frames] == ["s.0000", "t.0001", "s.0002"]
     assert [frame.image is None for frame in frames] == [False, True, False]
-    assert run.images_without_step == 1
+    assert run.frames.left_out == 1
 
 
 @pytest.mark.parametrize(
