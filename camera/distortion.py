@@ -180,12 +180,6 @@ def undistorted_radius(
     return np.asarray(r)
 
 
-def brown_of(polynomial: Polynomial, tangential: Tangential) -> Brown:
-    """(k1, k2, p1, p2, k3) of (k1, k2, k3) and (p1, p2)."""
-    k1, k2, k3 = polynomial
-    return k1, k2, *tangential, k3
-
-
 def polynomial_of(brown: Brown) -> Polynomial:
     """(k1, k2, k3)."""
     return brown[0], brown[1], brown[4]

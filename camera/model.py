@@ -29,7 +29,6 @@ from camera.distortion import (
     Coef,
     Polynomial,
     Tangential,
-    brown_of,
     brown_shift,
     distorted_jacobian,
     one_to_one_radius,
@@ -180,7 +179,8 @@ class Camera:
     @cached_property
     def brown(self) -> Brown:
         """k1, k2, p1, p2, k3 of the distortion, in OpenCV's order."""
-        return brown_of(self.polynomial, self.tangential)
+        k1, k2, k3 = self.polynomial
+        return k1, k2, *self.tangential, k3
 
     @cached_property
     def content_hash(self) -> str:

@@ -19,7 +19,6 @@ from camera.distortion import (
     Polynomial,
     Tangential,
     brown_jacobian,
-    brown_of,
     brown_shift,
     fold_radius,
     one_to_one_radius,
@@ -37,7 +36,7 @@ from tests.camera.strategies import coefficients, pixel_grid
 TANGENTIAL, POLYNOMIAL = (2e-3, -3e-3), (-0.05, 0.02, -0.004)
 NONE: Coef = (0.0,) * 5
 PUBLISHED: Coef = (-0.0620672, -0.324903, 0.314764, 1.52524, -0.480806)
-BROWN = brown_of(POLYNOMIAL, TANGENTIAL)
+BROWN = (*POLYNOMIAL[:2], *TANGENTIAL, POLYNOMIAL[2])
 IDENTITY: Any = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 #: As published with EuRoC's cam0 and with TUM's fr1.
@@ -170,7 +169,7 @@ def test_past_the_fold_the_radial_part_falls(coef: Coef) -> None:
 def test_up_to_r_max_the_lens_grows_in_all_directions_and_is_inverted(
     coef: Coef, polynomial: Polynomial, p1: float, p2: float, share: float
 ) -> None:
-    r_max = one_to_one_radius(coef, brown_of(polynomial, (p1, p2)))
+    r_max = one_to_one_radius(coef, (*polynomial[:2], p1, p2, polynomial[2]))
     assert 0.0 < r_max <= max(min(fold_radius(coef, polynomial), RADIUS_LIMIT), fold_radius(coef))
     assume(r_max > 1e-3)
     camera = lens(coef, (p1, p2), polynomial)
