@@ -97,18 +97,9 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """Derivatives of where on the floor pixels are taken to see, by the camera's parameters.
+    """(N, 2, 20) derivatives of where on the floor pixels are taken to see, by the parameters.
 
-    Parameters
-    ----------
-    camera : Camera
-    floor_xy : (N, 2) float64
-        Positions on the floor (m).
-
-    Returns
-    -------
-    (N, 2, 20) float64
-        Of the position that the same pixel gets.
+    Of the positions that the pixels get which see (N, 2) positions on the floor (m).
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     _, by_intrinsics, by_point = project_points(
