@@ -133,7 +133,7 @@ def test_what_may_be_missing(published_cam_text: str) -> None:
         ("width: 768", "width: 768.5", r"e.cam:9: width is 768.5: expected a whole number"),
         ("width: 768", "width: wide", r"e.cam:9: width has 'wide': expected a number"),
         ("width: 768", "width: 7_68", r"e.cam:9: width has '7_68': expected a number"),
-        ("width: 768", "width: ٧٦٨", r"e.cam:9: width has '.u0667.*: expected a number"),
+        ("width: 768", "width: ٧٦٨", r"e.cam:9: width has '.*': expected a number"),
         ("width: 768", "width: 768 width: 768", r"e.cam:9: 'width' is given twice"),
         ("width: 768", "width: 0", "e.cam: width is 0: expected 1 to"),
         ("scaleX: 464.762", "scaleX: nan", r"e.cam:9: scaleX has 'nan': expected a number"),
