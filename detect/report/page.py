@@ -16,20 +16,7 @@ from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
-from detect.report.figures import (
-    RateCurve,
-    bearings_figure,
-    counts_figure,
-    distance_figure,
-    floor_figure,
-    floor_map,
-    knee,
-    rates_figure,
-    rates_over,
-    tilt_figure,
-    whitened,
-    whitened_figure,
-)
+from detect.report import figures
 from detect.seen import Sight
 from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import ImageRun, Run, read_image
@@ -147,7 +134,7 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
 
 
 def _summary(inputs: ReportInputs) -> list[Part]:
-    figures = [("frames", str(len(inputs.rows)))]
+    shown = [("frames", str(len(inputs.rows)))]
     rows = []
     for kind, path in inputs.files.detected.items():
         frames = [getattr(seen, kind) for seen in inputs.rows]
@@ -156,23 +143,23 @@ def _summary(inputs: ReportInputs) -> list[Part]:
             for frame in frames
         ]
         name = "frames with a tilt" if kind == "tilt" else _NAMES[kind].lower()
-        figures.append((name, str(sum(counts))))
+        shown.append((name, str(sum(counts))))
         rows.append(
             (_NAMES[kind], path.name, str(sum(counts)), str(sum(count > 0 for count in counts)))
         )
     for name, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
         if result is not None:
-            figures.append((f"recall of {name}", number(result.recall, 3)))
-            figures.append((f"precision of {name}", number(result.precision, 3)))
+            shown.append((f"recall of {name}", number(result.recall, 3)))
+            shown.append((f"precision of {name}", number(result.precision, 3)))
     head = ("what", "file", "rows", "frames with some")
     parts = [
-        Part("figures", rows=tuple(figures)),
+        Part("figures", rows=tuple(shown)),
         Part("table", "Files of rows", head, tuple(rows), left=(0, 1)),
     ]
     if len(inputs.rows) < 2:
         return parts
-    plan = floor_map(inputs.rows)
-    return [*parts, counts_figure(inputs.rows), *([] if plan is None else [plan])]
+    plan = figures.floor_map(inputs.rows)
+    return [*parts, figures.counts_figure(inputs.rows), *([] if plan is None else [plan])]
 
 
 # -- against the reference --------------------------------------------------------------------
@@ -185,12 +172,12 @@ def _discs(inputs: ReportInputs) -> list[Part]:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [_summary_of(result)]
     if result.reference or result.detected:
-        parts.append(distance_figure(result.bins))
+        parts.append(figures.distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
-    parts += _rates(rates_over(result, np.unique(levels)), "least quality", "quality")
+    parts += _rates(figures.rates_over(result, np.unique(levels)), "least quality", "quality")
     if result.matched:
-        parts.append(floor_figure(result.pairs, lean=result.lean is not None))
+        parts.append(figures.floor_figure(result.pairs, lean=result.lean is not None))
     what = "two components for each matched disc"
     if result.lean is not None:
         what += ", after the common lean"
@@ -206,12 +193,12 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     sigma = [row.sigma for match in result.frames for row in match.frame.detected]
     levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
     # Quantiles between rows may round below the greatest.
-    curve = rates_over(result, np.nextafter(np.unique(levels), np.inf))
+    curve = figures.rates_over(result, np.nextafter(np.unique(levels), np.inf))
     return [
         _summary_of(result),
         *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),
         *_honesty(result, "one for each matched vertical"),
-        *([bearings_figure(result.pairs)] if result.matched else []),
+        *([figures.bearings_figure(result.pairs)] if result.matched else []),
     ]
 
 
@@ -223,11 +210,11 @@ def _summary_of(result: Comparison) -> Part:
     )
 
 
-def _rates(curve: RateCurve, axis: str, name: str) -> list[Part]:
+def _rates(curve: figures.RateCurve, axis: str, name: str) -> list[Part]:
     count = len(curve.threshold)
     if not count:
         return [Part("note", "No rows: no rates over thresholds.")]
-    best = knee(curve.recall, curve.precision)
+    best = figures.knee(curve.recall, curve.precision)
     chosen = set(np.linspace(0, count - 1, _TABLE_POINTS).astype(int).tolist())
     chosen |= {best} - {None}
     rows = tuple(
@@ -240,12 +227,12 @@ def _rates(curve: RateCurve, axis: str, name: str) -> list[Part]:
     )
     head = (name, "rows kept", "recall", "precision")
     table = Part("table", f"Rates over the threshold ({axis})", head, rows)
-    return [table] if count < 2 else [rates_figure(curve, axis), table]
+    return [table] if count < 2 else [figures.rates_figure(curve, axis), table]
 
 
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     """Whether the stated covariances are right."""
-    residuals = whitened(result)
+    residuals = figures.whitened(result)
     if not len(residuals):
         return [Part("note", "No matched rows with a usable covariance: nothing to whiten.")]
     rows = [("mean", f"{residuals.mean():.3f}"), ("deviation", f"{residuals.std():.3f}")]
@@ -253,7 +240,7 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
         normal = math.erf(k / math.sqrt(2.0))
         share = np.mean(np.abs(residuals) <= k)
         rows.append((f"within {k} {_SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
-    return [whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
+    return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
 # -- frames, tilt, settings -------------------------------------------------------------
@@ -307,12 +294,12 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
         ("roll", [t.roll for t in tilts], [t.crr for t in tilts]),
     ):
         angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
-        figures = (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))
-        rows.append((name, *(f"{figure:.3f}" for figure in figures)))
+        values = (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))
+        rows.append((name, *(f"{v:.3f}" for v in values)))
     head = ("degrees", "mean", "deviation", "largest", f"median of its {_SIGMA}")
     lines = np.median([t.lines for t in tilts])
     caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
-    figure = [tilt_figure(inputs.rows)] if len(tilts) > 1 else []
+    figure = [figures.tilt_figure(inputs.rows)] if len(tilts) > 1 else []
     return [*figure, Part("table", caption, head, tuple(rows))]
 
 
