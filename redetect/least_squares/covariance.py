@@ -18,9 +18,21 @@ def diagonal_blocks(
 ) -> tuple[list[FloatArray], FloatArray]:
     """Covariances of groups of unknowns, and of the shared ones, all others unknown too.
 
-    A block is the width of some groups and their first (b,) indices; its covariances are (b, width,
-    width), those of the shared ones (s, s). Raises numpy.linalg.LinAlgError if the residuals do not
-    determine the unknowns.
+    Parameters
+    ----------
+    equations : NormalEquations
+    blocks : list of (width, (b,) int64)
+        Width and first indices of groups.
+
+    Returns
+    -------
+    covariances : list of (b, width, width) float64
+    shared : (s, s) float64
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the residuals do not determine the unknowns.
     """
     found = inverse_blocks(equations.matrix, blocks)
     eliminated, shared = _shared(equations)

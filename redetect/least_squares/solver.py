@@ -35,12 +35,22 @@ class Loss(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Whitened residuals of one kind, with their derivatives."""
+    """Whitened residuals of one kind, with their derivatives.
 
-    error: FloatArray  #: (n, d) each row is one residual to the loss
-    #: (n,) index of the first of k unknowns, below 0: not an unknown; (n, d, k) derivatives by them
+    Attributes
+    ----------
+    error : (n, d) float64
+        Each row is one residual to the loss.
+    by : sequence of ((n,) int64, (n, d, k) float64)
+        Derivatives by k unknowns, and the index of the first of these; below 0: not an unknown.
+    shared : (n, d, s) float64 or None
+        Derivatives by the shared unknowns; None: all are 0.
+    loss : Loss
+    """
+
+    error: FloatArray
     by: Sequence[tuple[IntArray, FloatArray]]
-    shared: FloatArray | None = None  #: (n, d, s) by the shared unknowns; None: all are 0
+    shared: FloatArray | None = None
     loss: Loss = Loss()
 
 
@@ -204,10 +214,29 @@ def minimise(
 ) -> Minimum[X]:
     """Minimise by Levenberg and Marquardt's method.
 
-    It stops at a step that lowers the cost by less than a share of it, the tolerance. The damping
-    at the beginning is a share of the diagonal. `refined` improves each trial, whose cost it takes
-    and returns, before it is judged. Raises StartError if the cost is not finite at the start,
-    numpy.linalg.LinAlgError if the residuals do not determine the unknowns.
+    Parameters
+    ----------
+    problem : Problem
+    start : X
+    tolerance : float
+        Stop at a step that lowers the cost by less than this share of it.
+    most_steps : int
+        Stop after as many.
+    damping : float
+        At the beginning, a share of the diagonal.
+    refined : callable, optional
+        Improves each trial, whose cost it takes and returns, before it is judged.
+
+    Returns
+    -------
+    Minimum
+
+    Raises
+    ------
+    StartError
+        If the cost is not finite at the start.
+    numpy.linalg.LinAlgError
+        If the residuals do not determine the unknowns.
     """
     at, lowest = start, problem.cost(start)
     if not np.isfinite(lowest):
