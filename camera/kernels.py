@@ -64,12 +64,25 @@ def brown_shift_point(
 def straightened_point(
     lens: FloatArray, x_seen: float, y_seen: float, x: float, y: float
 ) -> tuple[float, float]:
-    """Undistorted normalised coordinates of a distorted point; both NaN where nothing is seen.
+    """Undistorted normalised coordinates of a distorted point, of a lens with Brown's terms.
 
-    Of a lens with Brown's terms: (11,) a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max. Newton's
-    method within the circle of r_max, from (x, y), the radial inverse or what a neighbour sees; a
-    step that would leave it or raise the error is halved. As the distortion is the gradient of a
-    convex function there, that ends at the one solution, if there is one.
+    Newton's method within the circle of r_max; a step that would leave it or raise the error is
+    halved. As the distortion is the gradient of a convex function there, that ends at the one
+    solution, if there is one.
+
+    Parameters
+    ----------
+    lens : (11,) float64
+        a2, a3, b1, b2, b3, k1, k2, p1, p2, k3, r_max.
+    x_seen, y_seen : float
+        The distorted point, normalised.
+    x, y : float
+        Where to begin: the radial inverse, or what a neighbour sees.
+
+    Returns
+    -------
+    x, y : float
+        Both NaN where nothing is seen.
     """
     a2, a3, b1, b2, b3 = lens[0], lens[1], lens[2], lens[3], lens[4]
     k1, k2, p1, p2, k3, r_max = lens[5], lens[6], lens[7], lens[8], lens[9], lens[10]

@@ -27,11 +27,27 @@ _SEARCHED_PX = (1280, 2048)
 def find_board(
     image: GreyImage, board: Board, *, window: float = _WINDOW
 ) -> tuple[IntArray, FloatArray]:
-    """Which of `Board.points` are in an image, (K,) ascending, and their (K, 2) pixels.
+    """Find a board's points in an image.
 
-    A checkerboard's corner is refined in a window whose half side is a share of its squares in the
-    image: a larger one averages more, and follows the lens's bending more. Raises CalibrationError
-    if the board is not there, or too little of a ChArUco board is.
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    board : Board
+    window : float
+        Half the side of the window in which a checkerboard's corner is refined, as a share of its
+        squares in the image: a larger one averages more, and follows the lens's bending more.
+
+    Returns
+    -------
+    indices : (K,) int64 array
+        Which of `Board.points`; ascending.
+    pixels : (K, 2) array
+        Where they are (the top left pixel's centre is 0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        If the board is not there, or too little of a ChArUco board is.
     """
     if board.kind == "charuco":
         return _charuco(image, board)

@@ -158,9 +158,21 @@ def convert_to_foreign(
 ) -> Converted:
     """Fit one of the other programs' models.
 
-    The first `free` of the model's coefficients, by default all, may differ from 0. A thin prism's
-    are taken over, but never fitted. Raises ConversionError if the source does not see all of its
-    image, or the fit fails.
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    model : str
+        `radtan`, `rational` or `fisheye`.
+    rows : str
+        `same`, `halve` or `double`.
+    free : int, optional
+        Number of the model's first coefficients that may differ from 0; by default all. A thin
+        prism's are taken over, but never fitted.
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
     """
     number = COEFFICIENTS[model] if free is None else free
     factor = _FACTORS[rows]
@@ -208,9 +220,21 @@ def convert_to_camera(
 
     A polynomial and tangential terms without a denominator are copied. Else the rational part is
     fitted beside the source's tangential terms and, where it comes not near, all of them and a
-    polynomial together. The result gets the ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of
-    `pose`, by default those of the source if it has them, else the identity. Raises ConversionError
-    if the source does not see all of its image, or the fit fails.
+    polynomial together.
+
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    rows : str
+        `same`, `halve` or `double`.
+    pose : Camera, optional
+        Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
+        of the source if it has them, else the identity.
+
+    Raises
+    ------
+    ConversionError
+        If the source does not see all of its image, or the fit fails.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)

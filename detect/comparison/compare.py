@@ -102,12 +102,25 @@ def compare_frames(
     lookalikes: Iterable[Frame] | None = None,
     names: tuple[str, str] = ("reference", "detected"),
 ) -> DiscComparison:
-    """Compare the discs of two sets of frames, which messages call by their names.
+    """Compare the discs of two sets of frames.
 
-    With a sight, rows come back into the images; without, they are compared on the floor. Discs
-    that are unlisted may be detected but need not be: rows on them are neither right nor wrong.
-    Rows on what looks like a disc are extra, and counted apart. Raises CompareError if an image has
-    two frames, or a covariance is needed and not positive definite.
+    Parameters
+    ----------
+    reference, detected : iterable of Frame
+    options : CompareOptions, optional
+    sight : Sight, optional
+        How rows come back into the images; without it, they are compared on the floor.
+    unlisted : iterable of Frame, optional
+        Discs that may be detected but need not be: rows on them are neither right nor wrong.
+    lookalikes : iterable of Frame, optional
+        Rows on what looks like a disc are extra, and counted apart.
+    names : (str, str)
+        What messages call the two sets.
+
+    Raises
+    ------
+    CompareError
+        If an image has two frames, or a covariance is needed and not positive definite.
     """
     options = options or CompareOptions()
     in_image = sight is not None and not options.on_floor

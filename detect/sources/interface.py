@@ -174,9 +174,20 @@ def decode_gray(
 ) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    `name` is the image's in messages, `bits` are the significant ones of images that have more than
-    8; an image that claims another size (width, height) than is expected is not decoded. Raises
-    FrameError if there is no image in it, it is cut off, or its values need more bits.
+    Parameters
+    ----------
+    content : bytes
+    name : object
+        The image's name in messages.
+    bits : int
+        Significant bits of images that have more than 8 bits.
+    size : (int, int) or None
+        Width and height that are expected: an image that claims others is not decoded.
+
+    Raises
+    ------
+    FrameError
+        If there is no image in it, it is cut off, or its values need more bits.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")

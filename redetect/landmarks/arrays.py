@@ -103,11 +103,21 @@ class Association:
 def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     """Pair the rows of two sets: as many pairs as possible, and of those the least total cost.
 
-    A linear assignment problem: (N, M) costs, at least 0, of pairing row n of the first set with
-    row m of the second, and which pairs are allowed (the gate); costs of others are ignored.
-    Deterministic; where several solutions have the same number of pairs and the same cost, which
-    one comes out may depend on the order of the rows. Raises ValueError if the shapes differ or an
-    allowed cost is negative or not finite.
+    A linear assignment problem. Deterministic; where several solutions have the same number of
+    pairs and the same cost, which one comes out may depend on the order of the rows.
+
+    Parameters
+    ----------
+    costs : (N, M) array_like
+        Cost of pairing row n of the first set with row m of the second, at least 0. Costs of pairs
+        that are not allowed are ignored.
+    allowed : (N, M) array_like of bool
+        The gate.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or an allowed cost is negative or not finite.
     """
     from scipy.optimize import linear_sum_assignment
 
