@@ -97,9 +97,18 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """(N, 2, 20) derivatives of where on the floor pixels are taken to see, by the parameters.
+    """Derivatives of where on the floor pixels are taken to see, by the camera's parameters.
 
-    Of the positions that the pixels get which see (N, 2) positions on the floor (m).
+    Parameters
+    ----------
+    camera : Camera
+    floor_xy : (N, 2) float64
+        Positions on the floor (m).
+
+    Returns
+    -------
+    (N, 2, 20) float64
+        Of the position that the same pixel gets.
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     _, by_intrinsics, by_point = project_points(

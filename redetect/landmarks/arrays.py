@@ -41,9 +41,23 @@ def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
 def circle_landmarks(
     xy: ArrayLike, quality: ArrayLike, covariance: ArrayLike, ids: ArrayLike | None = None
 ) -> tuple[CircleLandmark, ...]:
-    """Convert arrays, as `CircleArrays` has them, to rows of discs; without `ids` they have none.
+    """Convert arrays to rows of discs.
 
-    Raises LandmarkError if the arrays' shapes do not fit or a number is not finite.
+    Parameters
+    ----------
+    xy : (N, 2) array_like
+        Centres in the robot frame (m).
+    quality : (N,) array_like
+        Confidence, 0 to 1.
+    covariance : (N, 2, 2) array_like
+        Of `xy` (m^2).
+    ids : (N,) array_like of int, optional
+        Identifiers, -1 where unknown; by default the rows have none.
+
+    Raises
+    ------
+    LandmarkError
+        If the arrays' shapes do not fit or a number is not finite.
     """
     position = np.asarray(xy, dtype=np.float64)
     confidence = np.asarray(quality, dtype=np.float64)
@@ -70,9 +84,19 @@ def circle_landmarks(
 def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArray:
     """Which covariance matrices are positive definite, that is, can be inverted and used.
 
-    Covariances are read from files unchecked; callers that need valid ones check them here. Of
-    (..., n, n) symmetric matrices; the smallest eigenvalue of the correlations must be above
-    `least`: where it is not, two quantities are one.
+    Covariances are read from files unchecked; callers that need valid ones check them here.
+
+    Parameters
+    ----------
+    covariance : (..., n, n) array_like
+        Symmetric matrices.
+    least : float
+        What the smallest eigenvalue of the correlations must be above: where it is not, two
+        quantities are one.
+
+    Returns
+    -------
+    (...) bool
     """
     matrices = np.asarray(covariance, dtype=np.float64)
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
@@ -144,9 +168,14 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
 
 
 def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -> Association:
-    """Pair (N, 2) and (M, 2) positions that lie within `gate_m` (m) of each other.
+    """Pair positions that lie within `gate_m` of each other, with least squared distances.
 
-    As many as possible, with least squared distances.
+    Parameters
+    ----------
+    first, second : (N, 2), (M, 2) array_like
+        Positions in one frame (m).
+    gate_m : float
+        Largest distance of a pair (m), at least 0.
     """
     with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
         distance = np.linalg.norm(_differences(first, second), axis=-1)
@@ -157,11 +186,23 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
 def associate_within_covariance(
     first: ArrayLike, second: ArrayLike, covariance: ArrayLike, *, gate_sigma: float
 ) -> Association:
-    """Pair (N, 2) and (M, 2) positions (m) by their Mahalanobis distance, at most `gate_sigma`.
+    """Pair positions by their Mahalanobis distance.
 
-    The covariance (m^2), (N, 2, 2) of each position of the first set, or (N, M, 2, 2) of each
-    difference, is positive definite: numpy.linalg.LinAlgError is raised if one is singular, a
-    ValueError if one makes a squared distance negative.
+    Parameters
+    ----------
+    first, second : (N, 2), (M, 2) array_like
+        Positions in one frame (m).
+    covariance : (N, 2, 2) or (N, M, 2, 2) array_like
+        Positive definite covariance of each position of the first set, or of each difference (m^2).
+    gate_sigma : float
+        Largest Mahalanobis distance of a pair (standard deviations), at least 0.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a covariance is singular.
+    ValueError
+        If one makes a squared distance negative.
     """
     spread = np.asarray(covariance, dtype=np.float64)
     if spread.ndim == 3:
@@ -172,10 +213,23 @@ def associate_within_covariance(
 
 
 def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
-    """(...) squares of Mahalanobis distances, ``offset' covariance^-1 offset``.
+    """Square of the Mahalanobis distance, ``offset' covariance^-1 offset``.
 
-    Of (..., n) differences and their (..., n, n) positive definite covariances, broadcast. Raises
-    numpy.linalg.LinAlgError if one is singular.
+    Parameters
+    ----------
+    offset : (..., n) array_like
+        Differences.
+    covariance : (..., n, n) array_like
+        Their positive definite covariances; broadcast against `offset`.
+
+    Returns
+    -------
+    (...) float64
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a covariance is singular.
     """
     difference = np.asarray(offset, dtype=np.float64)
     solved = np.linalg.solve(np.asarray(covariance, dtype=np.float64), difference[..., np.newaxis])
