@@ -169,6 +169,10 @@ def convert_to_foreign(
         Number of the model's first coefficients that may differ from 0; by default all. A thin
         prism's are taken over, but never fitted.
 
+    Returns
+    -------
+    Converted
+
     Raises
     ------
     ConversionError
@@ -230,6 +234,10 @@ def convert_to_camera(
     pose : Camera, optional
         Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
         of the source if it has them, else the identity.
+
+    Returns
+    -------
+    Converted
 
     Raises
     ------

@@ -38,8 +38,14 @@ def open_run(
 ) -> Run:
     """Open what holds a run's images, with a calibration.
 
-    That is a run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``; the
-    calibration is by default the one beside the images (of several in a run folder ``<run>.cam``).
+    Parameters
+    ----------
+    name : path
+        A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
+    camera_path : path, optional
+        The calibration; by default the one beside the images (of several in a run folder
+        ``<run>.cam``).
+    options : SourceOptions, optional
 
     Raises
     ------

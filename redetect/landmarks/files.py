@@ -53,9 +53,18 @@ _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBE
 def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     """Read a landmark file row by row, comments and blank lines included.
 
-    Written back with `write_rows`, unchanged rows are byte-identical. The file is opened when the
-    first row is requested. A row's record is None for comments, blank lines and the settings of a
-    detector, as the data set's files have them at their head.
+    Written back with `write_rows`, unchanged rows are byte-identical.
+
+    Parameters
+    ----------
+    path : path
+        The file. It is opened when the first row is requested.
+
+    Yields
+    ------
+    Row
+        Each row with its text and its record: None for comments, blank lines and the settings of a
+        detector, as the data set's files have them at their head.
 
     Raises LandmarkFileError if the file cannot be opened, a row is malformed, or a landmark
     precedes the first STEP; the message names the file, the line and what was expected.

@@ -86,9 +86,17 @@ def write_map(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a map with columns as `MAP_COLUMNS`, numbers in full precision, comments in its head.
+    """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
 
-    Raises `redetect.storage.OutputExistsError` if the file exists and must not be overwritten.
+    Parameters
+    ----------
+    path : path
+    landmark_map : LandmarkMap
+    comments : sequence of str
+        Lines for the head.
+    overwrite : bool
+        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
+        raised.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))

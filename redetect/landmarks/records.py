@@ -22,9 +22,15 @@ class LandmarkError(OneLineError, ValueError):
 
 
 class LandmarkFileError(LandmarkError):
-    """A landmark file that cannot be read: what was found and what was expected.
+    """A landmark file that cannot be read.
 
-    The wrong line is counted from 1; None if the error concerns the whole file.
+    Parameters
+    ----------
+    file : path
+    line : int or None
+        The wrong line, counted from 1; None if the error concerns the whole file.
+    problem : str
+        What was found and what was expected.
     """
 
     def __init__(self, file: str | os.PathLike[str], line: int | None, problem: str) -> None:
