@@ -1,5 +1,5 @@
 # make demo: set everything up, detect what is in the demo run, compare it with the truth, make a page.
-# make test: set everything up and pass the tests.
+# make test: set everything up, compile the kernels, pass the tests.
 # make docs: the documentation as a site, build/docs/index.html; what leads nowhere is an error.
 # make package: build wheel and source distribution, install and use each in an empty environment.
 # make lowest: pass the tests of what packages are used for, with the lowest versions that are allowed.
