@@ -1,5 +1,5 @@
 # make demo: set everything up, detect what is in the demo run, compare it with the truth, make a page.
-# make test: set everything up and pass the tests.
+# make test: set everything up, compile the kernels, pass the tests.
 # make docs: the documentation as a site, build/docs/index.html; what leads nowhere is an error.
 # make package: build wheel and source distribution, install and use each in an empty environment.
 # make lowest: pass the tests of what packages are used for, with the lowest versions that are allowed.
@@ -10,6 +10,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# What Python has compiled once is kept, whatever the environment says: tests start many processes.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo kernels test check lint docs package lowest lowest-more lowest-setup audit clean setup
 
@@ -20,12 +22,12 @@ setup:
 demo: setup
 	$(BIN)/redetect demo --run images/e -o build/demo --force
 
-# Kernels are compiled beforehand, those of discs and of lines at the same time: processes of tests that need the same
-# one at once would each compile it.
+# Kernels are compiled beforehand, by two processes: workers of tests that need the same one at once would each compile it.
 define compile_kernels
 mkdir -p $(2)
 $(1) circles images/e --jobs 1 -o $(2)/compiled.circles --json $(2)/compiled.json --force & discs=$$!; \
-    $(1) lines images/e --jobs 1 -o $(2)/compiled.lines --force; lines=$$?; wait $$discs && exit $$lines
+    $(1) lines images/e --jobs 1 -o $(2)/compiled.lines --force && \
+    $(1) markers images/m/a -o $(2)/m.markers --force; others=$$?; wait $$discs && exit $$others
 endef
 
 # A kernel that others call exists several times, optimised among different code, and which of them runs depends on what
@@ -33,14 +35,13 @@ endef
 # they are loaded.
 kernels: setup
 	$(call compile_kernels,$(BIN)/detect,build/kernels)
-	$(BIN)/detect circles images/e --jobs 1 -o build/kernels/loaded.circles --json build/kernels/loaded.json --force
-	$(BIN)/detect lines images/e --jobs 1 -o build/kernels/loaded.lines --force
+	$(BIN)/detect circles images/e --jobs 1 -o build/kernels/loaded.circles --json build/kernels/loaded.json --force & discs=$$!; \
+	    $(BIN)/detect lines images/e --jobs 1 -o build/kernels/loaded.lines --force && \
+	    $(BIN)/detect all images/e --output build/kernels --force; others=$$?; wait $$discs && exit $$others
 	cmp build/kernels/compiled.json build/kernels/loaded.json
 	cmp build/kernels/compiled.lines build/kernels/loaded.lines
-	$(BIN)/detect all images/e --output build/kernels --force
-	$(BIN)/detect markers images/m/a --output build/kernels/m.markers --force
 
-test: setup
+test: kernels
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: lint docs

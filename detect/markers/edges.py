@@ -197,11 +197,12 @@ def _fit_edges(
             return found
         found.dark[k], found.light[k] = step.dark, step.light
         found.blur[k], found.support[k] = step.blur, step.support
-        variance[k] = step.var_start, step.var_end
+        variance[k, 0], variance[k, 1] = step.var_start, step.var_end
         a, b = p0 + step.start * outwards, p1 + step.end * outwards
         # Unit normal and distance from the origin.
-        lines[k] = a[1] - b[1], b[0] - a[0], a[0] * b[1] - a[1] * b[0]
-        lines[k] /= math.hypot(lines[k, 0], lines[k, 1])
+        x, y, from_origin = a[1] - b[1], b[0] - a[0], a[0] * b[1] - a[1] * b[0]
+        length = math.hypot(x, y)
+        lines[k, 0], lines[k, 1], lines[k, 2] = x / length, y / length, from_origin / length
     for k in range(4):
         a, b = lines[k - 1], lines[k]
         sine = a[0] * b[1] - a[1] * b[0]
@@ -209,8 +210,10 @@ def _fit_edges(
         found.corners[k, 1] = (a[2] * b[0] - a[0] * b[2]) / sine
         # A line that moves takes the corner along the other line.
         for line, spread in ((b, variance[k - 1, 1]), (a, variance[k, 0])):
-            along = np.array([-line[1], line[0]]) / sine
-            found.covariance[k] += spread * np.outer(along, along)
+            along = -line[1] / sine, line[0] / sine
+            for i in range(2):
+                for j in range(2):
+                    found.covariance[k, i, j] += spread * (along[i] * along[j])
     return found
 
 
@@ -241,7 +244,9 @@ def _fit_step(pixels: _Pixels, reach: float, search: _Search) -> _Step:
         here = _linearise(pixels, p, expected, prior, outlier)
         damping = 1e-3
         for _ in range(_STEPS):
-            damped = here.matrix + damping * np.diag(np.diag(here.matrix))
+            damped = here.matrix.copy()
+            for i in range(_PARAMETERS):
+                damped[i, i] += damping * here.matrix[i, i]
             if not solve_positive(damped, here.right, change):
                 return _NO_STEP
             trial = p + change
@@ -338,29 +343,33 @@ def _linearise(
 ) -> _Linearised:
     """Normal equations about p with the weights of prior knowledge, and the robust cost."""
     along, blur = pixels.along, math.exp(p[4])
-    out = pixels.across - p[0] - p[1] * along
-    z = out / blur
-    share = np.empty_like(z)
-    for n in range(len(z)):
-        share[n] = 0.5 * (1.0 + math.erf(z[n] * math.sqrt(0.5)))
-    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    dark = p[2] + p[7] * along
-    step = p[3] + p[5] * along + p[6] * out - dark
-    residual = pixels.grey - dark - step * share
-    weight, log_weights = np.ones_like(z), 0.0
-    for k in np.flatnonzero(np.abs(residual) > outlier):
-        weight[k] = (outlier / residual[k]) ** 2
-        log_weights += math.log(weight[k])
-    slope = -step * density / blur - p[6] * share
-    jacobian = np.empty((_PARAMETERS, len(z)))
-    jacobian[0], jacobian[1] = slope, slope * along
-    jacobian[2], jacobian[3], jacobian[4] = 1.0 - share, share, -step * density * z
-    jacobian[5], jacobian[6], jacobian[7] = share * along, share * out, (1.0 - share) * along
+    count = len(along)
+    residual, weight, jacobian = np.empty(count), np.ones(count), np.empty((_PARAMETERS, count))
+    squares = log_weights = 0.0
+    for n in range(count):
+        out = pixels.across[n] - p[0] - p[1] * along[n]
+        z = out / blur
+        share = 0.5 * (1.0 + math.erf(z * math.sqrt(0.5)))
+        density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+        dark = p[2] + p[7] * along[n]
+        step = p[3] + p[5] * along[n] + p[6] * out - dark
+        residual[n] = pixels.grey[n] - dark - step * share
+        if abs(residual[n]) > outlier:
+            weight[n] = (outlier / residual[n]) ** 2
+            log_weights += math.log(weight[n])
+        squares += weight[n] * residual[n] ** 2
+        slope = -step * density / blur - p[6] * share
+        jacobian[0, n], jacobian[1, n] = slope, slope * along[n]
+        jacobian[2, n], jacobian[3, n], jacobian[4, n] = 1.0 - share, share, -step * density * z
+        jacobian[5, n], jacobian[6, n] = share * along[n], share * out
+        jacobian[7, n] = (1.0 - share) * along[n]
     weighted = weight * jacobian
-    squares = np.sum(weight * residual**2)
+    matrix = weighted @ jacobian.T
+    for i in range(_PARAMETERS):
+        matrix[i, i] += prior[i]
     off = expected - p
     return _Linearised(
-        np.diag(prior) + weighted @ jacobian.T,
+        matrix,
         prior * off + weighted @ residual,
         np.sum(prior * off**2) + squares - outlier**2 * log_weights,
         np.sum(weight),
@@ -378,11 +387,19 @@ def robust_sigma(residual: FloatArray, least: float) -> float:
 @kernel()
 def _support(pixels: _Pixels, p: FloatArray) -> float:
     """Share of the segments of an edge whose own step is at least half the fitted one."""
-    out = pixels.across - p[0] - p[1] * pixels.along
-    near = np.abs(out) > 0.5
-    segment = ((pixels.along[near] + 1.0) * 0.5 * _SEGMENTS).astype(np.int64)
-    place, places = 2 * np.minimum(segment, _SEGMENTS - 1) + (out[near] > 0.0), 2 * _SEGMENTS
-    means = np.bincount(place, pixels.grey[near], places) / np.bincount(place, None, places)
-    steps = means[1::2] - means[::2]
-    known = steps[np.isfinite(steps)]
-    return float(np.mean(known > 0.5 * (p[3] - p[2]))) if len(known) > 0 else 0.0
+    # Those of the inside are even.
+    count, total = np.zeros(2 * _SEGMENTS), np.zeros(2 * _SEGMENTS)
+    for n in range(len(pixels.along)):
+        out = pixels.across[n] - p[0] - p[1] * pixels.along[n]
+        if abs(out) > 0.5:
+            segment = min(int((pixels.along[n] + 1.0) * 0.5 * _SEGMENTS), _SEGMENTS - 1)
+            place = 2 * segment + (out > 0.0)
+            count[place] += 1.0
+            total[place] += pixels.grey[n]
+    known = large = 0
+    for k in range(0, 2 * _SEGMENTS, 2):
+        if count[k] > 0.0 and count[k + 1] > 0.0:
+            known += 1
+            step = total[k + 1] / count[k + 1] - total[k] / count[k]
+            large += step > 0.5 * (p[3] - p[2])
+    return large / known if known > 0 else 0.0

@@ -114,12 +114,14 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
     return np.ascontiguousarray(corners if signed_area(corners) > 0.0 else corners[::-1])
 
 
-@kernel()
 def largest_quadrangle(points: FloatArray) -> IntArray:
-    """Indices (4,) of the largest quadrangle among points (N, 2), in the order of the points.
+    """Indices (4,) of the largest quadrangle among points (N, 2), in the order of the points."""
+    return np.sort(_largest_quadrangle(points))
 
-    Over each diagonal the highest triangles on both sides.
-    """
+
+@kernel()
+def _largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
+    """Over each diagonal the highest triangles on both sides."""
     n = len(points)
     largest, best = -1.0, (0, 0, 0, 0)
     for i in range(n - 2):
@@ -134,7 +136,7 @@ def largest_quadrangle(points: FloatArray) -> IntArray:
                     high, at_high = height, j
             if high - low > largest:
                 largest, best = high - low, (i, at_low, k, at_high)
-    return np.sort(np.array(best))
+    return best
 
 
 def signed_area(corners: FloatArray) -> float:

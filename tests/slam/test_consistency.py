@@ -21,7 +21,7 @@ from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 pytestmark = pytest.mark.long
 
-RUNS = 50
+RUNS = 30
 #: Enough for what is far outside the band.
 FEW_RUNS = 20
 NO_LINES = LineRows.of()

@@ -100,14 +100,19 @@ class FixedBoard(Board):
         return np.asarray(vars(self)["places"])
 
 
-def read_group(folder: Path, group: str) -> tuple[list[BoardView], Board, tuple[int, int]]:
-    """All photographs of a camera, in the folder or below: views, the board, and the image size."""
+def read_group(
+    folder: Path, group: str, every: int = 1
+) -> tuple[list[BoardView], Board, tuple[int, int]]:
+    """All photographs of a camera, in the folder or below: views, the board, and the image size.
+
+    Of each photograph's discs one of `every` so many is used.
+    """
     views: list[BoardView] = []
     places: list[FloatArray] = []
     offset, size = 0, (0, 0)
     for path in sorted(folder.glob(f"**/{group}_*/truth.json")):
         truth = json.loads(path.read_text())
-        discs = [d for d in truth["discs"] if d["how"] == "measured" and d["visible"]]
+        discs = [d for d in truth["discs"] if d["how"] == "measured" and d["visible"]][::every]
         uv = np.array([[d["u"], d["v"]] for d in discs])
         xy = np.array([[d["px"], d["py"], 0.0] for d in discs])
         image = read_grey(next((path.parent / "images").iterdir()))
@@ -181,9 +186,13 @@ def compare(
     free_aspect: bool,
     polynomial: bool = False,
     peers: Sequence[str] = tuple(OPENCV),
+    every: int = 1,
 ) -> Comparison:
-    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
-    views, board, size = read_group(folder, group)
+    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers.
+
+    One of `every` so many discs of a photograph is used.
+    """
+    views, board, size = read_group(folder, group, every)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
         keep_outliers=True,

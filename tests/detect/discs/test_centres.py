@@ -189,7 +189,7 @@ def test_landmarks_of_the_report_are_the_plain_maxima(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("group", ["asym", "rct", "robvis", "sym"])
+@pytest.mark.parametrize("group", ["asym", "rct", "sym"])
 def test_photographs(group: str, shared_data: Path) -> None:
     folder = min((shared_data / "discs" / "dev").glob(f"{group}_*"))
     (path,) = (folder / "images").iterdir()
