@@ -46,6 +46,7 @@ PUBLISHED_PIXEL_VARIANCE = 2.0
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
+_LIGHT_AND_DARK: tuple[Polarity, Polarity] = ("light", "dark")
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
@@ -55,8 +56,8 @@ _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where the polarity is
 #: stated.
 _DOUBTFUL = 1.0
-#: Where it is not, it is that of the sure discs, if they are at least so many and all alike; the
-#: second look is at the best candidates then, which need these log-odds more.
+#: Where it is not, it is each that at least so many sure discs have; the second look is at the best
+#: candidates then, which need these log-odds more.
 _LEAST_SURE, _BEST, _UNSTATED = 2, 60, 0.75
 
 
@@ -212,10 +213,9 @@ def second_look(
 ) -> SecondLooks:  # fmt: skip
     """Look again where the first look found no disc; other parameters as of `detect_circles`.
 
-    Candidates by edges have a sign. Where none is stated, that of the sure discs is taken, for
-    discs of one place are mostly alike: only the best candidates are looked at then, and pale ones
-    count for less. Where the signs of the sure discs differ, or these are few, there is no second
-    look.
+    Candidates by edges have a sign. Where none is stated, it is that of the sure discs, for discs
+    of one place are mostly alike: of each sign that has enough of them, the best candidates are
+    looked at, and pale ones count for less.
     """
     if not (settings.verify and settings.refine):
         return NO_LOOKS
@@ -224,20 +224,25 @@ def second_look(
         candidates = candidates_at(image, camera, table, settings, first.noise)
         return second_looks_at(image, camera, settings, candidates, found.floor_xy, first.noise)
     contrast, sure = centres.contrast[found.centre], found.evidence >= SURE_EVIDENCE
-    signs = np.sign(contrast[sure])
-    if len(signs) < _LEAST_SURE or (signs != signs[0]).any():
-        return NO_LOOKS
-    settings = replace(settings, polarity="light" if signs[0] > 0.0 else "dark")
-    candidates = candidates_at(image, camera, table, settings, first.noise)
-    best = HoughCandidates(candidates.floor_xy[:_BEST], candidates.score[:_BEST])
-    looks = second_looks_at(image, camera, settings, best, found.floor_xy, first.noise, _UNSTATED)
+    looks = [NO_LOOKS]
+    for polarity in _LIGHT_AND_DARK:
+        if (np.sign(contrast[sure]) == _SIGNS[polarity]).sum() >= _LEAST_SURE:
+            of_sign = replace(settings, polarity=polarity)
+            candidates = candidates_at(image, camera, table, of_sign, first.noise)
+            best = HoughCandidates(candidates.floor_xy[:_BEST], candidates.score[:_BEST])
+            looks.append(
+                second_looks_at(
+                    image, camera, of_sign, best, found.floor_xy, first.noise, _UNSTATED
+                )
+            )
+    more = SecondLooks(*(np.concatenate(values) for values in zip(*looks, strict=True)))
     u, v = centres.pixels[found.centre].T
     lost = lost_by_paleness(
-        np.concatenate([contrast, looks.step]),
-        np.concatenate([image[v, u] - contrast, looks.floor_grey]),
-        np.concatenate([sure, np.zeros(len(looks.step), np.bool_)]),
+        np.concatenate([contrast, more.step]),
+        np.concatenate([image[v, u] - contrast, more.floor_grey]),
+        np.concatenate([sure, np.zeros(len(more.step), np.bool_)]),
     )
-    return looks._replace(log_odds=looks.log_odds - lost[len(sure) :])
+    return more._replace(log_odds=more.log_odds - lost[len(sure) :])
 
 
 def candidates_at(
