@@ -230,11 +230,8 @@ def second_look(
             of_sign = replace(settings, polarity=polarity)
             candidates = candidates_at(image, camera, table, of_sign, first.noise)
             best = HoughCandidates(candidates.floor_xy[:_BEST], candidates.score[:_BEST])
-            looks.append(
-                second_looks_at(
-                    image, camera, of_sign, best, found.floor_xy, first.noise, _UNSTATED
-                )
-            )
+            terms = found.floor_xy, first.noise, None, _UNSTATED
+            looks.append(second_looks_at(image, camera, of_sign, best, *terms))
     more = SecondLooks(*(np.concatenate(values) for values in zip(*looks, strict=True)))
     u, v = centres.pixels[found.centre].T
     lost = lost_by_paleness(
@@ -265,8 +262,8 @@ def second_looks_at(
     candidates: HoughCandidates,
     found_xy: FloatArray,
     noise: float,
-    needed: float = 0.0,
     networks: Networks | None = None,
+    needed: float = 0.0,
 ) -> SecondLooks:
     """Look a second time where no disc was found (see `detect.discs.second_look`).
 
@@ -280,10 +277,10 @@ def second_looks_at(
         Discs found already, metres.
     noise : float
         Of the image, grey levels.
-    needed : float
-        Log-odds that a disc needs more than usual.
     networks : Networks, optional
         Others than the trained ones.
+    needed : float
+        Log-odds that a disc needs more than usual.
     """
     sign = float(_SIGNS[settings.polarity])
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)

@@ -18,13 +18,17 @@ from detect.seen import level_seen
 from detect.verticals.tilt import Verticals, consensus
 from redetect.landmarks import read_frames
 from tests.camera.test_uncertainty import moved
-from tools.simulator.files import exact
 
 SIGMAS = np.array(
     [1.0, 0.5, 1.0, 0.7, *[1e-9] * 5, 1e-9, 1e-9, *[1e-9] * 3, *[2e-3] * 3, 3e-3, 3e-3, 2e-3]
 )
 COVARIANCE = np.diag(SIGMAS**2)
 FLOOR = np.array([[0.0, -1.2], [0.8, -1.8], [-1.1, -2.5]])
+
+
+def exact(camera: Camera) -> Camera:
+    """The camera with a covariance of zero."""
+    return with_covariance(camera, np.zeros((PARAMETERS, PARAMETERS)))
 
 
 def normals_of_verticals(truth: Camera, wrong: Camera) -> np.ndarray:

@@ -103,10 +103,7 @@ class FixedBoard(Board):
 def read_group(
     folder: Path, group: str, every: int = 1
 ) -> tuple[list[BoardView], Board, tuple[int, int]]:
-    """All photographs of a camera, in the folder or below: views, the board, and the image size.
-
-    Of each photograph's discs one of `every` so many is used.
-    """
+    """Photographs of a camera below a folder, one of `every` discs each: views, board, size."""
     views: list[BoardView] = []
     places: list[FloatArray] = []
     offset, size = 0, (0, 0)
@@ -188,10 +185,7 @@ def compare(
     peers: Sequence[str] = tuple(OPENCV),
     every: int = 1,
 ) -> Comparison:
-    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers.
-
-    One of `every` so many discs of a photograph is used.
-    """
+    """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
     settings = CalibrationSettings(
         aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,

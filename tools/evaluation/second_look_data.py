@@ -121,9 +121,7 @@ class _Gathering:
         for place, score in zip(candidates.floor_xy, candidates.score, strict=True):
             grey, scale = glance(image, numbers, place[0], place[1], _RADIUS)
             self.glances.append((np.array([score]), grey[None], scale[None], *judged(place)))
-        looks = second_looks_at(
-            image, camera, _SETTINGS, candidates, _NO_PLACES, noise, networks=_BY_RIM
-        )
+        looks = second_looks_at(image, camera, _SETTINGS, candidates, _NO_PLACES, noise, _BY_RIM)
         for features, place in zip(looks.features, looks.floor_xy, strict=True):
             if np.isfinite(features).all():
                 self.looks.append((features, *self._views(image, camera, place), *judged(place)))

@@ -7,18 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from camera import Camera
-from camera.model import PARAMETERS
-from camera.uncertainty import with_covariance
 from redetect.array_types import ByteArray
 from redetect.storage import write_whole
-
-
-def exact(camera: Camera) -> Camera:
-    """The camera with a covariance of zero: what it is in a simulation."""
-    return with_covariance(camera, np.zeros((PARAMETERS, PARAMETERS)))
 
 
 def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:

@@ -10,6 +10,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
+from camera.model import PARAMETERS
+from camera.uncertainty import with_covariance
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
 from tools.published_camera import PUBLISHED_CAM
@@ -22,7 +24,7 @@ from tools.simulator.driving import (
     step_record,
     tilted_camera,
 )
-from tools.simulator.files import encoded, exact, rounded, write_bytes, write_truth
+from tools.simulator.files import encoded, rounded, write_bytes, write_truth
 from tools.simulator.furniture import DISC_RADIUS_M, lay_discs
 from tools.simulator.observation import (
     SeenDisc,
@@ -299,7 +301,8 @@ def _write_seen(
 ) -> None:  # fmt: skip
     """Write calibration, odometry, the rows of discs (and what is said of them) and the truth."""
     name = plan.settings.name
-    write_camera(exact(plan.camera), folder / f"{name}.cam", overwrite=overwrite)
+    exact = with_covariance(plan.camera, np.zeros((PARAMETERS, PARAMETERS)))
+    write_camera(exact, folder / f"{name}.cam", overwrite=overwrite)
     no_rows: list[tuple[Landmark, ...]] = [() for _ in truths]
     _write_landmarks(plan, folder / f"{name}.txt", what, "", no_rows, overwrite)
     _write_landmarks(plan, folder / "map.circles", what, *circles, overwrite)
