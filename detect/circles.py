@@ -56,8 +56,8 @@ _PART_QUALITY = 0.8
 #: Discs of so little more than the least evidence are for the second look, where the polarity is
 #: stated.
 _DOUBTFUL = 1.0
-#: Where it is not, it is each that at least so many sure discs have; the second look is at the best
-#: candidates then, which need these log-odds more.
+#: Where it is not, it is each that two sure discs have; the second look then examines this number
+#: of candidates, the best ones, which need these log-odds more.
 _LEAST_SURE, _BEST, _UNSTATED = 2, 60, 0.75
 
 
@@ -215,7 +215,7 @@ def second_look(
 
     Candidates by edges have a sign. Where none is stated, it is that of the sure discs, for discs
     of one place are mostly alike: of each sign that has enough of them, the best candidates are
-    looked at, and pale ones count for less.
+    examined, and pale ones count for less.
     """
     if not (settings.verify and settings.refine):
         return NO_LOOKS

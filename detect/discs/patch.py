@@ -63,7 +63,7 @@ PATCH = np.dtype(
 #: Sectors of a disc and what is about it, and where those of a quadrant meet.
 SECTORS = 16
 _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
-#: Where pixels are sorted by sector, each has a multiple of so many.
+#: Where pixels are sorted by sector, each is filled up to a multiple of this number.
 _SECTOR_WHOLE = 8
 
 #: By which formula discs are seen, and along which axis their chords run: see `detect.discs.model`.

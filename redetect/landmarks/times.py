@@ -9,7 +9,7 @@ from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage.messages import excerpt
 
-#: What stands at the head of those that are written here.
+#: The first line of files that are written here.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
 
 
