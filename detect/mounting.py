@@ -10,14 +10,17 @@ that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens i
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from camera import Camera, write_camera
+from camera.calibration.model import COUNT
+from camera.model import PARAMETERS
 from camera.model_checks import checked_pose
 from camera.options import Level
+from camera.rotations import left_jacobian
+from camera.uncertainty import covariance_of, with_covariance
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
@@ -27,7 +30,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import level_matrix
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
-from detect.terminal import progress_bar
+from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.storage import demand_place
 
@@ -37,6 +40,9 @@ HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 _RADIUS_SIGMA = 0.01
 #: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
+#: Places of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
+_POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
+_LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
 
 
 def perform(options: Level) -> int:
@@ -47,13 +53,13 @@ def perform(options: Level) -> int:
     plan = FramePlan(
         camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"
     )
-    tilts, pitches = [], []
+    tilts, pitches, failures = [], [], []
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
             advance()
             (found,) = detect_batch([FrameTask(frame)], plan)
             if found.error is not None or found.seen is None or found.image is None:
-                print(f"left out: {found.error}", file=sys.stderr)
+                failures.append(str(found.error))
                 continue
             outlines = [
                 tilt_of_outlines(
@@ -63,6 +69,9 @@ def perform(options: Level) -> int:
             ]
             tilts.append(found.tilt)
             pitches.append([math.nan if one is None else one.pitch for one in outlines])
+    report_failures(len(failures), failures)
+    if not tilts:
+        raise DetectError(f"{options.run}: none of its images could be worked on")
     mounting = mounting_of_run(
         height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
     )
@@ -150,9 +159,26 @@ def mounting_of_run(
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
-    """The camera as it is mounted, turned about the robot's origin on the floor."""
+    """The camera as it is mounted, turned about the robot's origin on the floor.
+
+    If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
+    mounting's; the rest stays.
+    """
     turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
     up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
     rows = checked_pose("sensor2World", pose)
-    return replace(camera, robot_from_camera=rows, covariance=None)
+    moved = replace(camera, robot_from_camera=rows, covariance=None)
+    covariance = covariance_of(camera)
+    if covariance is None:
+        return moved
+    sigmas = np.array([mounting.pitch_sigma_rad, mounting.roll_sigma_rad, mounting.raised_sigma_m])
+    turned = left_jacobian(np.array([mounting.pitch_rad, mounting.roll_rad, 0.0]))[:, :2]
+    by_mounting = np.zeros((PARAMETERS, 3))
+    by_mounting[_POSITION] = np.column_stack([np.cross(turned.T, moved.centre).T, turn[:, 2]])
+    by_mounting[_ROTATION, :2] = turned
+    found = np.isfinite(sigmas)
+    replaced = np.array(_LEAN_AND_HEIGHT)[found]
+    covariance[replaced] = covariance[:, replaced] = 0.0
+    by_mounting = by_mounting[:, found] * sigmas[found]
+    return with_covariance(moved, covariance + by_mounting @ by_mounting.T)

@@ -7,11 +7,16 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from camera import Camera, read_camera, write_camera
+from camera.calibration.model import COUNT
 from camera.cli import main
+from camera.model import PARAMETERS
+from camera.uncertainty import covariance_of, with_covariance
+from detect.levelling import common_covariance
 from detect.mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import LEAST_FRAMES, FrameTilts
 from detect.seen import image_positions, level_seen
@@ -77,6 +82,46 @@ def test_the_remounted_camera_sees_level(published_camera: Camera) -> None:
     np.testing.assert_allclose(seen, level_seen(published_camera, rows_xy, tilt, raised_m))
 
 
+def test_the_remounted_camera_states_what_its_mounting_may_be_wrong_by(
+    published_camera: Camera,
+) -> None:
+    """As positions scatter if the mounting does; levelled by verticals only its height counts."""
+    tilt, raised_m, sigmas = (-0.045, 0.013), -0.04, (2e-3, 3e-3, 0.012)
+    mounting = Mounting(*tilt, *sigmas[:2], raised_m, sigmas[2], 30, 30)
+    pixels = image_positions(published_camera, np.array([(0.3, -1.4), (-0.7, -2.2), (0.1, -3.3)]))
+    exact = with_covariance(published_camera, np.zeros((PARAMETERS, PARAMETERS)))
+    seen = remounted(exact, mounting)
+    floor_xy = seen.floor_from_pixel(pixels)
+
+    draws = np.random.default_rng(1).standard_normal((4000, 3)) * sigmas
+    scattered = [
+        remounted(
+            published_camera,
+            replace(mounting, pitch_rad=p + tilt[0], roll_rad=r + tilt[1], raised_m=z + raised_m),
+        ).floor_from_pixel(pixels)
+        for p, r, z in draws
+    ]
+    off = np.array(scattered) - floor_xy
+    stated = common_covariance(seen, floor_xy, 0.0, by_verticals=False)
+    normalised = np.einsum("kni,nij,knj->n", off, np.linalg.inv(stated), off) / (2 * len(off))
+    np.testing.assert_allclose(normalised, 1.0, atol=0.1)
+
+    levelled = common_covariance(seen, floor_xy, 0.0, by_verticals=True)
+    higher = remounted(published_camera, replace(mounting, raised_m=raised_m + sigmas[2]))
+    off = higher.floor_from_pixel(pixels) - floor_xy
+    np.testing.assert_allclose(levelled, off[:, :, None] * off[:, None, :], rtol=0.1, atol=3e-6)
+
+
+def test_without_a_covariance_the_remounted_camera_states_none(published_camera: Camera) -> None:
+    mounting = Mounting(0.01, 0.0, 2e-3, 2e-3, math.nan, math.nan, 30, 3)
+    assert remounted(published_camera, mounting).covariance is None
+    # A height that could not be estimated is known as well as before.
+    before = 0.01 * np.eye(PARAMETERS)
+    stated = covariance_of(remounted(with_covariance(published_camera, before), mounting))
+    assert stated is not None
+    assert stated[COUNT + 2, COUNT + 2] > 0.01
+
+
 @pytest.mark.long
 def test_the_demos_camera_comes_back(
     project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -98,10 +143,27 @@ def test_the_demos_camera_comes_back(
     # The simulated robot itself leans by a tenth of a degree or two in the mean.
     off = np.degrees(np.arccos((np.trace(found.rotation @ true.rotation.T) - 1.0) / 2.0))
     assert off < 0.5
-    assert found.covariance is None  # the pose is another one, and not that well known
+    # The pose is another one, and not as well known as the simulation's.
+    stated = covariance_of(found)
+    assert stated is not None
+    assert 0.005 < math.sqrt(stated[COUNT + 2, COUNT + 2]) < 0.03
     unmoved = replace(found, robot_from_camera=true.robot_from_camera, covariance=true.covariance)
     assert unmoved == true
     assert main(command) == 1  # nothing is overwritten unasked
+
+
+def test_images_of_another_size_are_told_once(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = project_root / "images" / "e"
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((48, 64), np.uint8))
+    command = ["level", str(tmp_path), "--camera", str(run / "e.cam")]
+    assert main([*command, "-o", str(tmp_path / "level.cam")]) == 1
+    *failures, error = capsys.readouterr().err.splitlines()
+    assert failures[0] == "2 frames could not be worked on:"
+    assert all("expected 768x288" in line for line in failures[1:])
+    assert error == f"error: {tmp_path}: none of its images could be worked on"
 
 
 def test_an_existing_file_is_found_first(tmp_path: Path) -> None:
