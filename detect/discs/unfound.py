@@ -216,14 +216,12 @@ def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate
     table, found = scene.table, scene.found
     pixels = camera.project_floor(found.floor_xy)
     every = scene.centres(0.0)
-    levels = np.zeros(image.shape, np.float32)
-    levels[every.pixels[:, 1], every.pixels[:, 0]] = every.contrast
-    last = np.array(image.shape)[::-1] - 1
     for (u, v), (x, y), q, evidence in zip(
         pixels.tolist(), found.floor_xy.tolist(), found.quality.tolist(), found.evidence.tolist()
     ):
-        column, row = np.clip(np.rint((u, v)), 0, last).astype(int)
-        contrast = float(levels[row, column])
+        # Not every pixel of a large disc is tested for its centre.
+        nearest = np.argmin(np.hypot(*(every.pixels - np.array((u, v))).T))
+        contrast = float(every.contrast[nearest])
         yield Candidate(u, v, x, y, q, contrast, "disc", evidence, settings.evidence)
     near = 0.5 * settings.separation_m
     taken = [found.floor_xy]

@@ -246,6 +246,7 @@ def test_every_disc_that_is_found_is_explained(
     assert {"disc", "few steps", "polarity", "quality"} <= stages
     for row in why.candidates:
         assert row.is_disc == row.reason().startswith("found")
+        assert not row.is_disc or row.contrast > 15.0  # of large discs, too
     content = json.loads(why.to_json())
     assert len(content["candidates"]) == len(why.candidates)
     assert why._repr_png_().startswith(b"\x89PNG")
