@@ -43,7 +43,11 @@ def last_part(prefix: str) -> str:
 
 
 class ImageNames:
-    """Names of a folder's image files that match a pattern, in natural order: numbers by value."""
+    """Names of a folder's image files that match a pattern, in natural order: numbers by value.
+
+    Hidden files are skipped unless the pattern begins with a dot: some systems keep metadata in
+    files named ``._`` and the image's name.
+    """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
@@ -55,7 +59,9 @@ class ImageNames:
             names = sorted(
                 entry.name
                 for entry in entries
-                if _suffix(entry.name) in IMAGE_SUFFIXES and matches(entry.name)
+                if _suffix(entry.name) in IMAGE_SUFFIXES
+                and matches(entry.name)
+                and (pattern.startswith(".") or not entry.name.startswith("."))
             )
         self._names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
         self._places: dict[str, int] = {}

@@ -46,6 +46,19 @@ def demand_place(path: Path, *, overwrite: bool) -> None:
         raise OSError(f"{path}: is a device, pipe or socket: expected the name of a file")
     if not overwrite and os.path.lexists(path):
         raise OutputExistsError(path)
+    demand_writable(path)
+
+
+def demand_writable(path: Path) -> None:
+    """Refuse a path in a folder that may not be written to; of a folder yet to be made, the nearest
+    above it counts.
+    """
+    above = next(place for place in Path(os.path.realpath(path)).parents if place.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(above))
+    effective = os.access in os.supports_effective_ids
+    if not os.access(above, os.W_OK | os.X_OK, effective_ids=effective):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
 class PartFile(AbstractContextManager["PartFile"]):

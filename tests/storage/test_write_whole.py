@@ -12,7 +12,7 @@ from threading import Barrier
 
 import pytest
 
-from redetect.storage import OutputExistsError, write_whole
+from redetect.storage import OutputExistsError, demand_writable, write_whole
 
 
 def names(folder: Path) -> list[str]:
@@ -195,3 +195,9 @@ def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
         pass
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_below_a_file_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError):
+        demand_writable(tmp_path / "file" / "rows")

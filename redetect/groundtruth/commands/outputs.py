@@ -15,7 +15,7 @@ from rich.progress import track
 
 from redetect.groundtruth import __version__
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage import OutputExistsError
+from redetect.storage import OutputExistsError, demand_writable
 
 T = TypeVar("T")
 
@@ -28,6 +28,7 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
             continue
         if path.exists() and not force:
             raise OutputExistsError(path)
+        demand_writable(path)
         if path.resolve() in places:
             raise GroundTruthError(
                 f"{path}: two of the outputs would be written there: expected another name or "

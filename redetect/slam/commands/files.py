@@ -18,7 +18,7 @@ from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, landmark_files, read_recording
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import OutputExistsError, demand_writable, write_bytes
 
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
@@ -95,6 +95,7 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
     for path in paths:
         if path.exists() and not overwrite:
             raise OutputExistsError(path)
+        demand_writable(path)
 
 
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:

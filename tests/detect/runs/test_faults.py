@@ -18,6 +18,7 @@ import pytest
 
 from detect.cli import main
 from redetect.landmarks import read_frames, read_steps
+from redetect.storage import demand_writable
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
@@ -190,6 +191,18 @@ def as_nobody() -> Iterator[None]:
     finally:
         if superuser:
             os.seteuid(0)
+
+
+@pytest.mark.parametrize("place", ["rows", "folder/rows", "folder/deeper/rows"])
+def test_a_folder_that_may_not_be_written_to_is_told_before_the_work(place: str) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o555)
+        with as_nobody(), pytest.raises(PermissionError) as told:
+            demand_writable(Path(name) / place)
+        assert told.value.filename == str(Path(name) / place)
+        Path(name).chmod(0o777)
+        with as_nobody():
+            demand_writable(Path(name) / place)
 
 
 @pytest.fixture

@@ -43,6 +43,15 @@ def test_images_are_in_natural_order(names: set[str]) -> None:
         assert images.find("notes") is None
 
 
+def test_hidden_files_are_no_images(tmp_path: Path) -> None:
+    for name in ("a.jpg", "._a.jpg", ".b.jpg"):
+        (tmp_path / name).touch()
+    images = ImageNames(tmp_path)
+    assert [images.path(k).name for k in range(len(images))] == ["a.jpg"]
+    assert len(ImageNames(tmp_path, "*.jpg")) == 1
+    assert ImageNames(tmp_path, ".b.jpg").path(0).name == ".b.jpg"
+
+
 def test_a_prefix_may_go_up_within_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run" / "images").mkdir(parents=True)
     (tmp_path / "run" / "images" / "a.png").touch()
