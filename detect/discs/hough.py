@@ -151,9 +151,10 @@ def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArr
     score = np.zeros((rows, columns), np.float32)
     column = np.empty(columns, np.float32)
     for i in range(1, rows - 1):
-        # One cell more to either side; sliced, so that several are added at a time.
-        near = votes[:, grid.first[i] - 1 : grid.last[i] + 1]
-        before, same, after = near[i - 1], near[i], near[i + 1]
+        # One cell more to either side; sliced row by row, so that several are added at a time.
+        left, right = grid.first[i] - 1, grid.last[i] + 1
+        before, same = votes[i - 1, left:right], votes[i, left:right]
+        after = votes[i + 1, left:right]
         around = np.float32(0.0)
         for j in range(len(same)):
             column[j] = before[j] + same[j] + after[j]
