@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, published_camera_numbers
-from detect.discs.candidates import alone_published, local_maxima
+from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
 from detect.discs.evidence import lost_by_paleness
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
@@ -239,7 +239,9 @@ def second_look(
         np.concatenate([image[v, u] - contrast, more.floor_grey]),
         np.concatenate([sure, np.zeros(len(more.step), np.bool_)]),
     )
-    return more._replace(log_odds=more.log_odds - lost[len(sure) :])
+    more = more._replace(log_odds=more.log_odds - lost[len(sure) :])
+    alone = suppress_neighbours(more.floor_xy, more.log_odds, settings.separation_m)
+    return SecondLooks(*(values[alone] for values in more))
 
 
 def candidates_at(

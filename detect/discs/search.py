@@ -40,7 +40,7 @@ _CLEAR = 6.0
 _WITHIN = 0.75
 #: Looks that came to places nearer than this share of the separation are at the same disc.
 _SAME_DISC = 0.3
-#: Discs of this much more than the required evidence are sure: others are compared with them.
+#: Discs of this evidence are sure: others are compared with them.
 SURE_EVIDENCE = 4.0
 #: In place of an evidence of minus infinity, where nothing is verified.
 _NO_EVIDENCE = -1e9
@@ -366,7 +366,7 @@ def _not_pale(
         u, v = centres.pixels[centre, 0], centres.pixels[centre, 1]
         contrast[i] = centres.contrast[centre]
         floor_grey[i] = image[v, u] - contrast[i]
-        clear[i] = evidence[found[i]] >= least_evidence + SURE_EVIDENCE
+        clear[i] = evidence[found[i]] >= SURE_EVIDENCE
     lost = lost_by_paleness(contrast, floor_grey, clear)
     kept, n = np.empty(count, np.int64), 0
     for i in range(count):
