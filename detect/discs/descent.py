@@ -74,7 +74,7 @@ WORK = np.dtype(
         ("values", np.float64, UNKNOWNS),
         ("bare", np.float64, UNKNOWNS),
         ("sector_sums", np.float32, (SECTORS + 1, 8)),
-        ("by_sector", np.float32, (9, CAPACITY)),  # see `detect.discs.placing`
+        ("by_sector", np.float32, (9, CAPACITY)),  # the rows of `detect.discs.placing`
     ]
 )
 

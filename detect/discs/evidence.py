@@ -130,11 +130,11 @@ def _log_odds(share: float) -> float:
 
 @kernel()
 def lost_by_paleness(
-    contrast: NDArray[np.float64], floor_grey: NDArray[np.float64], clear: NDArray[np.bool_]
+    contrast: NDArray[np.float64], floor_grey: NDArray[np.float64], sure: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Log-odds that discs of an image lose because they are paler than its clear discs.
+    """Log-odds that discs of an image lose because they are paler than its sure discs.
 
-    Discs of one place are mostly alike. What has much less contrast than the clear discs is mostly
+    Discs of one place are mostly alike. What has much less contrast than the sure discs is mostly
     the reflection of one in a polished floor or in glass. In shadow a disc has less contrast, too,
     but its ratio to the floor stays what it is elsewhere: that speaks for it. Constants were chosen
     on the first 1,000 frames of run e; rendered buildings confirm them.
@@ -143,8 +143,9 @@ def lost_by_paleness(
     ----------
     contrast, floor_grey : (N,) float64
         Grey levels: of each disc less its floor, and of the floor.
-    clear : (N,) bool
-        Which discs are certain; each is compared with the others of its sign, if they are two.
+    sure : (N,) bool
+        Which are certainly discs; each one is compared with the others of its sign that are, if
+        there are two.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def lost_by_paleness(
     for k in range(count):
         others = 0
         for j in range(count):
-            if clear[j] and j != k and contrast[j] * contrast[k] > 0.0:
+            if sure[j] and j != k and contrast[j] * contrast[k] > 0.0:
                 contrasts[others], ratios[others] = abs(contrast[j]), ratio[j]
                 others += 1
         if others >= _LEAST_OTHERS:

@@ -407,7 +407,7 @@ def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
 
 @kernel()
 def _solve(normal: FloatArray, movement: FloatArray) -> None:
-    """Solve the normal equations (9, 9, 1); they are lost."""
+    """Solve the normal equations (9, 9, 1), which are overwritten."""
     for k in range(_BLUR_1, _GREY):
         eliminate(normal, k)
     for k in range(_Y, _BLUR_1 - 1, -1):
@@ -419,6 +419,7 @@ def _solve(normal: FloatArray, movement: FloatArray) -> None:
 
 @kernel()
 def _moved(edge: Edge, step: FloatArray) -> Edge:
+    """The edge after a step, within limits."""
     return Edge(
         edge.x + _within(step[_X], _LONGEST),
         edge.y + _within(step[_Y], _LONGEST),

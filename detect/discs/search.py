@@ -357,17 +357,17 @@ def _not_pale(
     evidence: NDArray[np.float64],
     least_evidence: float,
 ) -> NDArray[np.int64]:
-    """Those discs that have evidence enough for how pale they are."""
+    """Those discs whose evidence makes up for their paleness."""
     count = len(found)
     contrast, floor_grey = np.empty(count), np.empty(count)
-    clear = np.empty(count, np.bool_)
+    sure = np.empty(count, np.bool_)
     for i in range(count):
         centre = keep[found[i]]
         u, v = centres.pixels[centre, 0], centres.pixels[centre, 1]
         contrast[i] = centres.contrast[centre]
         floor_grey[i] = image[v, u] - contrast[i]
-        clear[i] = evidence[found[i]] >= SURE_EVIDENCE
-    lost = lost_by_paleness(contrast, floor_grey, clear)
+        sure[i] = evidence[found[i]] >= SURE_EVIDENCE
+    lost = lost_by_paleness(contrast, floor_grey, sure)
     kept, n = np.empty(count, np.int64), 0
     for i in range(count):
         if evidence[found[i]] - lost[i] >= least_evidence:
