@@ -26,7 +26,13 @@ from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, work
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.placing import place_all
 from detect.discs.positions import pixel_positions, refined_covariances
-from detect.discs.quality import Centres, Limits, centres_of, least_part_quality
+from detect.discs.quality import (
+    Centres,
+    Limits,
+    centres_of,
+    contrast_and_floor,
+    least_part_quality,
+)
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
 from detect.discs.search import SURE_EVIDENCE, DiscSearch, FoundDiscs, Scene, search_discs
@@ -199,12 +205,21 @@ def first_look(
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     least, sign = settings.threshold, _SIGNS[settings.polarity]
     centres = centres_of(image, table, Limits(least, _PART_QUALITY * least, sign=sign))
-    kernel = _kernel_camera(camera)
-    scene = Scene(
-        image, table.floor_xy, first_search(settings), fit_settings(noise, kernel.blur_ratio),
-        kernel.numbers,
-    )  # fmt: skip
+    scene = scene_of(image, camera, table, settings, noise)
     return FirstLook(noise, weakest, centres, search_discs(scene, centres, weakest), scene)
+
+
+def scene_of(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    table: DiscTable,
+    settings: CircleSettings,
+    noise: float,
+) -> Scene:
+    """An image, and how it is searched; parameters as of `detect_circles`."""
+    kernel = _kernel_camera(camera)
+    fit = fit_settings(noise, kernel.blur_ratio)
+    return Scene(image, table.floor_xy, first_search(settings), fit, kernel.numbers)
 
 
 def second_look(
@@ -223,7 +238,8 @@ def second_look(
     if settings.polarity != "any":
         candidates = candidates_at(image, camera, table, settings, first.noise)
         return second_looks_at(image, camera, settings, candidates, found.floor_xy, first.noise)
-    contrast, sure = centres.contrast[found.centre], found.evidence >= SURE_EVIDENCE
+    contrast, floor_grey = contrast_and_floor(image, centres, found.centre)
+    sure = found.evidence >= SURE_EVIDENCE
     looks = [NO_LOOKS]
     for polarity in _LIGHT_AND_DARK:
         if (np.sign(contrast[sure]) == _SIGNS[polarity]).sum() >= _LEAST_SURE:
@@ -233,10 +249,9 @@ def second_look(
             terms = found.floor_xy, first.noise, None, _UNSTATED
             looks.append(second_looks_at(image, camera, of_sign, best, *terms))
     more = SecondLooks(*(np.concatenate(values) for values in zip(*looks, strict=True)))
-    u, v = centres.pixels[found.centre].T
     lost = lost_by_paleness(
         np.concatenate([contrast, more.step]),
-        np.concatenate([image[v, u] - contrast, more.floor_grey]),
+        np.concatenate([floor_grey, more.floor_grey]),
         np.concatenate([sure, np.zeros(len(more.step), np.bool_)]),
     )
     more = more._replace(log_odds=more.log_odds - lost[len(sure) :])

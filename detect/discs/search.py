@@ -1,4 +1,4 @@
-"""Compiled search for discs among the maxima of the quality: looks, fits, and one row per disc."""
+"""The search for discs among the maxima of the quality: looks, fits, and one row per disc."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from detect.discs.evidence import (
     evidence_with_rim,
     lost_by_paleness,
 )
-from detect.discs.fit import RESULT, fit_disc, working_space
+from detect.discs.fit import RESULT, fit_disc, fitted_positions, working_space
 from detect.discs.model import Disc
 from detect.discs.patch import FULL, LOOK, Candidate, FitSettings, floor_steps
 from detect.discs.placing import WELL_EXPLAINED, apparent_radius, place_by_rim, place_fitted
-from detect.discs.quality import Centres
+from detect.discs.quality import Centres, contrast_and_floor
 from detect.discs.rim import follow_rim
 from redetect.compiled import kernel
 
@@ -159,6 +159,29 @@ class FoundDiscs(NamedTuple):
     looks: Looks
 
 
+class Fits(NamedTuple):
+    """Candidates, and what their fits say."""
+
+    centre: NDArray[np.int64]
+    """(K,) indices of the centres."""
+    starts: NDArray[np.int64]
+    """(K, 2) pixels."""
+    results: NDArray[Any]
+    """(K,) `RESULT`."""
+    place: NDArray[np.float64]
+    """(K, 2) metres."""
+    evidence: NDArray[np.float64]
+    """(K,); minus infinity where there is no disc, as is the score."""
+    score: NDArray[np.float64]
+    """(K,) what neighbours are suppressed by."""
+    rim_xy: NDArray[np.float64]
+    """(K, 2) of the rim that is to place the disc, metres."""
+    rim_step: NDArray[np.float64]
+    """(K,) grey levels across that rim; 0 where the fit places the disc."""
+    fate: NDArray[np.int8]
+    log_odds: NDArray[np.float64]
+
+
 def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     """Fit discs at the best centres, weigh the evidence, and keep the best of those that are one.
 
@@ -169,31 +192,44 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     weakest : float
         Least contrast, grey levels.
     """
-    centre, xy, covariance, evidence, radius, looks = _search(
-        scene, centres, weakest, working_space()
-    )
-    return FoundDiscs(centre, xy, covariance, evidence, radius, Looks(*looks))
+    search, space = scene.search, working_space()
+    fits = candidates_of(scene, centres, weakest)
+    _fit(scene, centres, fits, space)
+    clear = fits.evidence >= search.least_evidence + CLEAR_EVIDENCE
+    radius = apparent_radius(search.radius, fits.results[clear])
+    if search.verify and search.refine:
+        place_found(scene, radius, fits, space)
+    best = _best(scene, centres, fits)
+    positions, covariance = fitted_positions(fits.results[best])
+    return FoundDiscs(
+        fits.centre[best], positions, covariance, fits.evidence[best], radius,
+        Looks(fits.starts, fits.fate, fits.log_odds, fits.results),
+    )  # fmt: skip
+
+
+def candidates_of(scene: Scene, centres: Centres, weakest: float) -> Fits:
+    """The centres to fit discs at: of those in the middle of a disc one is enough."""
+    near = 0.5 * scene.search.separation
+    keep = strong_and_alone(centres, scene.floor_xy, weakest, near)
+    starts = middles(centres, keep, scene.floor_xy, weakest, near)
+    count = len(keep)
+    return Fits(
+        keep, starts, np.zeros(count, RESULT), np.zeros((count, 2)), np.full(count, -np.inf),
+        np.full(count, -np.inf), np.zeros((count, 2)), np.zeros(count),
+        np.full(count, _LOOK, np.int8), np.full(count, -np.inf),
+    )  # fmt: skip
 
 
 @kernel()
-def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any]) -> Any:
-    """`search_discs`: the fields of what it returns."""
+def _fit(scene: Scene, centres: Centres, fits: Fits, space: NDArray[Any]) -> None:
+    """Look at each candidate with a short fit; fit a disc in full where that promises one."""
     image, floor_xy, search, settings = scene.image, scene.floor_xy, scene.search, scene.settings
+    results, place, evidence, fate = fits.results, fits.place, fits.evidence, fits.fate
     work = space[0]
-    # Each disc has several best centres: of those in the middle of it one is enough.
-    near = 0.5 * search.separation
-    keep = strong_and_alone(centres, floor_xy, weakest, near)
-    starts = middles(centres, keep, floor_xy, weakest, near)
-    count = len(keep)
-    results: Any = np.zeros(count, RESULT)
-    place = np.zeros((count, 2))
-    evidence, score = np.full(count, -np.inf), np.full(count, -np.inf)
-    rim_xy, rim_step = np.zeros((count, 2)), np.zeros(count)
-    fate, log_odds_of_looks = np.full(count, _LOOK, np.int8), np.full(count, -np.inf)
     first_blur = max(settings.blur_px, 0.6 * search.optics_px)
-    for k in range(count):
-        result, u, v = results[k], starts[k, 0], starts[k, 1]
-        quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
+    for k in range(len(results)):
+        result, u, v = results[k], fits.starts[k, 0], fits.starts[k, 1]
+        quality, contrast = centres.quality[fits.centre[k]], centres.contrast[fits.centre[k]]
         if _at_clear_disc(search, place[:k], evidence, floor_xy[v, u]):
             fate[k] = _IN_CLEAR
             continue
@@ -206,7 +242,7 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
         if fit_disc(image, floor_xy, candidate, settings, start, LOOK, hope, work, result):
             place[k, 0], place[k, 1] = result.x, result.y
             promise = _evidence(result, search)
-            log_odds_of_looks[k] = promise
+            fits.log_odds[k] = promise
             if not search.verify:
                 evidence[k] = max(promise, _NO_EVIDENCE)
             elif promise >= hope.least_evidence:
@@ -214,8 +250,8 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             if evidence[k] > -np.inf:
                 fate[k] = _SAME
     for k in best_apart(place, evidence, _SAME_DISC * search.separation):
-        result, u, v = results[k], starts[k, 0], starts[k, 1]
-        quality, contrast = centres.quality[keep[k]], centres.contrast[keep[k]]
+        result, u, v = results[k], fits.starts[k, 0], fits.starts[k, 1]
+        quality, contrast = centres.quality[fits.centre[k]], centres.contrast[fits.centre[k]]
         x, y = floor_xy[v, u, 0], floor_xy[v, u, 1]
         u, v = nearest_pixel(floor_xy, u, v, result.x, result.y)
         # A look gives the blur but roughly: too small a patch would be gathered again.
@@ -236,8 +272,8 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             evidence[k] = _evidence(result, search) if is_disc else -np.inf
             if is_disc and search.verify:
                 verdict = _with_rim(scene, quality, evidence[k], result)
-                evidence[k], rim_step[k] = verdict.log_odds, verdict.rim_step
-                rim_xy[k, 0], rim_xy[k, 1] = verdict.rim_x, verdict.rim_y
+                evidence[k], fits.rim_step[k] = verdict.log_odds, verdict.rim_step
+                fits.rim_xy[k, 0], fits.rim_xy[k, 1] = verdict.rim_x, verdict.rim_y
                 is_disc = evidence[k] >= search.least_evidence
             if not is_disc or result.blur <= _AT_BOUND * result.blur_bound:
                 break
@@ -245,64 +281,45 @@ def _search(scene: Scene, centres: Centres, weakest: float, space: NDArray[Any])
             blur = result.blur_bound
         # A fit that wandered off, or turned the disc's contrast round, is about something else.
         off = math.hypot(result.x - x, result.y - y)
-        fate[k], log_odds_of_looks[k] = _EVIDENCE, evidence[k]
+        fate[k], fits.log_odds[k] = _EVIDENCE, evidence[k]
         if is_disc and off < search.radius and result.contrast * contrast > 0.0:
-            score[k] = max(evidence[k], _NO_EVIDENCE + quality)
+            fits.score[k] = max(evidence[k], _NO_EVIDENCE + quality)
             fate[k] = _BESIDE
         elif is_disc:
             fate[k] = _ELSEWHERE
         place[k, 0], place[k, 1] = (result.x, result.y) if search.refine else (x, y)
-    radius = _apparent_radius(results, evidence, search)
-    for k in range(count):
-        result = results[k]
-        if fate[k] != _BESIDE or not (search.verify and search.refine):
-            continue
-        if rim_step[k] != 0.0:
-            rim = follow_rim(
-                image, scene.camera_numbers, rim_xy[k, 0], rim_xy[k, 1], radius, rim_step[k]
-            )
-            place_by_rim(scene, radius, rim, work, result)
-        else:
-            place_fitted(scene, radius, work, result)
-        place[k, 0], place[k, 1] = result.x, result.y
-    best = best_apart(place, score, search.separation)
-    fate[best] = _RARE
-    if search.verify:
-        best = of_likely_sign(best, results.contrast, evidence, search.least_evidence)
-        fate[best] = _PALE
-        best = _not_pale(image, centres, keep, best, evidence, search.least_evidence)
-    fate[best] = _DISC
-    # In scan order, as the centres are: by insertion, for these are few.
-    for i in range(1, len(best)):
-        k, j = best[i], i
-        while j > 0 and keep[best[j - 1]] > keep[k]:
-            best[j] = best[j - 1]
-            j -= 1
-        best[j] = k
-    found, covariance = np.empty(len(best), np.int64), np.empty((len(best), 2, 2))
-    found_xy, log_odds = np.empty((len(best), 2)), np.empty(len(best))
-    for i in range(len(best)):
-        result = results[best[i]]
-        found[i], log_odds[i] = keep[best[i]], evidence[best[i]]
-        found_xy[i, 0], found_xy[i, 1] = result.x, result.y
-        covariance[i, 0, 0], covariance[i, 1, 1] = result.cov_xx, result.cov_yy
-        covariance[i, 0, 1] = covariance[i, 1, 0] = result.cov_xy
-    looks = (starts, fate, log_odds_of_looks, results)
-    return found, found_xy, covariance, log_odds, radius, looks
 
 
 @kernel()
-def _apparent_radius(
-    results: NDArray[Any], evidence: NDArray[np.float64], search: DiscSearch
-) -> float:
-    """The radius that the clear discs of an image seem to have."""
-    radii, count = np.empty(len(results)), 0
-    for k in range(len(results)):
-        clear = evidence[k] >= search.least_evidence + CLEAR_EVIDENCE
-        if clear and results[k].explained >= WELL_EXPLAINED:
-            radii[count] = results[k].radius
-            count += 1
-    return apparent_radius(search.radius, radii[:count])
+def place_found(scene: Scene, radius: float, fits: Fits, space: NDArray[Any]) -> None:
+    """Place the discs by their sectors (`detect.discs.placing`)."""
+    for k in range(len(fits.results)):
+        if fits.fate[k] != _BESIDE:
+            continue
+        result = fits.results[k]
+        if fits.rim_step[k] != 0.0:
+            x, y = fits.rim_xy[k, 0], fits.rim_xy[k, 1]
+            rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, fits.rim_step[k])
+            place_by_rim(scene, radius, rim, space[0], result)
+        else:
+            place_fitted(scene, radius, space[0], result)
+        fits.place[k, 0], fits.place[k, 1] = result.x, result.y
+
+
+def _best(scene: Scene, centres: Centres, fits: Fits) -> NDArray[np.int64]:
+    """The fits that are discs, in scan order, as the centres are; the fate of all others."""
+    search, evidence = scene.search, fits.evidence
+    best = best_apart(fits.place, fits.score, search.separation)
+    if search.verify:
+        fits.fate[best] = _RARE
+        best = of_likely_sign(best, fits.results["contrast"], evidence, search.least_evidence)
+        fits.fate[best] = _PALE
+        contrast, floor_grey = contrast_and_floor(scene.image, centres, fits.centre[best])
+        sure = evidence[best] >= SURE_EVIDENCE
+        lost = lost_by_paleness(contrast, floor_grey, sure)
+        best = best[evidence[best] - lost >= search.least_evidence]
+    fits.fate[best] = _DISC
+    return np.asarray(best[np.argsort(fits.centre[best])])
 
 
 @kernel()
@@ -346,34 +363,6 @@ def of_likely_sign(
             kept[count] = k
             count += 1
     return kept[:count]
-
-
-@kernel()
-def _not_pale(
-    image: NDArray[np.uint8],
-    centres: Centres,
-    keep: NDArray[np.int64],
-    found: NDArray[np.int64],
-    evidence: NDArray[np.float64],
-    least_evidence: float,
-) -> NDArray[np.int64]:
-    """Those discs whose evidence makes up for their paleness."""
-    count = len(found)
-    contrast, floor_grey = np.empty(count), np.empty(count)
-    sure = np.empty(count, np.bool_)
-    for i in range(count):
-        centre = keep[found[i]]
-        u, v = centres.pixels[centre, 0], centres.pixels[centre, 1]
-        contrast[i] = centres.contrast[centre]
-        floor_grey[i] = image[v, u] - contrast[i]
-        sure[i] = evidence[found[i]] >= SURE_EVIDENCE
-    lost = lost_by_paleness(contrast, floor_grey, sure)
-    kept, n = np.empty(count, np.int64), 0
-    for i in range(count):
-        if evidence[found[i]] - lost[i] >= least_evidence:
-            kept[n] = found[i]
-            n += 1
-    return kept[:n]
 
 
 @kernel(forceinline=True)

@@ -175,7 +175,7 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
             raise WorkerError("--jobs and --cluster: expected one of them")
         return cluster_workers(command.cluster, large=job.ships_images)
     jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
-    return local_workers(jobs, large=job.ships_images, halves=True)
+    return local_workers(jobs, large=job.ships_images, shared=True)
 
 
 def _print_results(job: Job, summary: RunSummary) -> None:

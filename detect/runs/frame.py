@@ -21,13 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import (
-    CircleDetections,
-    candidates_at,
-    detect_circles,
-    disc_shape,
-    second_looks_at,
-)
+from detect.circles import CircleDetections, detect_circles, disc_shape
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
@@ -40,7 +34,7 @@ from detect.levelling import (
     with_common,
 )
 from detect.lines import LineDetections, detect_lines
-from detect.run_tilt import RunTilt, frame_tilts, smooth_axis, tilt_of_run
+from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
     FramePlan,
@@ -181,20 +175,6 @@ def reason_of(error: Exception, task: FrameTask) -> str:
     if isinstance(error, FrameError):
         return str(error)
     return f"{task.name}: {type(error).__name__}: {error}"
-
-
-def after_first_look(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """What follows the first look at discs, as if that had found none: for its kernels."""
-    camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
-    if camera and table and settings and settings.verify and settings.refine:
-        if settings.polarity == "any":
-            settings = replace(settings, polarity="light")
-        image = read_image(tasks[0].frame, camera, plan.working_folder)
-        candidates = candidates_at(image, camera, table, settings, noise=0.0)
-        second_looks_at(image, camera, settings, candidates, np.empty((0, 2)), noise=0.0)
-        if plan.levelling == "run":
-            tilt_of_outlines(image, camera, candidates.floor_xy, settings.radius_m)
-            smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -190,17 +190,17 @@ def _cores() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-def local_workers(jobs: int, *, large: bool = False, halves: bool = False) -> Workers:
+def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Workers:
     """Processes of this machine; 1 is this process itself.
 
-    Of `large` tasks, which carry images or bring pictures back, each has one frame. With `halves`,
-    one that has to compile has half of the kernels compiled by each of two others.
+    Of `large` tasks, which carry images or bring pictures back, each has one frame. With `shared`,
+    one that has to compile has the kernels compiled by two or three others at the same time.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
     chunk = 1 if large else _TOGETHER
     if jobs == 1:
-        return Workers(lambda plan: _InProcess(plan, halves=halves), chunk, window=lambda: 1)
+        return Workers(lambda plan: _InProcess(plan, shared=shared), chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
     show = announcements_are_shown()
     return Workers(lambda plan: _ProcessPool(jobs, plan, show=show), chunk, lambda: window)
@@ -237,9 +237,9 @@ class _CompiledElsewhereError(Exception):
 class _InProcess(Executor):
     """Runs each task immediately, before it returns the future."""
 
-    def __init__(self, plan: FramePlan, *, halves: bool) -> None:
+    def __init__(self, plan: FramePlan, *, shared: bool) -> None:
         self._plan = plan
-        self._halves = halves and plan.lines and plan.circles and _cores() > 1
+        self._shared = shared and plan.lines and plan.circles and _cores() > 1
         self._chunk: Chunk = ()
         self._forget = on_compilation(self._before_compilation)
 
@@ -257,25 +257,26 @@ class _InProcess(Executor):
 
     def _before_compilation(self) -> None:
         say_compiling()
-        if not self._halves:
+        if not self._shared:
             return
-        self._halves = False  # only before the first kernel
-        from detect.runs.frame import after_first_look
+        self._shared = False  # only before the first kernel
+        from detect.runs.first_run import look_again, place_discs
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
-        with (
-            suppress(OSError, ImportError, BrokenExecutor),
-            _ProcessPool(1, discs, show=False) as one,
-            _ProcessPool(1, lines, show=False) as other,
-        ):
-            # Discs take twice as long as lines. So the process of the lines goes on with what
-            # follows the first look at discs, which the other one comes to last.
-            done: list[Future[Any]] = [
-                one.submit(work_on_chunk, discs, self._chunk),
-                other.submit(work_on_chunk, lines, self._chunk),
-                other.submit(after_first_look, discs, self._chunk),
+        with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
+            one, *others = [
+                started.enter_context(_ProcessPool(1, plan, show=False))
+                for plan in (discs, lines, discs)[: _cores()]
             ]
+            # Discs take three times as long as lines. So another process takes on what follows the
+            # first look at discs, which theirs comes to last.
+            done = [
+                one.submit(work_on_chunk, discs, self._chunk),
+                others[0].submit(work_on_chunk, lines, self._chunk),
+            ]
+            for function in (look_again, place_discs):
+                others[-1].submit(function, discs, self._chunk)
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
             raise _CompiledElsewhereError

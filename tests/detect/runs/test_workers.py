@@ -87,18 +87,24 @@ def test_no_workers_are_refused() -> None:
         local_workers(0)
 
 
-def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) -> None:
-    """The kernels of lines and those of discs by a process each; what was begun begins again."""
+@pytest.mark.parametrize("cores", [2, 8])
+def test_kernels_are_compiled_once_and_first(
+    cores: int, run_folder: Path, monkeypatch: Any
+) -> None:
+    """By a process each for lines and discs, and one for the rest; what was begun begins again."""
     began: list[str] = []
+    processes: list[ThreadPoolExecutor] = []
 
     class Process(ThreadPoolExecutor):
         def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
             assert not show
             super().__init__(count)
+            processes.append(self)
 
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
             plan, chunk = args
-            began.append(f"{fn.__name__} {bool(plan.lines)} {bool(plan.circles)} {chunk}")
+            process = processes.index(self)
+            began.append(f"{process} {fn.__name__} {bool(plan.lines)} {bool(plan.circles)} {chunk}")
             return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
 
     def work(plan: FramePlan, chunk: str) -> int:
@@ -108,17 +114,23 @@ def test_halves_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) 
         return 7
 
     monkeypatch.setattr(workers_module, "_ProcessPool", Process)
-    monkeypatch.setattr(workers_module, "_cores", lambda: 2)
+    monkeypatch.setattr(workers_module, "_cores", lambda: cores)
     plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
-    with local_workers(1, halves=True).start(plan) as executor:
+    with local_workers(1, shared=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
-    halves = ["work_on_chunk False True images", "work_on_chunk True False images"]
-    halves += ["after_first_look False True images"]
-    assert began == [*halves, "compiled images", "compiled images"]
+    rest = 1 if cores == 2 else 2
+    assert began == [
+        "0 work_on_chunk False True images",
+        "1 work_on_chunk True False images",
+        f"{rest} look_again False True images",
+        f"{rest} place_discs False True images",
+        "compiled images",
+        "compiled images",
+    ]
     only_lines = replace(plan, circles=None)
-    with local_workers(1, halves=True).start(only_lines) as executor:
+    with local_workers(1, shared=True).start(only_lines) as executor:
         executor.submit(work, only_lines, "more")
-    assert began[5:] == ["compiled more", "compiled more"]
+    assert began[6:] == ["compiled more", "compiled more"]
 
 
 @pytest.mark.long
