@@ -542,11 +542,13 @@ def _add_square(result: Any, share: float, x: float, y: float) -> None:
     result.cov_yy += share * y * y
 
 
-def apparent_radius(nominal: float, clear: NDArray[Any]) -> float:
-    """The radius that discs of an image seem to have, by the clear ones that are wholly in view.
+@kernel()
+def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
+    """The radius that discs of an image seem to have, by those that are wholly in view.
 
     All are larger or smaller where the camera hangs lower or higher than calibrated. The radius of
     a part of a disc trades with its place, so it has to be known otherwise.
     """
-    whole = clear["radius"][clear["explained"] >= WELL_EXPLAINED]
-    return nominal if len(whole) < _LEAST_WHOLE else float(median(whole))
+    if len(radii) < _LEAST_WHOLE:
+        return nominal
+    return median(radii)

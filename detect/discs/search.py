@@ -192,13 +192,7 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     weakest : float
         Least contrast, grey levels.
     """
-    search, space = scene.search, working_space()
-    fits = candidates_of(scene, centres, weakest)
-    _fit(scene, centres, fits, space)
-    clear = fits.evidence >= search.least_evidence + CLEAR_EVIDENCE
-    radius = apparent_radius(search.radius, fits.results[clear])
-    if search.verify and search.refine:
-        place_found(scene, radius, fits, space)
+    fits, radius = _search(scene, centres, weakest, working_space())
     best = _best(scene, centres, fits)
     positions, covariance = fitted_positions(fits.results[best])
     return FoundDiscs(
@@ -207,25 +201,46 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
     )  # fmt: skip
 
 
+@kernel()
+def _search(
+    scene: Scene, centres: Centres, weakest: float, space: NDArray[Any]
+) -> tuple[Fits, float]:
+    """Fits of discs, those that are some in their places; the radius that they seem to have."""
+    search, work = scene.search, space[0]
+    fits = candidates_of(scene, centres, weakest)
+    _fit(scene, centres, fits, work)
+    radii, count = np.empty(len(fits.results)), 0
+    for k in range(len(fits.results)):
+        clear = fits.evidence[k] >= search.least_evidence + CLEAR_EVIDENCE
+        if clear and fits.results[k].explained >= WELL_EXPLAINED:
+            radii[count] = fits.results[k].radius
+            count += 1
+    radius = apparent_radius(search.radius, radii[:count])
+    if search.verify and search.refine:
+        place_found(scene, radius, fits, work)
+    return fits, radius
+
+
+@kernel()
 def candidates_of(scene: Scene, centres: Centres, weakest: float) -> Fits:
     """The centres to fit discs at: of those in the middle of a disc one is enough."""
     near = 0.5 * scene.search.separation
     keep = strong_and_alone(centres, scene.floor_xy, weakest, near)
     starts = middles(centres, keep, scene.floor_xy, weakest, near)
     count = len(keep)
+    results: Any = np.zeros(count, RESULT)
     return Fits(
-        keep, starts, np.zeros(count, RESULT), np.zeros((count, 2)), np.full(count, -np.inf),
+        keep, starts, results, np.zeros((count, 2)), np.full(count, -np.inf),
         np.full(count, -np.inf), np.zeros((count, 2)), np.zeros(count),
         np.full(count, _LOOK, np.int8), np.full(count, -np.inf),
     )  # fmt: skip
 
 
 @kernel()
-def _fit(scene: Scene, centres: Centres, fits: Fits, space: NDArray[Any]) -> None:
+def _fit(scene: Scene, centres: Centres, fits: Fits, work: Any) -> None:
     """Look at each candidate with a short fit; fit a disc in full where that promises one."""
     image, floor_xy, search, settings = scene.image, scene.floor_xy, scene.search, scene.settings
     results, place, evidence, fate = fits.results, fits.place, fits.evidence, fits.fate
-    work = space[0]
     first_blur = max(settings.blur_px, 0.6 * search.optics_px)
     for k in range(len(results)):
         result, u, v = results[k], fits.starts[k, 0], fits.starts[k, 1]
@@ -291,7 +306,7 @@ def _fit(scene: Scene, centres: Centres, fits: Fits, space: NDArray[Any]) -> Non
 
 
 @kernel()
-def place_found(scene: Scene, radius: float, fits: Fits, space: NDArray[Any]) -> None:
+def place_found(scene: Scene, radius: float, fits: Fits, work: Any) -> None:
     """Place the discs by their sectors (`detect.discs.placing`)."""
     for k in range(len(fits.results)):
         if fits.fate[k] != _BESIDE:
@@ -300,9 +315,9 @@ def place_found(scene: Scene, radius: float, fits: Fits, space: NDArray[Any]) ->
         if fits.rim_step[k] != 0.0:
             x, y = fits.rim_xy[k, 0], fits.rim_xy[k, 1]
             rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, fits.rim_step[k])
-            place_by_rim(scene, radius, rim, space[0], result)
+            place_by_rim(scene, radius, rim, work, result)
         else:
-            place_fitted(scene, radius, space[0], result)
+            place_fitted(scene, radius, work, result)
         fits.place[k, 0], fits.place[k, 1] = result.x, result.y
 
 

@@ -32,7 +32,7 @@ from detect.discs.rim import (
     median,
     profiles,
 )
-from detect.discs.rim_network import Networks, network_inputs, network_log_odds
+from detect.discs.rim_network import Networks, RimNetwork, network_inputs, network_log_odds
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
@@ -55,6 +55,10 @@ _WITHIN = 0.75
 _RIM_RADIUS = 0.98
 #: Log-odds by the network that make a disc.
 _TAKEN = 0.8
+#: A rim that looks worse than this by the log-odds is not followed from its own middle.
+_HOPELESS = -4.0
+#: Nearer to another rim than this share of the radius it is the same.
+_SAME = 0.1
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
@@ -147,7 +151,6 @@ def _look_at_all(
     features, place = np.empty((n, len(FEATURES))), np.empty((n, 2))
     seen_from, doubt = np.empty((n, 2)), np.empty((n, 2))
     step, floor_grey, quality, log_odds = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    noted = np.empty(len(FEATURES))
     count = 0
     for i in range(n):
         x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
@@ -162,35 +165,33 @@ def _look_at_all(
         least = _LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE
         if network_log_odds(inputs, scales, score, networks.glance) < least + sought.needed:
             continue
-        first = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
-        if first.agreeing < _LEAST_RIM:
+        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
+        is_known = _near_any(found_xy, rim.x, rim.y, sought.separation) or _near_any(
+            place[:count], rim.x, rim.y, _SAME * sought.radius
+        )
+        if rim.agreeing < _LEAST_RIM or is_known:
+            continue
+        odds, noted, grey = _look(image, camera_numbers, rim, score[0], sought, networks.look)
+        if odds < _HOPELESS:
             continue
         # From its own middle a rim is seen best, but that may lead to another circle.
-        again = follow_again(image, camera_numbers, sought.radius, first)
+        again = follow_again(image, camera_numbers, sought.radius, rim)
         if _near_any(found_xy, again.x, again.y, sought.separation):
             continue
-        is_new = False
-        for rim, from_x, from_y in ((first, x, y), (again, first.x, first.y)):
-            if _near_any(found_xy, rim.x, rim.y, sought.separation):
-                continue
-            if _near_any(place[:count], rim.x, rim.y, 0.1 * sought.radius):
-                continue
-            _note_rim(rim, sought.radius, candidates.score[i], noted)
-            grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
-            inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
-            odds = network_log_odds(inputs, scales, noted, networks.look) - _TAKEN - sought.needed
-            if is_new and odds <= log_odds[count]:
-                continue
-            is_new = True
-            for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
-                features[count, k] = noted[k]
-            log_odds[count] = odds
-            step[count] = rim.step
-            quality[count], floor_grey[count] = _quality(grey)
-            place[count, 0], place[count, 1] = rim.x, rim.y
-            seen_from[count, 0], seen_from[count, 1] = from_x, from_y
-            doubt[count, 0], doubt[count, 1] = again.x - first.x, again.y - first.y
-        count += is_new
+        doubt[count, 0], doubt[count, 1] = again.x - rim.x, again.y - rim.y
+        more, noted_again, grey_again = _look(
+            image, camera_numbers, again, score[0], sought, networks.look
+        )
+        if more > odds and not _near_any(place[:count], again.x, again.y, _SAME * sought.radius):
+            x, y = rim.x, rim.y
+            rim, odds, noted, grey = again, more, noted_again, grey_again
+        for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
+            features[count, k] = noted[k]
+        log_odds[count], step[count] = odds, rim.step
+        quality[count], floor_grey[count] = _quality(grey)
+        place[count, 0], place[count, 1] = rim.x, rim.y
+        seen_from[count, 0], seen_from[count, 1] = x, y
+        count += 1
     return SecondLooks(
         features[:count], place[:count], seen_from[:count], doubt[:count], step[:count],
         floor_grey[:count], quality[:count], log_odds[:count],
@@ -281,13 +282,27 @@ def _quality(grey: FloatArray) -> tuple[float, float]:
 
 
 @kernel()
-def _note_rim(rim: Rim, radius: float, score: float, out: FloatArray) -> None:
-    """The features of the rim, each bounded, for a single one is never to decide."""
-    off = abs(math.log(min(max(rim.radius / radius, 0.3), 3.0) / _RIM_RADIUS))
-    out[0] = rim.agreeing
-    out[1] = min(rim.runs, 4)
-    out[2] = rim.scatter
-    out[3] = off
-    out[4] = 10.0 * off * off
-    out[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
-    out[6] = min(score, 12.0)
+def _look(
+    image: NDArray[np.uint8],
+    camera_numbers: FloatArray,
+    rim: Rim,
+    score: float,
+    sought: Sought,
+    network: RimNetwork,
+) -> tuple[float, FloatArray, FloatArray]:
+    """Log-odds that a rim is a disc's; its features, and the grey values about it.
+
+    Each feature is bounded, for a single one is never to decide.
+    """
+    noted = np.empty(len(FEATURES))
+    off = abs(math.log(min(max(rim.radius / sought.radius, 0.3), 3.0) / _RIM_RADIUS))
+    noted[0] = rim.agreeing
+    noted[1] = min(rim.runs, 4)
+    noted[2] = rim.scatter
+    noted[3] = off
+    noted[4] = 10.0 * off * off
+    noted[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
+    noted[6] = min(score, 12.0)
+    grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+    inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
+    return network_log_odds(inputs, scales, noted, network) - _TAKEN - sought.needed, noted, grey

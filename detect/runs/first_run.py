@@ -45,5 +45,5 @@ def place_discs(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
         image = read_image(tasks[0].frame, camera, plan.working_folder)
         scene = scene_of(image, camera, table, settings, noise=0.0)
         fits, space = candidates_of(scene, NO_CENTRES, weakest=0.0), working_space()
-        place_found(scene, settings.radius_m, fits, space)
+        place_found(scene, settings.radius_m, fits, space[0])
         place_all(scene, settings.radius_m, NO_LOOKS, space)
