@@ -184,6 +184,8 @@ def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True)
     return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(37, 49))
 
 
+#: Rays of a pixel, along either axis: of 4, edges that lie nearly along the pixels are .07 px off.
+_SAMPLES = 6
 #: The board in the hand, and the one that lies on the floor: squares of 4 cm and 12 cm.
 IN_HAND = Board("checkerboard", 9, 6, 0.04)
 ON_FLOOR = Board("checkerboard", 9, 6, 0.12)
@@ -208,7 +210,7 @@ class TutorialPhotographs:
         if boards.exists():
             raise OutputExistsError(boards)
         boards.mkdir(parents=True)
-        rays = rays_of(camera, 3)
+        rays = rays_of(camera, _SAMPLES)
         poses = board_poses(camera, IN_HAND, self.count, self.seed, distances_m=(0.25, 0.5))
         for number, (rotation, translation) in enumerate(poses):
             image = render_board(rays, IN_HAND, rotation, translation, seed=self.seed + number)
