@@ -192,7 +192,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(RunFlags):
-    """Write a run (and a map of it) in the formats of other tools.
+    """Write a run in the formats of other tools, whose axes are X forward, Y left.
 
     Example: slam export images/e --to g2o -o /tmp/e.g2o
     """
@@ -203,14 +203,9 @@ class Export(RunFlags):
     # `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
     # odometry and measurements as tables for GTSAM or MRPT.
     to: Literal["g2o", "tum", "csv"] = "g2o"
-    # Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
-    # default odometry's and first sight's.
-    solution: MaybePath = None
     # For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside the
     # run that has them all; where there is none, t counts the steps.
     times: MaybePath = None
-    # `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
-    axes: Literal["robotics", "dataset"] = "robotics"
 
 
 @dataclass(frozen=True)
@@ -220,15 +215,13 @@ class Import:
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
     """
 
-    # A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
+    # A .g2o graph, a TUM trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
     # data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     file: Positional[Path]
     # Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates; of
     # a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of true
     # landmarks the map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    # The axes that the graph or trajectory is in; see `slam export`.
-    axes: Literal["robotics", "dataset"] = "robotics"
     range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
     bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).
     force: bool = False  # Replace an existing file.

@@ -28,7 +28,7 @@ PATHS = circuit(1.2, 5.0), circuit(2.0, 5.0)[70:]
 def write_run(file: Path, run: Recording, *, known: bool) -> str:
     """A run as a landmark file, with the simulation's identifiers or without."""
     rows = run.circles if known else replace(run.circles, ids=0 * run.circles.ids - 1)
-    frames = frames_of_discs(replace(run, circles=rows), np.ones(len(rows)))
+    frames = frames_of_discs(replace(run, circles=rows))
     lines = run.lines
     for k, bearing, ids in zip(lines.frame, lines.bearing_rad, lines.ids):
         line = LineLandmark(0.0, -1.0, 0.0, 1.0, float(bearing), 0.0, 0.0, LINE_SIGMA, ids)

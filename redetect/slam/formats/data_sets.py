@@ -28,7 +28,7 @@ from redetect.landmarks import Frame
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import finite, text_rows, to_dataset
+from redetect.slam.formats.text import finite, rows_of_words, to_dataset
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import CircleRows, LineRows, Recording, frames_of_discs
 
@@ -73,7 +73,7 @@ def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame
     unstated = np.zeros((len(run.steps), 3, 3))
     rows = CircleRows(run.frame, xy, covariance, run.ids)
     recording = Recording(run.prefixes, run.steps, unstated, rows, LineRows.of())
-    return frames_of_discs(recording, np.ones(len(xy)))
+    return frames_of_discs(recording)
 
 
 def discs_of_ranges(
@@ -124,7 +124,7 @@ def read_robot(odometry: Path) -> RangeBearing:
         raise SlamError(f"{odometry}: no odometry, or no landmark seen: expected both")
     return RangeBearing(
         times=times,
-        steps=to_dataset(_velocity_steps(velocity, times), "robotics"),
+        steps=to_dataset(_velocity_steps(velocity, times)),
         frame=frame,
         range_m=seen[order, 2],
         bearing_rad=seen[order, 3],
@@ -142,7 +142,7 @@ def read_truth(odometry: Path) -> Path2D:
     at = np.concatenate([[min(begin, run.times[0])], run.times])
     columns = (truth[:, 1], truth[:, 2], np.unwrap(truth[:, 3]))
     poses = np.stack([np.interp(at, truth[:, 0], column) for column in columns], axis=1)
-    return Path2D(("start", *run.prefixes), to_dataset(poses, "robotics"))
+    return Path2D(("start", *run.prefixes), to_dataset(poses))
 
 
 def read_landmarks(path: Path) -> LandmarkMap:
@@ -152,7 +152,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    xy = to_dataset(table[:, 1:3], "robotics")
+    xy = to_dataset(table[:, 1:3])
     return LandmarkMap(
         Landmarks(table[:, 0].astype(np.int64), xy, covariance, count), no_landmarks()
     )
@@ -178,10 +178,7 @@ def _beside(odometry: Path, ending: str) -> Path:
 def _table(path: Path, names: tuple[str, ...]) -> FloatArray:
     """The numbers of a file, sorted by the first column as they come."""
     rows = []
-    for line, text in text_rows(path):
-        if text.startswith("#"):
-            continue
-        words = text.split()
+    for line, words in rows_of_words(path):
         if len(words) != len(names):
             raise SlamError(f"{path}:{line}: {len(words)} numbers: expected {', '.join(names)}")
         rows.append([finite(path, line, name, word) for name, word in zip(names, words)])
@@ -201,7 +198,7 @@ def read_drive(drive: Path) -> RangeBearing:
     trees = np.concatenate([np.zeros((0, 2)), *found])
     return RangeBearing(
         times=times,
-        steps=to_dataset(_car_steps(time / 1000.0, speed, steering, times), "robotics"),
+        steps=to_dataset(_car_steps(time / 1000.0, speed, steering, times)),
         frame=np.repeat(np.arange(len(found)), [len(some) for some in found]),
         range_m=trees[:, 0],
         bearing_rad=trees[:, 1],
