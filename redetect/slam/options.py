@@ -62,11 +62,8 @@ class Map(RunsFlags):
     # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
     # as mounted sees it; `recorded`, as the rows were written, where their covariances belong.
     row_errors: Literal["corrected", "recorded"] = "corrected"
-    # Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
-    # recorded.
-    tilt_deg: float = 0.0
     # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
-    # (extra [slam]).
+    # (extra [slam]), of discs and plain least squares alone.
     solver: Literal["separable", "gtsam"] = "separable"
     # `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"

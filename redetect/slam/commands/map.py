@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -46,7 +45,7 @@ from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
-from redetect.storage.bounds import ABOVE_0, FINITE, demand, from_to
+from redetect.storage.bounds import ABOVE_0, FINITE, demand
 
 TABLE_NAME = "table.json"
 
@@ -111,11 +110,9 @@ def perform(command: Map) -> int:
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     """The map of a run's rows that a command asks for."""
-    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0, tilt_deg=from_to(0.0, 45.0))
-    if command.tilt_deg and command.row_errors != "recorded":
-        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
+    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0)
     camera = None
-    if command.calibrate or command.tilt_deg or len(recording.lines):
+    if command.calibrate or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
     return map_run(
         recording,
@@ -134,7 +131,6 @@ def weighting_of(command: Map) -> Weighting:
         loss_scale=command.loss_scale,
         calibrate=command.calibrate,
         row_errors=command.row_errors,
-        tilt_sigma_rad=math.radians(command.tilt_deg),
     )
 
 

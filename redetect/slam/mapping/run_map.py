@@ -48,7 +48,6 @@ class ChiSquared:
     odometry: float
     discs: float
     lines: float
-    tilt: float
     # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
     chi_squared: float
     expected: int  # dim(z) - dim(x): numbers measured less numbers estimated
@@ -63,16 +62,12 @@ def chi_squared(
 ) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
-    parts = [
-        float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines, error.tilt)
-    ]
+    parts = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
     # The start is measured (it is the origin) and estimated, so it adds as much as it takes.
-    measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose) + error.tilt.size
-    unknown = 3 * poses + 2 * landmarks + error.tilt.size
-    if weighting.calibrate:
-        unknown += MOUNTING_UNKNOWNS
+    measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose)
+    unknown = 3 * poses + 2 * landmarks + MOUNTING_UNKNOWNS * weighting.calibrate
     # What a lost step says is as good as nothing.
     expected = measured - unknown - 3 * lost_steps
     factor = sum(parts) / expected if expected > 0 else math.nan
@@ -84,7 +79,6 @@ def chi_squared(
         odometry=parts[0],
         discs=parts[1],
         lines=parts[2],
-        tilt=parts[3],
         chi_squared=sum(parts),
         expected=expected,
         factor=factor,
@@ -180,8 +174,7 @@ def map_run(
     recording : Recording
         The run. Rows without an identifier do not count.
     camera : Camera, optional
-        As calibrated: for lines (where bearings are taken from) and where the mounting or a tilt is
-        unknown.
+        As calibrated: for lines (where bearings are taken from) and where the mounting is unknown.
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
     start : (3,)
@@ -224,12 +217,12 @@ def map_run(
             )
         graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
     if only_start:
-        fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
+        fixed = replace(wanted, calibrate=False)
         for weighting in _on_the_way(fixed):
             estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
     as_calibrated = trail[-1].cost
-    if wanted.calibrate or wanted.tilt_sigma_rad > 0.0:
+    if wanted.calibrate:
         estimate = keep(descend(graph, estimate, wanted))
     covariance = marginals(graph, estimate, wanted)
     return MappedRun(
@@ -351,7 +344,7 @@ def _check_usable(
             f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
         )
     needs = "lines" if len(recording.lines) else ""
-    if weighting.calibrate or weighting.tilt_sigma_rad > 0.0:
+    if weighting.calibrate:
         needs = "the camera's mounting"
     if needs and camera is None:
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
