@@ -15,7 +15,7 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.least_squares.solver import LossKind
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
@@ -30,7 +30,7 @@ from redetect.slam.mapping.graph import (
 )
 from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.solve import Marginals, Solution, marginals, solve
+from redetect.slam.mapping.solve import Marginals, Solution, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -144,7 +144,9 @@ class Mounting:
 class MappedRun:
     """A least-squares map and how it came about."""
 
+    prefixes: tuple[str, ...]  # names of the poses: the start, then the frames
     graph: Graph
+    weighting: Weighting
     start: Estimate  # odometry and first sight, without lines
     estimate: Estimate  # the minimum
     covariance: Marginals
@@ -153,6 +155,31 @@ class MappedRun:
     cost: float  # what was minimised: chi-squared, or less under a robust loss
     steps: int  # of all descents together
     mounting: Mounting | None
+
+    @property
+    def landmarks(self) -> LandmarkMap:
+        """The map."""
+        graph, at, spread = self.graph, self.estimate, self.covariance
+        return LandmarkMap(
+            discs=Landmarks(graph.disc_ids, at.disc_xy, spread.discs, graph.disc_row_counts),
+            lines=Landmarks(graph.line_ids, at.line_xy, spread.lines, graph.line_row_counts),
+        )
+
+    @property
+    def path(self) -> Path2D:
+        """The poses."""
+        return Path2D(self.prefixes, self.estimate.poses, self.covariance.poses)
+
+    @property
+    def before(self) -> tuple[LandmarkMap, Path2D]:
+        """Discs and poses at first sight, without covariances."""
+        graph, zero = self.graph, np.zeros_like(self.covariance.discs)
+        discs = Landmarks(graph.disc_ids, self.start.disc_xy, zero, graph.disc_row_counts)
+        return LandmarkMap(discs, no_landmarks()), Path2D(self.prefixes, self.start.poses)
+
+    def joint_covariance(self) -> FloatArray:
+        """(2 M, 2 M) covariance of all places, discs first (m^2)."""
+        return joint_covariance(self.graph, self.estimate, self.weighting)
 
 
 def map_run(
@@ -226,7 +253,9 @@ def map_run(
         estimate = keep(descend(graph, estimate, wanted))
     covariance = marginals(graph, estimate, wanted)
     return MappedRun(
+        prefixes=("start", *recording.prefixes),
         graph=graph,
+        weighting=wanted,
         start=begin,
         estimate=estimate,
         covariance=covariance,
@@ -266,26 +295,6 @@ def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) ->
         poses[here, 2] += motion[2]
         xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
     return replace(begin, poses=poses, disc_xy=np.where(np.isfinite(xy), xy, begin.disc_xy))
-
-
-def landmark_map(graph: Graph, estimate: Estimate, covariance: Marginals | None) -> LandmarkMap:
-    """Landmarks as a map; without covariances those are 0."""
-    discs, lines = len(graph.disc_ids), len(graph.line_ids)
-    zero = Marginals(np.zeros((0, 3, 3)), np.zeros((discs, 2, 2)), np.zeros((lines, 2, 2)), None)
-    spread = covariance or zero
-    return LandmarkMap(
-        discs=Landmarks(graph.disc_ids, estimate.disc_xy, spread.discs, graph.disc_row_counts),
-        lines=Landmarks(graph.line_ids, estimate.line_xy, spread.lines, graph.line_row_counts),
-    )
-
-
-def path_of(recording: Recording, estimate: Estimate, covariance: Marginals | None) -> Path2D:
-    """Poses as a path that begins at the start."""
-    return Path2D(
-        prefixes=("start", *recording.prefixes),
-        poses=estimate.poses,
-        covariance=None if covariance is None else covariance.poses,
-    )
 
 
 def _with_lines(
