@@ -20,6 +20,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dgemm
+from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
@@ -34,9 +36,9 @@ from redetect.slam.filters.frames import (
     Innovation,
     RowCount,
     innovation_of,
+    innovation_root,
     run_filter,
 )
-from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
 from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
@@ -46,7 +48,10 @@ JacobiansAt = Literal["first", "latest"]
 #: linear in its place.
 LARGEST_RANGE_SIGMA = 0.05
 
-_POSE = np.arange(POSE_SIZE)
+_POSE_SIZE = 3
+_POSE = np.arange(_POSE_SIZE)
+# By as many numbers the state grows; some too many cost less than moving its covariance often.
+_CHUNK = 64
 
 
 class EkfSlam:
@@ -77,7 +82,6 @@ class EkfSlam:
         jacobians: JacobiansAt = "first",
     ) -> None:
         spread = np.zeros((3, 3)) if start_covariance is None else np.asarray(start_covariance)
-        self.covariance = JointCovariance(spread)
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
@@ -85,7 +89,12 @@ class EkfSlam:
         self.line_rows: Counter[int] = Counter()
         self.count = RowCount()
         self.frame = -1
-        self._state = np.array(start, dtype=np.float64)
+        self.size = _POSE_SIZE
+        # With room for more, which is 0. BLAS has matrices by columns.
+        self._state = np.zeros(_CHUNK)
+        self._state[:_POSE_SIZE] = start
+        self._covariance = np.zeros((_CHUNK, _CHUNK), order="F")
+        self._covariance[:_POSE_SIZE, :_POSE_SIZE] = spread
         # The same array unless Jacobians are evaluated elsewhere.
         self._linearised = self._state.copy() if jacobians == "first" else self._state
         self._waiting = WaitingLines()
@@ -98,20 +107,19 @@ class EkfSlam:
     @property
     def state(self) -> FloatArray:
         """The pose, then landmarks and kept poses, as the slots say: (n,)."""
-        return self._state[: self.covariance.size]
+        return self._state[: self.size]
 
     def block(self, index: IntArray) -> FloatArray:
         """Rows and columns `index` of the state's covariance."""
-        return self.covariance.block(index)
+        return np.asarray(self._covariance[np.ix_(index, index)])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
         at = self._linearised
-        pose = move(self._state[:POSE_SIZE], step)
-        by_pose, by_step = move_jacobians(self._state[:POSE_SIZE], step)
+        pose = move(self._state[_POSE], step)
+        by_pose, by_step = move_jacobians(self._state[_POSE], step)
         by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
-        self.covariance.move_pose(by_pose, by_step @ noise @ by_step.T)
-        self._state[:POSE_SIZE] = at[:POSE_SIZE] = pose
+        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose, pose)
         self.frame += 1
 
     def measure(self, rows: FrameRows) -> None:
@@ -178,12 +186,16 @@ class EkfSlam:
     def _apply(self, innovation: Innovation) -> None:
         """Update the state."""
         error, jacobian, index, noise = innovation
-        projected = self.covariance.projected(index, jacobian)
-        change, squared = self.covariance.measure(
-            projected, jacobian @ projected[index] + noise, error
+        projected = self._covariance[:, index] @ jacobian.T
+        root = innovation_root(jacobian @ projected[index] + noise)
+        whitened = dtrtrs(root, np.vstack([projected, error]).T, lower=1)[0].T
+        factor, last = whitened[:-1], whitened[-1]
+        # K S K^T is taken off in place.
+        self._covariance = dgemm(
+            -1.0, factor, factor, 1.0, self._covariance, trans_b=1, overwrite_c=1
         )
-        self._state[: len(change)] += change
-        self.count.innovation_squared += squared
+        self._state += factor @ last
+        self.count.innovation_squared += float(last @ last)
         self.count.innovation_numbers += len(error)
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
@@ -231,11 +243,11 @@ class EkfSlam:
         index = (np.array(slots)[:, None] + _POSE).ravel()
         bearing = np.array([view.bearing_rad for view in views])
         sigma = np.array([view.sigma_rad for view in views])
-        poses = self._state[index].reshape(-1, POSE_SIZE)
+        poses = self._state[index].reshape(-1, _POSE_SIZE)
         if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
             return False
-        known = self.covariance.block(index)
-        poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
+        known = self.block(index)
+        poses_at = self._linearised[index].reshape(-1, _POSE_SIZE)
         start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
         if start is None:
             return False
@@ -259,14 +271,12 @@ class EkfSlam:
 
     def _keep_pose(self) -> int:
         """Put a copy of the pose into the state; returns where."""
-        copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-        pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
+        copy, none = np.eye(_POSE_SIZE), np.zeros((_POSE_SIZE, _POSE_SIZE))
+        pose, at = self._state[_POSE], self._linearised[_POSE]
         if not self._waiting.free_slots:
             return self._append(_POSE, copy, none, pose, at)
         slot = self._waiting.free_slots.pop()
-        self.covariance.replace(slot, _POSE, copy, none)
-        self._linearised[slot : slot + POSE_SIZE] = at
-        self._state[slot : slot + POSE_SIZE] = pose
+        self._put(slot, _POSE, copy, none, pose, at)
         return slot
 
     def _append(
@@ -277,16 +287,40 @@ class EkfSlam:
         value: FloatArray,
         linearised: FloatArray,
     ) -> int:
-        slot = self.covariance.append(index, jacobian, noise)
-        if self.covariance.size > len(self._state):
+        """`_put` numbers at the end of the state; returns where they begin."""
+        slot, self.size = self.size, self.size + len(value)
+        if self.size > len(self._state):
             separate = self._linearised is not self._state
-            self._state = np.resize(self._state, 2 * self.covariance.size)
-            self._linearised = (
-                np.resize(self._linearised, len(self._state)) if separate else self._state
-            )
-        self._linearised[slot : slot + len(value)] = linearised
-        self._state[slot : slot + len(value)] = value
+            self._state = np.pad(self._state, (0, _CHUNK))
+            self._linearised = np.pad(self._linearised, (0, _CHUNK)) if separate else self._state
+            covariance = np.zeros((len(self._state), len(self._state)), order="F")
+            covariance[:slot, :slot] = self._covariance[:slot, :slot]
+            self._covariance = covariance
+        self._put(slot, index, jacobian, noise, value, linearised)
         return slot
+
+    def _put(
+        self,
+        slot: int,
+        index: IntArray,
+        jacobian: FloatArray,
+        noise: FloatArray,
+        value: FloatArray,
+        linearised: FloatArray,
+    ) -> None:
+        """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
+
+        Takes where the others are, `index` (k,), its derivative by them, `jacobian` (d, k), and the
+        measurement's covariance, `noise` (d, d).
+        """
+        own = slice(slot, slot + len(value))
+        columns = self._covariance[:, index] @ jacobian.T
+        spread = jacobian @ columns[index] + noise
+        columns[own] = 0.5 * (spread + spread.T)
+        self._covariance[:, own] = columns
+        self._covariance[own] = columns.T
+        self._linearised[own] = linearised
+        self._state[own] = value
 
     def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
         place = np.array(list(slots.values()), dtype=np.int64)
