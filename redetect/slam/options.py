@@ -120,9 +120,9 @@ class Localize(FilterFlags):
     # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
     association: Literal["known", "nearest", "joint"] = "known"
     # `considered`: the map's covariances are errors that stay the same each time a landmark is
-    # seen; `white`: errors that are new each time; `ignored`: the map is exact. By default (`auto`)
-    # considered with known association, else ignored.
-    map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
+    # seen; `ignored`: the map is exact. By default (`auto`) considered with known association, else
+    # ignored.
+    map_errors: Literal["auto", "considered", "ignored"] = "auto"
     # Standard deviations of the pose at the start.
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Nothing is known of the pose at the start: it is found by the discs of the first frames,

@@ -125,8 +125,6 @@ def dense(
         for block in R:
             noise[at : at + len(block), at : at + len(block)] = block
             at += len(block)
-        if map_errors == "white":
-            noise += stacked @ blocks @ stacked.T
         gain = P @ stacked.T @ np.linalg.inv(stacked @ P @ stacked.T + noise)
         gain[3:] = 0.0
         pose = pose + gain[:3] @ np.concatenate(v)
@@ -137,7 +135,7 @@ def dense(
     return np.array(poses), np.array(covariances)
 
 
-@pytest.mark.parametrize("map_errors", ["considered", "white", "ignored"])
+@pytest.mark.parametrize("map_errors", ["considered", "ignored"])
 def test_the_localizer_is_the_plain_dense_filter(map_errors: MapErrors) -> None:
     recording, some, _ = drive(1)
     run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY, map_errors=map_errors))

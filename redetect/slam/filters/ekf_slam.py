@@ -21,7 +21,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.blas import dgemm
-from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
@@ -30,16 +29,15 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
+    POSE_SIZE,
     Associator,
+    Filter,
     FilterRun,
     FrameRows,
     Innovation,
-    RowCount,
     innovation_of,
-    innovation_root,
     run_filter,
 )
-from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 JacobiansAt = Literal["first", "latest"]
@@ -48,13 +46,12 @@ JacobiansAt = Literal["first", "latest"]
 #: linear in its place.
 LARGEST_RANGE_SIGMA = 0.05
 
-_POSE_SIZE = 3
-_POSE = np.arange(_POSE_SIZE)
+_POSE = np.arange(POSE_SIZE)
 # By as many numbers the state grows; some too many cost less than moving its covariance often.
 _CHUNK = 64
 
 
-class EkfSlam:
+class EkfSlam(Filter):
     """The filter.
 
     Parameters
@@ -81,45 +78,15 @@ class EkfSlam:
         *,
         jacobians: JacobiansAt = "first",
     ) -> None:
-        spread = np.zeros((3, 3)) if start_covariance is None else np.asarray(start_covariance)
-        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
-        self.disc_slots: dict[int, int] = {}
-        self.line_slots: dict[int, int] = {}
+        super().__init__(start, start_covariance, camera_xy, first_estimates=jacobians == "first")
         self.disc_rows: Counter[int] = Counter()
         self.line_rows: Counter[int] = Counter()
-        self.count = RowCount()
         self.frame = -1
-        self.size = _POSE_SIZE
-        # With room for more, which is 0. BLAS has matrices by columns.
-        self._state = np.zeros(_CHUNK)
-        self._state[:_POSE_SIZE] = start
-        self._covariance = np.zeros((_CHUNK, _CHUNK), order="F")
-        self._covariance[:_POSE_SIZE, :_POSE_SIZE] = spread
-        # The same array unless Jacobians are evaluated elsewhere.
-        self._linearised = self._state.copy() if jacobians == "first" else self._state
         self._waiting = WaitingLines()
-
-    @property
-    def pose_covariance(self) -> FloatArray:
-        """(3, 3)."""
-        return self.block(_POSE)
-
-    @property
-    def state(self) -> FloatArray:
-        """The pose, then landmarks and kept poses, as the slots say: (n,)."""
-        return self._state[: self.size]
-
-    def block(self, index: IntArray) -> FloatArray:
-        """Rows and columns `index` of the state's covariance."""
-        return np.asarray(self._covariance[np.ix_(index, index)])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
-        at = self._linearised
-        pose = move(self._state[_POSE], step)
-        by_pose, by_step = move_jacobians(self._state[_POSE], step)
-        by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
-        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose, pose)
+        super().predict(step, noise)
         self.frame += 1
 
     def measure(self, rows: FrameRows) -> None:
@@ -185,18 +152,12 @@ class EkfSlam:
 
     def _apply(self, innovation: Innovation) -> None:
         """Update the state."""
-        error, jacobian, index, noise = innovation
-        projected = self._covariance[:, index] @ jacobian.T
-        root = innovation_root(jacobian @ projected[index] + noise)
-        whitened = dtrtrs(root, np.vstack([projected, error]).T, lower=1)[0].T
-        factor, last = whitened[:-1], whitened[-1]
-        # K S K^T is taken off in place.
+        factor, last = self._whitened(innovation)
+        # P - K S K^T, in place.
         self._covariance = dgemm(
             -1.0, factor, factor, 1.0, self._covariance, trans_b=1, overwrite_c=1
         )
         self._state += factor @ last
-        self.count.innovation_squared += float(last @ last)
-        self.count.innovation_numbers += len(error)
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
         pose, at = self._state, self._linearised
@@ -243,11 +204,11 @@ class EkfSlam:
         index = (np.array(slots)[:, None] + _POSE).ravel()
         bearing = np.array([view.bearing_rad for view in views])
         sigma = np.array([view.sigma_rad for view in views])
-        poses = self._state[index].reshape(-1, _POSE_SIZE)
+        poses = self._state[index].reshape(-1, POSE_SIZE)
         if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
             return False
         known = self.block(index)
-        poses_at = self._linearised[index].reshape(-1, _POSE_SIZE)
+        poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
         start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
         if start is None:
             return False
@@ -271,7 +232,7 @@ class EkfSlam:
 
     def _keep_pose(self) -> int:
         """Put a copy of the pose into the state; returns where."""
-        copy, none = np.eye(_POSE_SIZE), np.zeros((_POSE_SIZE, _POSE_SIZE))
+        copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
         pose, at = self._state[_POSE], self._linearised[_POSE]
         if not self._waiting.free_slots:
             return self._append(_POSE, copy, none, pose, at)
@@ -290,37 +251,9 @@ class EkfSlam:
         """`_put` numbers at the end of the state; returns where they begin."""
         slot, self.size = self.size, self.size + len(value)
         if self.size > len(self._state):
-            separate = self._linearised is not self._state
-            self._state = np.pad(self._state, (0, _CHUNK))
-            self._linearised = np.pad(self._linearised, (0, _CHUNK)) if separate else self._state
-            covariance = np.zeros((len(self._state), len(self._state)), order="F")
-            covariance[:slot, :slot] = self._covariance[:slot, :slot]
-            self._covariance = covariance
+            self._grow(_CHUNK)
         self._put(slot, index, jacobian, noise, value, linearised)
         return slot
-
-    def _put(
-        self,
-        slot: int,
-        index: IntArray,
-        jacobian: FloatArray,
-        noise: FloatArray,
-        value: FloatArray,
-        linearised: FloatArray,
-    ) -> None:
-        """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
-
-        Takes where the others are, `index` (k,), its derivative by them, `jacobian` (d, k), and the
-        measurement's covariance, `noise` (d, d).
-        """
-        own = slice(slot, slot + len(value))
-        columns = self._covariance[:, index] @ jacobian.T
-        spread = jacobian @ columns[index] + noise
-        columns[own] = 0.5 * (spread + spread.T)
-        self._covariance[:, own] = columns
-        self._covariance[own] = columns.T
-        self._linearised[own] = linearised
-        self._state[own] = value
 
     def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
         place = np.array(list(slots.values()), dtype=np.int64)
