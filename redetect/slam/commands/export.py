@@ -19,7 +19,7 @@ from redetect.slam.formats.text import MEANING
 from redetect.slam.formats.tum import read_tum, write_tum
 from redetect.slam.models import chain_steps
 from redetect.slam.options import Export, Import
-from redetect.slam.recording import frames_of_discs
+from redetect.slam.recording import Recording, frames_of_discs
 from redetect.storage.bounds import ABOVE_0, demand
 
 _LANDMARKS = (".circles", ".lines", ".markers")
@@ -112,35 +112,37 @@ def _import(command: Import) -> int:
     run = graph.recording
     if command.output.suffix == ".csv":
         return _write_path(command, Path2D(("start", *run.prefixes), graph.poses))
-    head = _made_by(command.file)
-    write_frames(command.output, frames_of_discs(run), head=head, overwrite=command.force)
-    print(f"{command.output}: {len(run)} steps, {len(run.circles)} measurements of discs")
-    return 0
+    return _write_run(command, run, "measurements of discs")
 
 
 def _import_data_set(command: Import) -> int:
     """Of the UTIAS data set a robot's run, its true path or the landmarks; of Victoria Park all."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
-    file, head = command.file, _made_by(command.file)
+    file = command.file
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
-        write_map(command.output, landmark_map, [head], overwrite=command.force)
+        write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
         return 0
     if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
         return _write_path(command, data_sets.read_truth(file))
+    sigmas = command.range_sigma, command.bearing_sigma
     if file.name.endswith(data_sets.ODOMETRY):
-        run = data_sets.read_robot(file)
+        run = data_sets.read_robot(file, *sigmas)
     elif file.name == data_sets.DRIVE:
-        run = data_sets.read_drive(file)
+        run = data_sets.read_drive(file, *sigmas)
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "
             f"data set, or the {data_sets.DRIVE} of Victoria Park"
         )
-    frames = data_sets.frames_of(run, command.range_sigma, command.bearing_sigma)
+    return _write_run(command, run, "measurements")
+
+
+def _write_run(command: Import, run: Recording, what: str) -> int:
+    head, frames = _made_by(command.file), frames_of_discs(run)
     write_frames(command.output, frames, head=head, overwrite=command.force)
-    print(f"{command.output}: {len(frames)} steps, {len(run.frame)} measurements")
+    print(f"{command.output}: {len(run)} steps, {len(run.circles)} {what}")
     return 0
 
 
