@@ -85,7 +85,6 @@ class RunAssociation:
     local_line_labels: IntArray
     matches: tuple[Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the path that goes with them; None without map level
-    incomplete_frames: int  # frames whose joint search was cut short
 
 
 def associate_run(
@@ -148,7 +147,6 @@ def associate_run(
         in_order(local.line_labels),
         matches,
         path,
-        local.incomplete,
     )
 
 

@@ -325,7 +325,7 @@ class Associator:
             seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
             spread = jacobian @ estimate.block(index) @ jacobian.T
             innovation = rows.xy[:, None] - seen.reshape(-1, 2)
-            landmark, _ = compatible(
+            landmark = compatible(
                 self.method, innovation, spread, rows.covariance, self.gate_probability
             )
             found[landmark >= 0] = names[landmark[landmark >= 0]]
@@ -349,10 +349,10 @@ class Associator:
         innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
         spread = jacobian @ estimate.block(index) @ jacobian.T
         noise = rows.sigma_rad[:, None, None] ** 2
-        pairing = compatible(
+        landmark = compatible(
             self.method, innovation[:, :, None], spread, noise, self.gate_probability
         )
-        return tuple((int(names[j]),) if j >= 0 else () for j in pairing.landmark)
+        return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
 
 def run_filter(
