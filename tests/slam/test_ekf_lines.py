@@ -209,7 +209,9 @@ def test_jacobians_of_two_rays() -> None:
     assert start is not None
 
     def meet(numbers: FloatArray) -> FloatArray:
-        met = triangulate(numbers[:6].reshape(2, 3), numbers[6:], sigma, CAMERA_XY)
+        met = triangulate(
+            numbers[:6].reshape(2, 3), numbers[6:], sigma, CAMERA_XY, np.zeros((6, 6))
+        )
         assert met is not None
         return met
 
@@ -225,9 +227,12 @@ def test_jacobians_of_two_rays() -> None:
 @pytest.mark.parametrize("bearings", [(0.0, 0.3), (0.0, 0.0)])
 def test_rays_that_do_not_meet_in_front(bearings: tuple[float, float]) -> None:
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    assert triangulate(poses, np.array(bearings), np.full(2, 0.01), np.zeros(2)) is None
+    assert (
+        triangulate(poses, np.array(bearings), np.full(2, 0.01), np.zeros(2), np.zeros((6, 6)))
+        is None
+    )
     # Turned to each other they do.
-    met = triangulate(poses, np.array([0.3, -0.3]), np.full(2, 0.01), np.zeros(2))
+    met = triangulate(poses, np.array([0.3, -0.3]), np.full(2, 0.01), np.zeros(2), np.zeros((6, 6)))
     assert met is not None
     np.testing.assert_allclose(met, [0.5, -0.5 / np.tan(0.3)], atol=1e-9)
 
