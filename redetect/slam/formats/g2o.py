@@ -40,6 +40,8 @@ from redetect.slam.recording import CircleRows, LineRows, Recording
 
 #: The largest number of a vertex: other tools keep it in 31 bits.
 LARGEST_NUMBER = 2**31 - 1
+# Less has no inverse that is finite (m^-2, rad^-2).
+_LEAST_INFORMATION = 1e-100
 
 
 class RunGraph(NamedTuple):
@@ -73,8 +75,7 @@ def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
     turn[:, 2, 2] = 1.0
-    with np.errstate(all="ignore"):  # what is not finite stays so
-        turned = np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+    turned = turn @ covariance @ np.swapaxes(turn, 1, 2)
     return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
 
@@ -104,9 +105,9 @@ def _rows(graph: RunGraph) -> Iterator[str]:
         yield f"{_DISC} {base + disc} {_numbers(xy)}"
     steps, rows = from_dataset(run.steps), run.circles
     at_end = in_turned_axes(covariance_from_dataset(run.step_covariance), steps[:, 2])
-    of_steps = inverses(at_end)[:, *np.triu_indices(3)]
+    of_steps = _inverses(at_end)[:, *np.triu_indices(3)]
     seen = from_dataset(rows.xy)
-    of_rows = inverses(covariance_from_dataset(rows.covariance))[:, *np.triu_indices(2)]
+    of_rows = _inverses(covariance_from_dataset(rows.covariance))[:, *np.triu_indices(2)]
     of_frame = np.searchsorted(rows.frame, np.arange(len(steps) + 1))
     for k, step in enumerate(steps):
         yield f"{_STEP} {k} {k + 1} {_numbers(step)} {_numbers(of_steps[k])}"
@@ -116,20 +117,9 @@ def _rows(graph: RunGraph) -> Iterator[str]:
     yield f"{_FIX} 0"
 
 
-def inverses(matrices: FloatArray) -> FloatArray:
-    """Inverses of symmetric (n, d, d) matrices, scaled to ones on the diagonal meanwhile.
-
-    Metres and radians may differ by orders of magnitude. Where there is no inverse the result is
-    not finite.
-    """
-    with np.errstate(all="ignore"):
-        scale = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
-        unit = matrices / scale[:, :, None] / scale[:, None, :]
-        usable = np.all(np.isfinite(unit), axis=(1, 2))
-        usable[usable] = np.abs(np.linalg.det(unit[usable])) > 0.0
-        inverse = np.full(matrices.shape, np.nan)
-        inverse[usable] = np.linalg.inv(unit[usable])
-        inverse = inverse / scale[:, :, None] / scale[:, None, :]
+def _inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of positive definite (n, d, d) matrices, symmetric to the last digit."""
+    inverse = np.linalg.inv(matrices)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, 1, 2)))
 
 
@@ -179,13 +169,12 @@ def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
     spreads = []
     for some, size in ((steps, 3), (sights, 2)):
         information = _symmetric(some, size)
-        spread = inverses(information)
-        usable = is_positive_definite(information) & np.all(np.isfinite(spread), axis=(1, 2))
-        for bad in np.flatnonzero(~usable)[:1]:
+        some_at_all = np.diagonal(information, axis1=1, axis2=2).min(axis=1) > _LEAST_INFORMATION
+        for bad in np.flatnonzero(~(is_positive_definite(information) & some_at_all))[:1]:
             raise SlamError(
                 f"{path}:{some[bad].line}: the information matrix is not positive definite"
             )
-        spreads.append(spread)
+        spreads.append(_inverses(information))
     base = first_disc_vertex(order[-1])
     if min(discs, default=base) < base:
         base = 0
