@@ -16,9 +16,8 @@ from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
-    read_joint_covariance,
     read_map,
-    write_joint_covariance,
+    with_joint_covariance,
     write_map,
     write_path,
 )
@@ -113,13 +112,12 @@ class RunMap(Table):
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        write_map(place / MAP_NAME, self.result.landmarks, overwrite=overwrite)
-        write_joint_covariance(place / MAP_NAME, self.joint_covariance(), overwrite=overwrite)
+        write_map(place / MAP_NAME, self.result.landmarks_jointly(), overwrite=overwrite)
         write_path(place / PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:
         """(2 M, 2 M) covariance of all places, discs first (m^2)."""
-        return self.result.joint_covariance()
+        return self.result.landmarks_jointly().joint_covariance
 
     def _repr_png_(self) -> bytes:
         return _picture(self.result.landmarks, self.path)
@@ -216,11 +214,10 @@ def localize(
         run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options)
     )
     if isinstance(landmarks, RunMap):
-        places, joint = landmarks.result.landmarks, landmarks.joint_covariance()
+        places = landmarks.result.landmarks_jointly()
     else:
-        places = read_map(in_file)
-        joint = read_joint_covariance(in_file, places)
-    result = localized_run_of(command, joined(read_runs(command)), places, joint)
+        places = with_joint_covariance(read_map(in_file), in_file)
+    result = localized_run_of(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
-from redetect.landmarks.map_file import covariance_file, read_joint_covariance, read_map, read_path
+from redetect.landmarks.map_file import covariance_file, read_map, read_path, with_joint_covariance
 from redetect.landmarks.tilts import read_tilts
 from redetect.landmarks.times import read_times
 from redetect.slam.errors import SlamError
@@ -44,7 +44,7 @@ def _npy(array: object) -> bytes:
 def _joint(path: Path) -> object:
     map_file = path.parent / "map.csv"
     assert covariance_file(map_file).name == path.name
-    return read_joint_covariance(map_file, read_map(map_file))
+    return with_joint_covariance(read_map(map_file), map_file)
 
 
 _STEP = b"STEP e.0000  0.00088 -0.15647  0.01153 1e-5 0 1e-5 0 0 1e-4\n"

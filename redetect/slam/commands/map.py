@@ -12,7 +12,6 @@ import numpy as np
 from redetect import slam
 from redetect.landmarks.map_file import (
     covariance_file,
-    write_joint_covariance,
     write_map,
     write_path,
 )
@@ -68,12 +67,11 @@ def perform(command: Map) -> int:
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {slam.__version__}: {name}"]
     final, path = mapped.landmarks, mapped.path
-    write_map(output / MAP_NAME, final, head, overwrite=command.force)
     few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
     if few:
-        joint = mapped.joint_covariance()
-        write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
-    else:
+        final = mapped.landmarks_jointly()
+    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    if not few:
         # One of another map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     ends = first_poses(runs)

@@ -131,16 +131,13 @@ class EkfSlam(Filter):
         self._give_up(self._waiting.forget())
 
     def landmark_map(self) -> LandmarkMap:
-        """The landmarks that are in the state, with their marginal covariances."""
+        """The landmarks that are in the state, with their covariances."""
+        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
         return LandmarkMap(
             discs=self._landmarks(self.disc_slots, self.disc_rows),
             lines=self._landmarks(self.line_slots, self.line_rows),
+            joint_covariance=self.block((slots[:, None] + np.arange(2)).ravel()),
         )
-
-    def map_covariance(self) -> FloatArray:
-        """Joint covariance of `landmark_map`: discs, then lines; (2 M, 2 M), m^2."""
-        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
-        return self.block((slots[:, None] + np.arange(2)).ravel())
 
     def _update(self, rows: FrameRows) -> None:
         """Use rows whose landmarks are in the state."""

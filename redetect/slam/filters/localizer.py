@@ -6,7 +6,7 @@ the filter *considers* them: it carries the correlation of the pose with each la
 without estimating the landmarks anew (Schmidt-Kalman filter).
 
 Landmarks of a map made by driving share most of their error with their neighbours. The joint
-covariance describes this (`redetect.landmarks.map_file`); without it landmarks are
+covariance describes this (`LandmarkMap.joint_covariance`); without it landmarks are
 assumed to be independent of each other.
 """
 
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.filters.frames import NO_CAMERA, POSE_SIZE, Filter, FrameRows, innovation_of
 from redetect.slam.recording import UNKNOWN_ID
@@ -41,9 +40,6 @@ class Localizer(Filter):
         The camera's centre in the robot frame (m); only lines need it.
     map_errors : str
         `considered`: see above; `ignored`: the map is exact.
-    joint_covariance : (2 M, 2 M) array, optional
-        Of all discs and then lines (m^2), for errors that are considered; by default landmarks are
-        independent.
     """
 
     def __init__(
@@ -54,7 +50,6 @@ class Localizer(Filter):
         camera_xy: ArrayLike = NO_CAMERA,
         *,
         map_errors: MapErrors = "considered",
-        joint_covariance: FloatArray | None = None,
     ) -> None:
         # From prediction to prediction, as with first estimates in EKF-SLAM: else corrections would
         # look like knowledge of how the map as a whole is turned.
@@ -69,9 +64,10 @@ class Localizer(Filter):
         self.size = len(self._state)
         self._state[POSE_SIZE:] = self._linearised[POSE_SIZE:] = places
         if considered and len(places):
-            if joint_covariance is None:
-                joint_covariance = block_diag(*discs.covariance, *lines.covariance)
-            self._covariance[POSE_SIZE:, POSE_SIZE:] = joint_covariance
+            joint = landmark_map.joint_covariance
+            if joint is None:
+                joint = block_diag(*discs.covariance, *lines.covariance)
+            self._covariance[POSE_SIZE:, POSE_SIZE:] = joint
 
     def measure(self, rows: FrameRows) -> None:
         """Use the rows of a frame whose landmarks are in the map; the others are left out.

@@ -177,9 +177,10 @@ class MappedRun:
         discs = Landmarks(graph.disc_ids, self.start.disc_xy, zero, graph.disc_row_counts)
         return LandmarkMap(discs, no_landmarks()), Path2D(self.prefixes, self.start.poses)
 
-    def joint_covariance(self) -> FloatArray:
-        """(2 M, 2 M) covariance of all places, discs first (m^2)."""
-        return joint_covariance(self.graph, self.estimate, self.weighting)
+    def landmarks_jointly(self) -> LandmarkMap:
+        """The map with the joint covariance of its landmarks."""
+        joint = joint_covariance(self.graph, self.estimate, self.weighting)
+        return replace(self.landmarks, joint_covariance=joint)
 
 
 def map_run(
