@@ -99,6 +99,8 @@ class Audit(RunFlags):
 class FilterFlags(RunFlags):
     """Options of both filters."""
 
+    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
     association: Literal["known", "nearest", "joint"] = "known"
     # Share of right rows that pass the gate; with known association nothing is gated.
     gate_probability: float = 0.999
@@ -116,9 +118,6 @@ class Localize(FilterFlags):
     """
 
     map: Path  # The map (written by `slam map`).
-    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
-    association: Literal["known", "nearest", "joint"] = "known"
     # `considered`: the map's covariances are errors that stay the same each time a landmark is
     # seen; `ignored`: the map is exact. By default (`auto`) considered with known association, else
     # ignored.
@@ -139,9 +138,6 @@ class Ekf(FilterFlags):
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
     """
 
-    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-    # out.
-    association: Literal["known", "nearest", "joint"] = "known"
     # Where the models are linearised: at the `first` estimate of each landmark, so that the filter
     # gains no spurious information about its heading from landmarks that it has placed itself; or
     # at the `latest`, as the textbook filter does, which is inconsistent at large heading errors.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -98,14 +99,12 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
 
 
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A command's flags as a JSON file has them."""
-    return {
-        name: json.loads(json.dumps(value, default=str))
-        for name, value in asdict(cast(Any, command)).items()
-        if name not in but
-    }
+    """A command's flags for a JSON file."""
+    flags: dict[str, Any] = asdict(cast(Any, command))
+    return {name: value for name, value in flags.items() if name not in but}
 
 
 def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write a summary."""
-    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode(), overwrite=overwrite)
+    """Write a summary; paths become text."""
+    text = json.dumps(content, indent=1, default=os.fspath) + "\n"
+    write_bytes(path, text.encode(), overwrite=overwrite)
