@@ -118,7 +118,7 @@ def _localized(command: Localize, recording: Recording) -> _Result:
             name = covariance_file(command.map).name
             said.append(f"errors of the map taken as independent: no {name}")
     jointly = ", jointly" if landmark_map.joint_covariance is not None else ""
-    began = _now()
+    began = time.perf_counter()
     run = localized_run_of(command, recording, landmark_map)
     return _Result(
         run,
@@ -191,7 +191,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = camera_xy_of(recording, command.run, command.camera)
     ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
     associator = Associator(command.association, command.gate_probability)
-    began = _now()
+    began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
     time_line = _time_line(began, len(recording))
     landmark_map = ekf.landmark_map()
@@ -220,17 +220,9 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     )
 
 
-def _now() -> tuple[float, float]:
-    """Seconds on the clock, and of the processor."""
-    return time.perf_counter(), time.thread_time()
-
-
-def _time_line(began: tuple[float, float], steps: int) -> str:
-    seconds, working = (now - then for now, then in zip(_now(), began))
-    return (
-        f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s; of processor "
-        f"{working:.2f} s, {steps / working:.0f} steps/s"
-    )
+def _time_line(began: float, steps: int) -> str:
+    seconds = time.perf_counter() - began
+    return f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s"
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:

@@ -253,13 +253,11 @@ class EkfSlam(Filter):
         return slot
 
     def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
-        place = np.array(list(slots.values()), dtype=np.int64)
+        places = np.array(list(slots.values()), dtype=np.int64)[:, None] + np.arange(2)
         return Landmarks(
             ids=np.array(list(slots), dtype=np.int64),
-            xy=np.stack([self._state[place], self._state[place + 1]], axis=-1),
-            covariance=np.array([self.block(slot + np.arange(2)) for slot in place]).reshape(
-                -1, 2, 2
-            ),
+            xy=self._state[places],
+            covariance=self._covariance[places[:, :, None], places[:, None, :]],
             rows=np.array([rows[number] for number in slots], dtype=np.int64),
         )
 
