@@ -78,20 +78,6 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
     )
 
 
-def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, FloatArray]:
-    """By how much a camera is turned about the vertical against its calibration.
-
-    Takes `mounting` (3, 4); returns `angle`, `by_mounting` (4,).
-    """
-    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
-    sin, cos = turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]
-    tilt_x, tilt_y = turn[2, 0], turn[2, 1]
-    squared = sin**2 + cos**2
-    by_x = (-cos * tilt_x + sin * tilt_y) / squared
-    by_y = (-cos * tilt_y - sin * tilt_x) / squared
-    return float(np.arctan2(sin, cos)), np.array([by_x, by_y, 1.0, 0.0])
-
-
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
     """See that rows can come from a camera at all."""
     pixels = camera.project_floor(floor_xy)

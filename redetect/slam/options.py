@@ -58,7 +58,8 @@ class Map(RunsFlags):
 
     # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     camera: MaybePath = None
-    calibrate: bool = False  # Estimate the camera's mounting (rotation and height) as well.
+    # Estimate the camera's mounting (rotation and height) as well, by discs alone.
+    calibrate: bool = False
     # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
     # as mounted sees it; `recorded`, as the rows were written, where their covariances belong.
     row_errors: Literal["corrected", "recorded"] = "corrected"

@@ -20,11 +20,7 @@ from redetect.slam.models import (
     disc_in_robot,
     disc_jacobians,
 )
-from redetect.slam.mounting import (
-    rows_as_recorded,
-    rows_through_mounting,
-    turn_to_the_left,
-)
+from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
 from redetect.storage.bounds import Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
@@ -42,7 +38,7 @@ class Weighting:
 
     loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
     loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
-    calibrate: bool = False  # whether the camera's rotation and height are unknowns
+    calibrate: bool = False  # whether the camera's rotation and height are unknowns, of discs alone
     # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
     # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
     # row that the calibrated camera would have written is compared with the one it wrote, which is
@@ -124,7 +120,7 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     blocks = [
         Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
         Block(error.discs, seen, by_mounting if weighting.calibrate else None, loss),
-        *_line_blocks(graph, estimate, weighting, error.lines, loss),
+        *_line_blocks(graph, estimate, error.lines, loss),
     ]
     if len(error.prior):
         lines = len(graph.line_ids)
@@ -171,17 +167,12 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
     bearing = bearing_of_vertical(
         estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
     )
-    turn = 0.0
-    if estimate.mounting is not None and graph.camera is not None:
-        turn, _ = turn_to_the_left(graph.camera, estimate.mounting)
-    off = wrap_angle(bearing - turn - graph.bearing_rad[graph.member_row])
+    off = wrap_angle(bearing - graph.bearing_rad[graph.member_row])
     mean = np.bincount(graph.member_row, share * off, minlength=len(graph.line_pose))
     return np.asarray(mean / graph.bearing_sigma_rad)
 
 
-def _line_blocks(
-    graph: Graph, estimate: Estimate, weighting: Weighting, error: FloatArray, loss: Loss
-) -> list[Block]:
+def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss) -> list[Block]:
     """A row's derivatives are those of all its lines."""
     if len(graph.line_pose) == 0:
         return []
@@ -192,12 +183,6 @@ def _line_blocks(
     )
     scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
     by_pose, by_line = by_pose * scale, by_line * scale
-    shared = None
-    if weighting.calibrate and estimate.mounting is not None and graph.camera is not None:
-        # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-        # turned to the left sees landmarks further to the right than they are.
-        _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
-        shared = (-by_turn / graph.bearing_sigma_rad[:, None])[:, None, :]
     # The k-th line of each row; rows of fewer lines have none there.
     order = np.argsort(graph.member_row, kind="stable")
     count = np.bincount(graph.member_row, minlength=len(graph.line_pose))
@@ -209,4 +194,4 @@ def _line_blocks(
         member = order[start + np.minimum(k, count - 1)]
         first = layout.first_line + 2 * graph.member_line[member]
         by.append((np.where(k < count, first, -1), by_line[member][:, None, :]))
-    return [Block(error[:, None], by, shared, loss)]
+    return [Block(error[:, None], by, loss=loss)]

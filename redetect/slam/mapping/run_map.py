@@ -359,9 +359,9 @@ def _check_usable(
     if needs and camera is None:
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
     if weighting.calibrate and camera is not None:
-        if not np.any(recording.circles.ids >= 0):
+        if len(recording.lines):
             raise SlamError(
-                f"{name}: bearings do not say how the camera is mounted: expected discs"
+                f"{name}: bearings do not say how the camera is mounted: expected discs alone"
             )
         check_rows_fit_camera(camera, recording.circles.xy)
     check_connected(recording, name)
