@@ -22,7 +22,7 @@ class RunFlags:
     lines: bool = False  # Use the vertical lines.
     # Name of the landmark files in the folder; by default map, else detected.
     stem: MaybeStr = None
-    # Calibration, if it is not the one in the run folder (lines need one).
+    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     camera: MaybePath = None
     force: bool = False  # Replace existing files.
     # Of the steps that state no covariance.
@@ -56,8 +56,6 @@ class Map(RunsFlags):
     Example: slam map images/e --circles --lines -o /tmp/e-map
     """
 
-    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
-    camera: MaybePath = None
     # Estimate the camera's mounting (rotation and height) as well, by discs alone.
     calibrate: bool = False
     # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
