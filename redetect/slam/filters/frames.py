@@ -254,7 +254,7 @@ class Filter(ABC):
         return both[:-1], both[-1]
 
     def _grow(self, count: int) -> None:
-        """Make room for more numbers in the state, 0 so far. BLAS has matrices by columns."""
+        """Lengthen the arrays by some numbers, 0 so far. BLAS has matrices by columns."""
         separate, before = self._linearised is not self._state, len(self._state)
         self._state = np.pad(self._state, (0, count))
         self._linearised = np.pad(self._linearised, (0, count)) if separate else self._state
