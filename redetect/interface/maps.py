@@ -16,21 +16,19 @@ from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
     Path2D,
-    read_joint_covariance,
     read_map,
-    write_joint_covariance,
+    with_joint_covariance,
     write_map,
     write_path,
 )
-from redetect.slam.commands.files import MAP_NAME, PATH_NAME
+from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
 from redetect.slam.commands.filters import localized_run_of, path_distance
-from redetect.slam.commands.map import mapped_run_of, weighting_of
+from redetect.slam.commands.map import mapped_run_of
 from redetect.slam.filters.frames import FilterRun
-from redetect.slam.mapping.run_map import MappedRun, landmark_map, path_of
-from redetect.slam.mapping.solve import joint_covariance
+from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import Recording, joined, read_recording
+from redetect.slam.recording import joined
 
 PathLike = str | os.PathLike[str]
 
@@ -78,7 +76,6 @@ class RunMap(Table):
     lines: Landmarks
     path: Path2D
     result: MappedRun
-    command: Map
 
     @property
     def chi_squared_factor(self) -> float:
@@ -115,19 +112,15 @@ class RunMap(Table):
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        write_map(place / MAP_NAME, self._landmarks(), overwrite=overwrite)
-        write_joint_covariance(place / MAP_NAME, self.joint_covariance(), overwrite=overwrite)
+        write_map(place / MAP_NAME, self.result.landmarks_jointly(), overwrite=overwrite)
         write_path(place / PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:
         """(2 M, 2 M) covariance of all places, discs first (m^2)."""
-        return joint_covariance(self.result.graph, self.result.estimate, weighting_of(self.command))
-
-    def _landmarks(self) -> LandmarkMap:
-        return LandmarkMap(self.discs, self.lines)
+        return self.result.landmarks_jointly().joint_covariance
 
     def _repr_png_(self) -> bytes:
-        return _picture(self._landmarks(), self.path)
+        return _picture(self.result.landmarks, self.path)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,11 +176,8 @@ def map_landmarks(
         If a file is malformed.
     """
     command = Map(run=Path(run), circles=circles, lines=lines, **_as_paths(options))
-    recording = _recording_of(command)
-    mapped = mapped_run_of(command, recording)
-    final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
-    path = path_of(recording, mapped.estimate, mapped.covariance)
-    return RunMap(final.discs, final.lines, path, mapped, command)
+    mapped = mapped_run_of(command, joined(read_runs(command)))
+    return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
 
 def localize(
@@ -224,28 +214,11 @@ def localize(
         run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options)
     )
     if isinstance(landmarks, RunMap):
-        places = LandmarkMap(landmarks.discs, landmarks.lines)
-        joint = landmarks.joint_covariance()
+        places = landmarks.result.landmarks_jointly()
     else:
-        places = read_map(in_file)
-        joint = read_joint_covariance(in_file, places)
-    result = localized_run_of(command, _recording_of(command), places, joint)
+        places = with_joint_covariance(read_map(in_file), in_file)
+    result = localized_run_of(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
-
-
-def _recording_of(command: Map | Localize) -> Recording:
-    return joined(
-        [
-            read_recording(
-                run,
-                circles=command.circles,
-                lines=command.lines,
-                stem=command.stem,
-                noise=command.odometry_noise,
-            )
-            for run in command.runs
-        ]
-    )
 
 
 def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:

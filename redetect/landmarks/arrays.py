@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks.records import CircleLandmark, LandmarkError
+from redetect.landmarks.records import CircleLandmark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,27 +57,17 @@ def circle_landmarks(
     Raises
     ------
     LandmarkError
-        If the arrays' shapes do not fit or a number is not finite.
+        If a number is not finite.
+    ValueError
+        If the arrays' lengths differ.
     """
-    position = np.asarray(xy, dtype=np.float64)
-    confidence = np.asarray(quality, dtype=np.float64)
-    spread = np.asarray(covariance, dtype=np.float64)
-    count = len(position)
-    expected = ((count, 2), (count,), (count, 2, 2))
-    if (position.shape, confidence.shape, spread.shape) != expected:
-        raise LandmarkError(
-            f"xy, quality and covariance have shapes {position.shape}, {confidence.shape} and "
-            f"{spread.shape}: expected (N, 2), (N,) and (N, 2, 2)"
-        )
-    identifiers = np.zeros((count, 0), dtype=np.int64) if ids is None else np.reshape(ids, (-1, 1))
-    if len(identifiers) != count or not np.issubdtype(identifiers.dtype, np.integer):
-        raise LandmarkError(
-            f"ids are {len(identifiers)} {identifiers.dtype}: expected {count} integers"
-        )
-    numbers = np.column_stack([position, confidence, spread.reshape(count, 4)[:, [0, 1, 3]]])
+    spread = np.asarray(covariance, dtype=np.float64).reshape(-1, 4)[:, [0, 1, 3]]
+    numbers = np.column_stack([np.reshape(xy, (-1, 2)), quality, spread]).tolist()
+    count = len(numbers)
+    identifiers = np.zeros((count, 0), np.int64) if ids is None else np.reshape(ids, (-1, 1))
     return tuple(
-        CircleLandmark(px, py, q, cxx, cxy, cyy, tuple(identifier))
-        for (px, py, q, cxx, cxy, cyy), identifier in zip(numbers.tolist(), identifiers.tolist())
+        CircleLandmark(px, py, q, cxx, cxy, cyy, tuple(own))
+        for (px, py, q, cxx, cxy, cyy), own in zip(numbers, identifiers.tolist(), strict=True)
     )
 
 

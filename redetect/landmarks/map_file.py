@@ -10,7 +10,7 @@ import io
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -58,6 +58,8 @@ class LandmarkMap:
 
     discs: Landmarks
     lines: Landmarks
+    #: (2 M, 2 M) of all places, discs first (m^2); None: each landmark's own is all that is known
+    joint_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,8 @@ def write_map(
 ) -> None:
     """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
 
+    Its joint covariance, if there is one, is written beside it (`covariance_file`).
+
     Parameters
     ----------
     path : path
@@ -104,12 +108,17 @@ def write_map(
         for number, xy, c, count in zip(some.ids, some.xy, some.covariance, some.rows)
     ]
     write_table(path, MAP_COLUMNS, rows, comments, overwrite=overwrite)
+    if landmark_map.joint_covariance is not None:
+        content = io.BytesIO()
+        np.save(content, np.ascontiguousarray(landmark_map.joint_covariance, dtype=np.float64))
+        write_bytes(covariance_file(Path(path)), content.getvalue(), overwrite=overwrite)
 
 
 def read_map(path: FilePath) -> LandmarkMap:
     """Read a map that `write_map` wrote, or one made by hand with the same columns.
 
-    The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0.
+    The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0. The joint
+    covariance is left where it is (`with_joint_covariance`).
 
     Raises LandmarkFileError if the file cannot be read, a row is malformed, a landmark is listed
     twice or a covariance is negative; names file and line.
@@ -144,25 +153,14 @@ def covariance_file(map_file: Path) -> Path:
     return map_file.with_name(f"{map_file.stem}_covariance.npy")
 
 
-def write_joint_covariance(map_file: Path, covariance: FloatArray, *, overwrite: bool) -> None:
-    """Write a map's joint covariance beside it; errors and `overwrite` as of `write_map`.
+def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> LandmarkMap:
+    """A map with the joint covariance that is beside its file; as it is if there is none.
 
-    Takes `covariance` (2 M, 2 M): x and y of each landmark in the order of the map's rows (m^2).
-    """
-    content = io.BytesIO()
-    np.save(content, np.ascontiguousarray(covariance, dtype=np.float64), allow_pickle=False)
-    write_bytes(covariance_file(map_file), content.getvalue(), overwrite=overwrite)
-
-
-def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArray | None:
-    """Read the joint covariance (2 M, 2 M) of a map, None if there is no file of it beside.
-
-    Raises LandmarkFileError if it is malformed, or not of this map, whose content is
-    `landmark_map`.
+    Raises LandmarkFileError if that is malformed, or not of this map.
     """
     path = covariance_file(map_file)
     if not path.is_file():
-        return None
+        return landmark_map
     own = np.concatenate([landmark_map.discs.covariance, landmark_map.lines.covariance])
     shape = (2 * len(own), 2 * len(own))
     most_bytes = max(32 * len(own) ** 2, _SMALL_BYTES)
@@ -186,7 +184,7 @@ def read_joint_covariance(map_file: Path, landmark_map: LandmarkMap) -> FloatArr
         raise LandmarkFileError(
             path, None, f"not the covariance of {map_file}: expected that of each landmark"
         )
-    return np.asarray(0.5 * (found + found.T))
+    return replace(landmark_map, joint_covariance=0.5 * (found + found.T))
 
 
 def write_path(

@@ -6,13 +6,11 @@ otherwise, the same pixel's ray meets the floor elsewhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from camera.rotations import cross_matrices, left_jacobian, rotation_of
+from camera.rotations import cross_matrices
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 
@@ -48,44 +46,25 @@ def _on_floor(ray: FloatArray, height_m: float) -> tuple[FloatArray, FloatArray]
     return slope, by_ray
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedJacobians:
-    """Derivatives of n rows as recorded."""
-
-    floor: FloatArray  # (n, 2, 2): by the disc in the robot frame
-    tilt: FloatArray  # (n, 2, 2): by the frame's pitch and roll
-    # (n, 2, 4): by a rotation vector in the robot frame, applied to the mounting from the left, and
-    # by the height.
-    mounting: FloatArray
-
-
 def rows_as_recorded(
-    camera: Camera, floor_xy: FloatArray, mounting: FloatArray, tilt: FloatArray
-) -> tuple[FloatArray, RecordedJacobians]:
-    """Rows by the calibration of discs that the camera sees as mounted and tilted.
+    camera: Camera, floor_xy: FloatArray, mounting: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows by the calibration of discs that the camera sees as mounted.
 
     The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
     the camera.
 
-    Takes `floor_xy` (n, 2), `mounting` (3, 4), `tilt` (n, 2); returns `rows_xy` (n, 2),
-    `jacobians`.
+    Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
+    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 4), the latter by the numbers that
+    `rows_through_mounting` names.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
     from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
-    vectors = np.column_stack([tilt, np.zeros(len(tilt))])
-    level, left = np.swapaxes(rotation_of(vectors), 1, 2), left_jacobian(vectors)
-    untilted = np.einsum("nij,nj->ni", level, from_centre)
     height = float(camera.centre[2])
-    slope, by_ray = _on_floor(untilted @ unturn.T, height)
-    by_untilted = by_ray @ unturn
-    by_robot = by_untilted @ level
-    return camera.centre[:2] - height * slope, RecordedJacobians(
-        floor=by_robot[:, :, :2],
-        tilt=(by_robot @ cross_matrices(from_centre) @ left)[:, :, :2],
-        mounting=np.concatenate(
-            [by_untilted @ cross_matrices(untilted), -by_robot[:, :, 2:]], axis=2
-        ),
-    )
+    slope, by_ray = _on_floor(from_centre @ unturn.T, height)
+    by_robot = by_ray @ unturn
+    by_mounting = np.concatenate([by_robot @ cross_matrices(from_centre), -by_robot[:, :, 2:]], 2)
+    return camera.centre[:2] - height * slope, by_robot[:, :, :2], by_mounting
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
@@ -97,20 +76,6 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
     return np.append(
         Rotation.from_matrix(turn).as_rotvec(), mounting[2, 3] - float(camera.centre[2])
     )
-
-
-def turn_to_the_left(camera: Camera, mounting: FloatArray) -> tuple[float, FloatArray]:
-    """By how much a camera is turned about the vertical against its calibration.
-
-    Takes `mounting` (3, 4); returns `angle`, `by_mounting` (4,).
-    """
-    turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
-    sin, cos = turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]
-    tilt_x, tilt_y = turn[2, 0], turn[2, 1]
-    squared = sin**2 + cos**2
-    by_x = (-cos * tilt_x + sin * tilt_y) / squared
-    by_y = (-cos * tilt_y - sin * tilt_x) / squared
-    return float(np.arctan2(sin, cos)), np.array([by_x, by_y, 1.0, 0.0])
 
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:

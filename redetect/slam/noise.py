@@ -90,7 +90,6 @@ def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recor
     Covariances become 1 + factor^2 times what they were; odometry stays. Everything random follows
     from the seed.
     """
-    AddedNoise(sigma=factor, seed=seed)  # which refuses what makes no sense
     rng = np.random.default_rng([seed, 2])
     circles, lines = recording.circles, recording.lines
     root = np.linalg.cholesky(circles.covariance)

@@ -22,7 +22,7 @@ class RunFlags:
     lines: bool = False  # Use the vertical lines.
     # Name of the landmark files in the folder; by default map, else detected.
     stem: MaybeStr = None
-    # Calibration, if it is not the one in the run folder (lines need one).
+    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
     camera: MaybePath = None
     force: bool = False  # Replace existing files.
     # Of the steps that state no covariance.
@@ -56,17 +56,13 @@ class Map(RunsFlags):
     Example: slam map images/e --circles --lines -o /tmp/e-map
     """
 
-    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
-    camera: MaybePath = None
-    calibrate: bool = False  # Estimate the camera's mounting (rotation and height) as well.
+    # Estimate the camera's mounting (rotation and height) as well, by discs alone.
+    calibrate: bool = False
     # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
     # as mounted sees it; `recorded`, as the rows were written, where their covariances belong.
     row_errors: Literal["corrected", "recorded"] = "corrected"
-    # Standard deviation of the robot's pitch and roll in each frame (degrees); with --row-errors
-    # recorded.
-    tilt_deg: float = 0.0
     # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
-    # (extra [slam]).
+    # (extra [slam]), of discs and plain least squares alone.
     solver: Literal["separable", "gtsam"] = "separable"
     # `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
@@ -102,6 +98,8 @@ class Audit(RunFlags):
 class FilterFlags(RunFlags):
     """Options of both filters."""
 
+    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
+    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
     association: Literal["known", "nearest", "joint"] = "known"
     # Share of right rows that pass the gate; with known association nothing is gated.
     gate_probability: float = 0.999
@@ -119,13 +117,10 @@ class Localize(FilterFlags):
     """
 
     map: Path  # The map (written by `slam map`).
-    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
-    association: Literal["known", "nearest", "joint"] = "known"
     # `considered`: the map's covariances are errors that stay the same each time a landmark is
-    # seen; `white`: errors that are new each time; `ignored`: the map is exact. By default (`auto`)
-    # considered with known association, else ignored.
-    map_errors: Literal["auto", "considered", "white", "ignored"] = "auto"
+    # seen; `ignored`: the map is exact. By default (`auto`) considered with known association, else
+    # ignored.
+    map_errors: Literal["auto", "considered", "ignored"] = "auto"
     # Standard deviations of the pose at the start.
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Nothing is known of the pose at the start: it is found by the discs of the first frames,
@@ -142,9 +137,6 @@ class Ekf(FilterFlags):
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
     """
 
-    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-    # out.
-    association: Literal["known", "nearest", "joint"] = "known"
     # Where the models are linearised: at the `first` estimate of each landmark, so that the filter
     # gains no spurious information about its heading from landmarks that it has placed itself; or
     # at the `latest`, as the textbook filter does, which is inconsistent at large heading errors.
@@ -192,7 +184,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(RunFlags):
-    """Write a run (and a map of it) in the formats of other tools.
+    """Write a run in the formats of other tools, whose axes are X forward, Y left.
 
     Example: slam export images/e --to g2o -o /tmp/e.g2o
     """
@@ -203,14 +195,9 @@ class Export(RunFlags):
     # `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
     # odometry and measurements as tables for GTSAM or MRPT.
     to: Literal["g2o", "tum", "csv"] = "g2o"
-    # Folder that `slam map` wrote: its poses and landmarks are the estimates in the graph; by
-    # default odometry's and first sight's.
-    solution: MaybePath = None
     # For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside the
     # run that has them all; where there is none, t counts the steps.
     times: MaybePath = None
-    # `robotics`: X forward, Y left, as the other tools expect; `dataset`: X left, Y backward.
-    axes: Literal["robotics", "dataset"] = "robotics"
 
 
 @dataclass(frozen=True)
@@ -220,15 +207,13 @@ class Import:
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
     """
 
-    # A .g2o graph, a .tum trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
+    # A .g2o graph, a TUM trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
     # data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     file: Positional[Path]
     # Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates; of
     # a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of true
     # landmarks the map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    # The axes that the graph or trajectory is in; see `slam export`.
-    axes: Literal["robotics", "dataset"] = "robotics"
     range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
     bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).
     force: bool = False  # Replace an existing file.

@@ -20,7 +20,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -81,23 +81,15 @@ def picture(
                 pyplot.close(figure)
 
 
-def pose_errors(
-    path: Path2D, reference: ArrayLike
-) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Errors of a path's poses, their standard deviations, and the normalised error squared.
 
-    Takes `reference` (N, 3); returns `error` (N, 3), `sigma` (N, 3), `nees` (N,).
+    Takes a path with covariances and `reference` (N, 3); returns `error` (N, 3), `sigma` (N, 3),
+    `nees` (N,), NaN where a pose is given exactly.
     """
-    truth = np.asarray(reference, dtype=np.float64)
-    if truth.shape != path.poses.shape:
-        raise SlamError(
-            f"reference of shape {truth.shape}: expected one pose for each of the path's "
-            f"{len(path.poses)}"
-        )
-    error = path.poses - truth
+    assert path.covariance is not None
+    error = path.poses - reference
     error[:, 2] = wrap_angle(error[:, 2])
-    if path.covariance is None:
-        return error, None, None
     variance = np.diagonal(path.covariance, axis1=1, axis2=2)
     nees = np.full(len(error), np.nan)
     usable = is_positive_definite(path.covariance)
@@ -125,7 +117,7 @@ def draw_map(
     landmark_map: LandmarkMap,
     path: Path2D,
     *,
-    before: tuple[LandmarkMap | None, Path2D] | None = None,
+    before: tuple[LandmarkMap, Path2D] | None = None,
     reference: Path2D | None = None,
     title: str = "",
     overwrite: bool,
@@ -141,7 +133,7 @@ def draw_map(
         Discs and verticals. Verticals far outside are counted in the legend, not drawn.
     path : Path2D
         The robot's path.
-    before : (LandmarkMap or None, Path2D), optional
+    before : (LandmarkMap, Path2D), optional
         The same before loops were closed: drawn in a panel of its own, to the same scale.
     reference : Path2D, optional
         The true path, or another to compare with; dashed.
@@ -157,9 +149,9 @@ def draw_map(
     redetect.storage.OutputExistsError
         If the file exists and may not be replaced.
     SlamError
-        If there is nothing to draw, or `interactive` where no window can be opened.
+        If it is `interactive` where no window can be opened.
     """
-    panels: list[tuple[str, LandmarkMap | None, Path2D]] = [("", landmark_map, path)]
+    panels = [("", landmark_map, path)]
     if before is not None:
         panels = [
             ("before closing loops", *before),
@@ -172,6 +164,8 @@ def draw_map(
     largest = (9.0, 8.0) if len(panels) == 1 else (10.0, 6.0) if stacked else (7.0, 7.5)
     scale = min(largest[0] / span[0], largest[1] / span[1])
     size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
+    ticks = MaxNLocator(12, steps=[1, 2, 5, 10]).tick_values(0.0, float(np.max(span)))
+    spacing = float(ticks[1] - ticks[0])
     with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
@@ -180,8 +174,8 @@ def draw_map(
             axes.set_ylim(low[1], high[1])
             axes.set_aspect("equal")
             # Squares of one size: a scale for the eye.
-            axes.xaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
-            axes.yaxis.set_major_locator(MultipleLocator(_grid_spacing(span)))
+            axes.xaxis.set_major_locator(MultipleLocator(spacing))
+            axes.yaxis.set_major_locator(MultipleLocator(spacing))
             axes.set_title(name, fontsize=11)
             axes.set_xlabel("x / m")
             axes.set_ylabel("y / m")
@@ -198,7 +192,7 @@ def draw_map(
 def draw_errors(
     png: Path,
     path: Path2D,
-    reference: ArrayLike,
+    reference: FloatArray,
     *,
     title: str = "",
     overwrite: bool,
@@ -206,32 +200,28 @@ def draw_errors(
 ) -> None:
     """Draw position and heading error over the steps, and the normalised error squared.
 
-    Takes `reference` (N, 3).
+    Takes a path with covariances and `reference` (N, 3).
     """
     error, sigma, nees = pose_errors(path, reference)
     step = np.arange(len(error))
     unit = np.array([1.0, 1.0, 180.0 / np.pi])
     names = ("x error / m", "y error / m", "heading error / °")
-    rows = 3 if nees is None else 4
-    size = (10.0, 1.9 * rows + 1.0)
-    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
-        all_axes = figure.subplots(rows, 1, sharex=True)
+    with picture(png, (10.0, 8.6), overwrite=overwrite, interactive=interactive) as figure:
+        all_axes = figure.subplots(4, 1, sharex=True)
         for i, (axes, name) in enumerate(zip(all_axes, names)):
             value = unit[i] * error[:, i]
-            if sigma is not None:
-                band = 3.0 * unit[i] * sigma[:, i]
-                axes.fill_between(
-                    step, -band, band, color=_BAND, alpha=0.2, lw=0, label=f"±3 {_SIGMA}", zorder=1
-                )
-                share = float(np.mean(np.abs(value) <= band))
-                axes.set_title(f"within 3 {_SIGMA}: {share:.1%}", fontsize=9, loc="right")
+            band = 3.0 * unit[i] * sigma[:, i]
+            axes.fill_between(
+                step, -band, band, color=_BAND, alpha=0.2, lw=0, label=f"±3 {_SIGMA}", zorder=1
+            )
+            share = float(np.mean(np.abs(value) <= band))
+            axes.set_title(f"within 3 {_SIGMA}: {share:.1%}", fontsize=9, loc="right")
             axes.plot(step, value, color="black", lw=0.8, label="error", zorder=3)
             axes.axhline(0.0, color=_REFERENCE, lw=0.6, zorder=2)
             axes.set_ylabel(name)
             axes.grid(alpha=0.25, lw=0.6)
         all_axes[0].legend(loc="upper left", fontsize=8, ncols=2)
-        if nees is not None:
-            _draw_nees(all_axes[3], step, nees)
+        _draw_nees(all_axes[3], step, nees)
         all_axes[-1].set_xlabel("step")
         all_axes[-1].set_xlim(0, max(len(step) - 1, 1))
         figure.align_ylabels(list(all_axes))
@@ -263,27 +253,23 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
 
 
 def _extent(
-    drawn: list[tuple[LandmarkMap | None, Path2D]], reference: Path2D | None
+    drawn: list[tuple[LandmarkMap, Path2D]], reference: Path2D | None
 ) -> tuple[FloatArray, FloatArray]:
     """Corners of the picture (m): all paths and discs, and the verticals not far from them."""
-    points = [path.poses[:, :2] for _, path in drawn]
-    points += [some.discs.xy for some, _ in drawn if some is not None]
+    points = [xy for some, path in drawn for xy in (path.poses[:, :2], some.discs.xy)]
     if reference is not None:
         points.append(reference.poses[:, :2])
     inner = np.concatenate(points)
-    if len(inner) == 0:
-        raise SlamError("a map without path and discs: expected something to draw")
     low, high = inner.min(axis=0), inner.max(axis=0)
     reach = np.minimum(_MARGIN_M, _MARGIN_SHARE * float(np.max(high - low)) + 1.0)
     for some, _ in drawn:
-        if some is not None:
-            near = _inside(some.lines.xy, low - reach, high + reach)
-            for landmarks, shown in ((some.discs, slice(None)), (some.lines, near)):
-                # With their ellipses, but an unknown place shall not shrink the known ones.
-                variance = np.diagonal(landmarks.covariance[shown], axis1=1, axis2=2)
-                around = np.minimum(3.0 * np.sqrt(np.clip(variance, 0.0, None)), 0.5 * reach)
-                places = landmarks.xy[shown]
-                inner = np.concatenate([inner, places - around, places + around])
+        near = _inside(some.lines.xy, low - reach, high + reach)
+        for landmarks, shown in ((some.discs, slice(None)), (some.lines, near)):
+            # With their ellipses, but an unknown place shall not shrink the known ones.
+            variance = np.diagonal(landmarks.covariance[shown], axis1=1, axis2=2)
+            around = np.minimum(3.0 * np.sqrt(np.clip(variance, 0.0, None)), 0.5 * reach)
+            places = landmarks.xy[shown]
+            inner = np.concatenate([inner, places - around, places + around])
     low, high = inner.min(axis=0), inner.max(axis=0)
     margin = max(0.03 * float(np.max(high - low)), 0.3)
     # A straight drive has next to no width, but shall have a picture.
@@ -292,20 +278,13 @@ def _extent(
     return middle - half, middle + half
 
 
-def _grid_spacing(span: FloatArray) -> float:
-    """1, 2 or 5 times a power of ten, of which the larger side has 5 to 12."""
-    finest = float(np.max(span)) / 12.0
-    power = 10.0 ** np.floor(np.log10(finest))
-    return float(next(n * power for n in (1.0, 2.0, 5.0, 10.0) if n * power >= finest))
-
-
 def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
     return np.asarray(np.all((xy >= low) & (xy <= high), axis=1))
 
 
 def _draw_panel(
     axes: Axes,
-    some: LandmarkMap | None,
+    some: LandmarkMap,
     path: Path2D,
     reference: Path2D | None,
     low: FloatArray,
@@ -322,16 +301,15 @@ def _draw_panel(
     for k, poses in enumerate(runs):
         label = None if k else "path"
         axes.plot(poses[:, 0], poses[:, 1], color=_PATH, lw=0.9, label=label, zorder=3)
-    if some is not None:
-        ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
-        _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
-        _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), low, high, ellipses=ellipses)
-        if 0 < len(some.discs) <= _MOST_NUMBERED:
-            for number, (x, y) in zip(some.discs.ids.tolist(), some.discs.xy.tolist()):
-                axes.annotate(
-                    str(number), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7,
-                    color=_DISC, zorder=6,
-                )  # fmt: skip
+    ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
+    _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
+    _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), low, high, ellipses=ellipses)
+    if len(some.discs) <= _MOST_NUMBERED:
+        for number, (x, y) in zip(some.discs.ids.tolist(), some.discs.xy.tolist()):
+            axes.annotate(
+                str(number), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7,
+                color=_DISC, zorder=6,
+            )  # fmt: skip
     for index, name, marker in ((0, "start", "o"), (-1, "end", "s")):
         at = np.array([poses[index] for poses in runs if len(poses)]).reshape(-1, 3)
         axes.plot(

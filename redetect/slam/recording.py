@@ -296,12 +296,13 @@ def recording_of_frames(
     )
 
 
-def frames_of_discs(recording: Recording, quality: FloatArray) -> list[Frame]:
+def frames_of_discs(recording: Recording) -> list[Frame]:
     """Steps and rows of discs as frames, of which `recording_of_frames` gathers them again.
 
-    Takes `quality` (n,) of the rows.
+    The rows' quality is 1.
     """
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
+    quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
     numbers = np.column_stack([recording.steps, spread[:, [0, 1, 4, 2, 5, 8]]])
     frames = []

@@ -100,12 +100,11 @@ def test_errors_are_as_large_as_covariances_say(estimate: Estimate, lines: bool)
     ("estimate", "noise", "turn"),
     [
         (localized(0.05, "ignored"), 1.0, 0.006),
-        (localized(0.05, "white"), 1.0, 0.006),
         (localized(0.0, "considered"), 1.44, 0.006),
         (mapped("first"), 1.44, 0.006),
         (mapped("latest"), 1.0, 0.1),
     ],
-    ids=["map errors ignored", "map errors white", "localizer", "EKF-SLAM", "heading error"],
+    ids=["map errors ignored", "localizer", "EKF-SLAM", "heading error"],
 )
 def test_what_is_wrong_shows(estimate: Estimate, noise: float, turn: float) -> None:
     nees = mean_nees(estimate, FEW_RUNS, noise=noise, turn=turn)

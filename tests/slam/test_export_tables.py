@@ -15,7 +15,7 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between, rotation
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
-from redetect.slam.formats.text import Axes, from_dataset
+from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 
@@ -55,9 +55,8 @@ def estimates(recording: Recording) -> FloatArray:
 TRIANGLE = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi_rad2")
 
 
-@pytest.mark.parametrize("axes", ["robotics", "dataset"])
-def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes) -> None:
-    write_table(tmp_path / "o.csv", *odometry_table(recording, axes), ["a comment"])
+def test_the_error_of_odometry(tmp_path: Path, recording: Recording) -> None:
+    write_table(tmp_path / "o.csv", *odometry_table(recording), ["a comment"])
     rows = rows_of(tmp_path / "o.csv")
     assert [row["prefix"] for row in rows] == list(recording.prefixes)
     assert [row["step"] for row in rows] == [str(k + 1) for k in range(80)]
@@ -67,7 +66,7 @@ def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes)
     expected = squared(ours, recording.step_covariance)
 
     steps = numbers(rows, "dx_m", "dy_m", "dphi_rad")
-    turned = from_dataset(poses, axes)
+    turned = from_dataset(poses)
     error = between(turned[:-1], turned[1:]) - steps
     error[:, 2] = wrap_angle(error[:, 2])
     before = symmetric(numbers(rows, *TRIANGLE), 3)
@@ -76,13 +75,11 @@ def test_the_error_of_odometry(tmp_path: Path, recording: Recording, axes: Axes)
     error[:, :2] = np.einsum("nji,nj->ni", rotation(steps[:, 2]), error[:, :2])
     assert squared(error, at_end) == pytest.approx(expected, rel=1e-9)
     # Had the means alone been rotated, it would show.
-    if axes == "robotics":
-        assert abs(squared(error, recording.step_covariance) / expected - 1.0) > 0.01
+    assert abs(squared(error, recording.step_covariance) / expected - 1.0) > 0.01
 
 
-@pytest.mark.parametrize("axes", ["robotics", "dataset"])
-def test_the_error_of_discs(tmp_path: Path, recording: Recording, axes: Axes) -> None:
-    write_table(tmp_path / "d.csv", *disc_table(recording, axes))
+def test_the_error_of_discs(tmp_path: Path, recording: Recording) -> None:
+    write_table(tmp_path / "d.csv", *disc_table(recording))
     rows = rows_of(tmp_path / "d.csv")
     some = recording.circles
     known = some.ids >= 0
@@ -95,21 +92,19 @@ def test_the_error_of_discs(tmp_path: Path, recording: Recording, axes: Axes) ->
     ours = disc_in_robot(poses[some.frame[known] + 1], place[some.ids[known]]) - some.xy[known]
     expected = squared(ours, some.covariance[known])
 
-    turned, step = from_dataset(poses, axes), numbers(rows, "step")[:, 0].astype(int)
-    discs = from_dataset(place, axes)[numbers(rows, "id")[:, 0].astype(int)]
+    turned, step = from_dataset(poses), numbers(rows, "step")[:, 0].astype(int)
+    discs = from_dataset(place)[numbers(rows, "id")[:, 0].astype(int)]
     error = disc_in_robot(turned[step], discs) - numbers(rows, "x_m", "y_m")
     covariance = symmetric(numbers(rows, "cxx_m2", "cxy_m2", "cyy_m2"), 2)
     assert squared(error, covariance) == pytest.approx(expected, rel=1e-9)
-    if axes == "robotics":
-        assert abs(squared(error, some.covariance[known]) / expected - 1.0) > 0.01
+    assert abs(squared(error, some.covariance[known]) / expected - 1.0) > 0.01
 
 
-@pytest.mark.parametrize("axes", ["robotics", "dataset"])
-def test_the_bearings(tmp_path: Path, recording: Recording, axes: Axes) -> None:
+def test_the_bearings(tmp_path: Path, recording: Recording) -> None:
     camera_xy = np.array(read_camera(DEMO / "e.cam").robot_from_camera)[:2, 3]
     ids = ((3, 8), (), *recording.lines.ids[2:])
     recording = replace(recording, lines=replace(recording.lines, ids=ids))
-    write_table(tmp_path / "b.csv", *bearing_table(recording, camera_xy, axes))
+    write_table(tmp_path / "b.csv", *bearing_table(recording, camera_xy))
     rows = rows_of(tmp_path / "b.csv")
     some = recording.lines
     known = [0, *range(2, len(some))]
@@ -119,7 +114,7 @@ def test_the_bearings(tmp_path: Path, recording: Recording, axes: Axes) -> None:
     # A line in some place is seen under the same angle in both axes.
     pose, line = np.array([0.4, -1.0, 0.7]), np.array([2.0, 3.0])
     camera = numbers(rows, "camera_x_m", "camera_y_m")[0]
-    seen = disc_in_robot(from_dataset(pose, axes), from_dataset(line, axes)) - camera
-    angle = np.arctan2(seen[1], seen[0]) if axes == "robotics" else np.arctan2(seen[0], -seen[1])
+    seen = disc_in_robot(from_dataset(pose), from_dataset(line)) - camera
+    angle = np.arctan2(seen[1], seen[0])
     assert angle == pytest.approx(float(bearing_of_vertical(pose, line, camera_xy)), abs=1e-12)
     np.testing.assert_array_equal(numbers(rows, "bearing_rad")[:, 0], some.bearing_rad[known])

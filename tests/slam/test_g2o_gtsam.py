@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,10 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.landmarks import read_frames, wrap_angle
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between
-from redetect.slam.formats.g2o import RunGraph, graph_of_frames, write_g2o
+from redetect.slam.formats.g2o import RunGraph, graph_of_run, write_g2o
 from redetect.slam.formats.tables import odometry_table
 from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import disc_in_robot
@@ -27,15 +26,15 @@ DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"
 
 def estimates_with_error(file: Path) -> RunGraph:
     """A run with estimates that are off by more than the measurements."""
-    graph = graph_of_frames(list(read_frames(file)), "run")
+    graph = graph_of_run(read_recording(file))
     rng = np.random.default_rng(11)
-    poses = graph.path.poses + rng.normal(0.0, [0.01, 0.01, 0.02], graph.path.poses.shape)
+    poses = graph.poses + rng.normal(0.0, [0.01, 0.01, 0.02], graph.poses.shape)
     discs = graph.discs + rng.normal(0.0, 0.05, graph.discs.shape)
-    return replace(graph, path=replace(graph.path, poses=poses), discs=discs)
+    return graph._replace(poses=poses, discs=discs)
 
 
 def step_errors(graph: RunGraph) -> FloatArray:
-    error = between(graph.path.poses[:-1], graph.path.poses[1:]) - graph.recording.steps
+    error = between(graph.poses[:-1], graph.poses[1:]) - graph.recording.steps
     error[:, 2] = wrap_angle(error[:, 2])
     return error
 
@@ -44,7 +43,7 @@ def disc_errors(graph: RunGraph) -> FloatArray:
     place = dict(zip(graph.disc_ids.tolist(), graph.discs))
     discs = np.array([place[number] for number in graph.recording.circles.ids.tolist()])
     return np.asarray(
-        disc_in_robot(graph.path.poses[graph.recording.circles.frame + 1], discs)
+        disc_in_robot(graph.poses[graph.recording.circles.frame + 1], discs)
         - graph.recording.circles.xy
     )
 
@@ -58,7 +57,7 @@ def check(graph: RunGraph, file: Path) -> None:
     count = len(graph.recording.steps)
     assert factors.size() == count  # its reader leaves EDGE_SE2_XY out
     assert values.size() == count + 1 + len(graph.disc_ids)
-    for number, pose in enumerate(from_dataset(graph.path.poses, "robotics")):
+    for number, pose in enumerate(from_dataset(graph.poses)):
         read = values.atPose2(number)
         np.testing.assert_array_equal([read.x(), read.y()], pose[:2])
         assert wrap_angle(read.theta() - pose[2]) == pytest.approx(0.0, abs=1e-12)
@@ -112,11 +111,11 @@ def test_the_real_run(tmp_path: Path, shared_data: Path) -> None:
 def test_the_published_error_of_the_real_run(tmp_path: Path, shared_data: Path) -> None:
     """At the least-squares solution all of a file's edges give the published chi squared."""
     folder = shared_data / "dlr"
-    graph = graph_of_frames(list(read_frames(folder / "map.circles")), "real")
+    graph = graph_of_run(read_recording(folder / "map.circles"))
     table = np.loadtxt(folder / "least_squares_map.csv", delimiter=",")
     assert np.array_equal(table[:, 0].astype(int), graph.disc_ids)
     poses = np.loadtxt(folder / "least_squares_path.csv", delimiter=",")
-    solved = replace(graph, path=replace(graph.path, poses=poses), discs=table[:, 1:])
+    solved = graph._replace(poses=poses, discs=table[:, 1:])
     write_g2o(tmp_path / "e.g2o", solved)
     check(solved, tmp_path / "e.g2o")
     total = squared(step_errors(solved), solved.recording.step_covariance)
@@ -133,7 +132,7 @@ def test_the_documented_way_from_the_tables_to_factors(
     write_g2o(tmp_path / "e.g2o", graph)
     factors, values = gtsam.readG2o(str(tmp_path / "e.g2o"), False)
     (tmp_path / "TABLES").mkdir()
-    table = odometry_table(read_recording(DEMO), "robotics")
+    table = odometry_table(read_recording(DEMO))
     write_table(tmp_path / "TABLES" / "odometry.csv", *table, ["a comment"])
     program = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)

@@ -133,8 +133,6 @@ def test_without_gtsam_it_is_said_how_to_get_it(
     ("flags", "said"),
     [
         (["--loss-scale", "0"], "loss_scale is 0: expected above 0"),
-        (["--tilt-deg", "0.5"], "--row-errors recorded"),
-        (["--tilt-deg", "-1"], "tilt_deg is -1: expected 0 to 45"),
     ],
 )
 def test_impossible_settings_are_refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from redetect.landmarks.map_file import (
     Landmarks,
     covariance_file,
     no_landmarks,
-    read_joint_covariance,
-    write_joint_covariance,
+    read_map,
+    with_joint_covariance,
+    write_map,
 )
 from redetect.slam.commands.files import camera_of_run
 from redetect.slam.mapping.graph_terms import Weighting
@@ -56,14 +58,17 @@ def some() -> LandmarkMap:
 
 def test_file(tmp_path: Path, some: LandmarkMap) -> None:
     place = tmp_path / "map.csv"
-    assert read_joint_covariance(place, some) is None
+    assert with_joint_covariance(some, place) is some
     joint = 0.25 * np.eye(4)
     joint[0, 2] = joint[2, 0] = 0.1
-    write_joint_covariance(place, joint, overwrite=False)
+    jointly = replace(some, joint_covariance=joint)
+    write_map(place, jointly)
     assert covariance_file(place).name == "map_covariance.npy"
-    np.testing.assert_array_equal(read_joint_covariance(place, some), joint)
+    read = with_joint_covariance(read_map(place), place)
+    np.testing.assert_array_equal(read.joint_covariance, joint)
+    place.unlink()
     with pytest.raises(OutputExistsError):
-        write_joint_covariance(place, joint, overwrite=False)
+        write_map(place, jointly)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +87,7 @@ def test_files_of_another_map_are_refused(
     place = tmp_path / "map.csv"
     np.save(covariance_file(place), content)
     with pytest.raises(LandmarkFileError, match=message):
-        read_joint_covariance(place, some)
+        with_joint_covariance(some, place)
     covariance_file(place).write_bytes(b"no array")
     with pytest.raises(LandmarkFileError, match="cannot be read"):
-        read_joint_covariance(place, some)
+        with_joint_covariance(some, place)

@@ -124,11 +124,12 @@ def test_from_the_files_to_the_map(
     assert table["odometry"] / (3 * (FRAMES - 1)) == pytest.approx(1.0, abs=0.3)
     assert max(off(name) for name in ("map", "l", "ekf")) < 0.02
 
-    for form, name in (("g2o", "drive.g2o"), ("csv", "tables"), ("tum", "map.tum")):
-        output = ["-o", str(tmp_path / name), "--solution", str(tmp_path / "map")]
-        assert slam(["export", found, "--to", form, *output]) == 0
-    assert capsys.readouterr().err.count("steps state no covariance") == 5  # each but tum
+    for form, name in (("g2o", "drive.g2o"), ("csv", "tables")):
+        assert slam(["export", found, "--to", form, "-o", str(tmp_path / name)]) == 0
+    assert capsys.readouterr().err.count("steps state no covariance") == 5
+    times = ["--times", str(run / "detected.times"), "-o", str(tmp_path / "map.tum")]
+    assert slam(["export", str(tmp_path / "map" / "path.csv"), "--to", "tum", *times]) == 0
     exported = np.loadtxt(tmp_path / "map.tum")
     np.testing.assert_allclose(exported[:, 0], TIMES, atol=1e-6)
     path = read_path(tmp_path / "map" / "path.csv").poses
-    np.testing.assert_allclose(exported[:, 1:3], from_dataset(path, "robotics")[1:, :2])
+    np.testing.assert_allclose(exported[:, 1:3], from_dataset(path)[1:, :2])

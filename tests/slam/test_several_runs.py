@@ -10,7 +10,7 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import LineLandmark, squared_mahalanobis, write_frames
-from redetect.landmarks.map_file import read_joint_covariance, read_map, read_path
+from redetect.landmarks.map_file import read_map, read_path, with_joint_covariance
 from redetect.plane import apply, between, invert
 from redetect.slam.association.loops import Stretch
 from redetect.slam.association.placing import lay_together
@@ -28,7 +28,7 @@ PATHS = circuit(1.2, 5.0), circuit(2.0, 5.0)[70:]
 def write_run(file: Path, run: Recording, *, known: bool) -> str:
     """A run as a landmark file, with the simulation's identifiers or without."""
     rows = run.circles if known else replace(run.circles, ids=0 * run.circles.ids - 1)
-    frames = frames_of_discs(replace(run, circles=rows), np.ones(len(rows)))
+    frames = frames_of_discs(replace(run, circles=rows))
     lines = run.lines
     for k, bearing, ids in zip(lines.frame, lines.bearing_rad, lines.ids):
         line = LineLandmark(0.0, -1.0, 0.0, 1.0, float(bearing), 0.0, 0.0, LINE_SIGMA, ids)
@@ -48,7 +48,7 @@ def check_map(folder: Path, true_ids: dict[int, int]) -> None:
     true = disc_in_robot(PATHS[0][0], DISCS)[[true_ids[i] for i in found.ids.tolist()]]
     off = found.xy - true
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.15
-    joint = read_joint_covariance(folder / "map.csv", read_map(folder / "map.csv"))
+    joint = with_joint_covariance(read_map(folder / "map.csv"), folder / "map.csv").joint_covariance
     assert joint is not None
     squared = off.ravel() @ np.linalg.solve(joint, off.ravel())
     assert squared / off.size == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / off.size))

@@ -111,7 +111,7 @@ class MapStudy:
 def _plain_gtsam(kind: str, graph: Graph, start: Estimate) -> tuple[float, int]:
     """One of GTSAM's optimizers with its own default parameters: cost and number of steps."""
     gtsam = load_gtsam()
-    factors, values = gtsam_problem(graph, start, Weighting())
+    factors, values = gtsam_problem(graph, start)
     parameters: Any = getattr(gtsam, f"{kind}Params")()
     optimizer = getattr(gtsam, f"{kind}Optimizer")(factors, values, parameters)
     found = estimate_of_values(graph, optimizer.optimize(), start)

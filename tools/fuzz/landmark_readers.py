@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
-from redetect.landmarks.map_file import covariance_file, read_joint_covariance, read_map, read_path
+from redetect.landmarks.map_file import covariance_file, read_map, read_path, with_joint_covariance
 from redetect.landmarks.tilts import read_tilts
 from redetect.landmarks.times import read_times
 from redetect.slam.errors import SlamError
@@ -44,7 +44,7 @@ def _npy(array: object) -> bytes:
 def _joint(path: Path) -> object:
     map_file = path.parent / "map.csv"
     assert covariance_file(map_file).name == path.name
-    return read_joint_covariance(map_file, read_map(map_file))
+    return with_joint_covariance(read_map(map_file), map_file)
 
 
 _STEP = b"STEP e.0000  0.00088 -0.15647  0.01153 1e-5 0 1e-5 0 0 1e-4\n"
@@ -53,13 +53,12 @@ _LINE = b"LANDMARK_L 0.1 -0.2 0.1 0.3 0.02 0.001 0 0.002 -1\n"
 _MARKER = b"LANDMARK_M rawseeds 3 0.99" + b" 10 20 0.1 0 0.1" * 4 + b"\n"
 _SETTINGS = b"CIRCLEMARKDETECTOR e.cam nohalf 0.1 0.6\n"
 _IDENTITY_4 = "1 0 0 1 0 1"
-_G2O = f"""# AXES robotics
+_G2O = f"""# a comment
 VERTEX_SE2 0 0 0 0
 VERTEX_SE2 1 0.5 0 0.1
 VERTEX_XY 12 1 1
 EDGE_SE2 0 1 0.5 0 0.1 {_IDENTITY_4}
 EDGE_SE2_XY 1 12 0.5 1 4 0 4
-# FRAME 1 e.0000 0.5
 FIX 0
 """.encode()
 _MAP_HEAD = "kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n"
@@ -77,7 +76,7 @@ _RECORD_WORDS = (
     b"\r\n", *NUMBERS,
 )  # fmt: skip
 _G2O_WORDS = (
-    b"VERTEX_SE2 ", b"VERTEX_XY ", b"EDGE_SE2 ", b"EDGE_SE2_XY ", b"FIX ", b"# FRAME ", *NUMBERS,
+    b"VERTEX_SE2 ", b"VERTEX_XY ", b"EDGE_SE2 ", b"EDGE_SE2_XY ", b"FIX ", *NUMBERS,
 )  # fmt: skip
 _LANDMARK, _SLAM = (LandmarkError,), (SlamError,)
 
@@ -96,5 +95,5 @@ LANDMARK_READERS: tuple[Reader, ...] = (
            {"map.csv": _MAP_OF_ONE}, needed=False),
     Reader("g2o", "e.g2o", read_g2o, _SLAM, (_G2O,), _G2O_WORDS),
     Reader("tum", "e.tum", read_tum, _SLAM,
-           (b"# AXES robotics\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
+           (b"# a comment\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
 )  # fmt: skip

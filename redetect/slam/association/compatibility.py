@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -28,14 +27,6 @@ DEFAULT_GATE_PROBABILITY = 0.999
 MOST_NODES = 30_000
 
 
-class Pairing(NamedTuple):
-    """Rows and the landmarks they show."""
-
-    # (n,): index of each row's landmark, -1 where it shows none of them; none is there twice.
-    landmark: IntArray
-    complete: bool = True  # whether the search was finished: only then is no better pairing left
-
-
 def compatible(
     method: str,
     innovations: FloatArray,
@@ -44,7 +35,7 @@ def compatible(
     gate_probability: float = DEFAULT_GATE_PROBABILITY,
     *,
     most_nodes: int = MOST_NODES,
-) -> Pairing:
+) -> IntArray:
     """Which rows show which landmarks.
 
     Parameters
@@ -60,6 +51,11 @@ def compatible(
         Share of right pairs, or sets of pairs, that pass.
     most_nodes : int
         Bound of the joint search.
+
+    Returns
+    -------
+    (n,) int64
+        Index of each row's landmark, -1 where it shows none of them; none is there twice.
     """
     arrays = map(np.ascontiguousarray, (innovations, predicted_covariance, noise))
     innovations, predicted_covariance, noise = arrays
@@ -67,16 +63,15 @@ def compatible(
     squared = individual_distances(innovations, predicted_covariance, noise)
     gates = chi_squared_gates(gate_probability, width, n)
     if method == "nearest":
-        return Pairing(pair_nearest_first(squared, gates[1] if n else 0.0))
+        return pair_nearest_first(squared, gates[1] if n else 0.0)
     candidates = np.argsort(squared, axis=1, kind="stable")
     counts = np.sum(squared <= gates[1], axis=1) if n else np.zeros(0, np.int64)
     # Rows with few candidates first: they decide most.
     rows = np.argsort(counts, kind="stable")
     rows = rows[counts[rows] > 0]
-    landmark, _, nodes = search_jointly(
+    return search_jointly(
         innovations, predicted_covariance, noise, rows, candidates, counts, gates, most_nodes
     )
-    return Pairing(landmark, nodes < most_nodes)
 
 
 @cache
@@ -165,14 +160,14 @@ def search_jointly(
     counts: IntArray,
     gates: FloatArray,
     most_nodes: int,
-) -> tuple[IntArray, float, int]:
+) -> IntArray:
     """Depth-first branch and bound over all ways to give rows landmarks.
 
     Parameters are those of `compatible`, and the rows in the order in which they get
     landmarks, the first `counts` (n,) of `candidates` (n, m) of each, the joint gate of k pairs
     `gates[k]` (n + 1), and how many pairs may be tried.
 
-    Returns `partner` (n,), `squared distance`, `nodes`.
+    Returns (n,): the landmark of each row, -1 without.
     """
     n, m, width = innovations.shape
     depth = len(rows)
@@ -244,4 +239,4 @@ def search_jointly(
                 best[i] = partner[i]
         level += 1
         choice[level] = 0
-    return best, best_squared, nodes
+    return best

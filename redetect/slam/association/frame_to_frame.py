@@ -159,7 +159,6 @@ class LocalAssociation:
     # (n,): the landmark of each row, numbered from 0 in order of first sight.
     circle_labels: IntArray
     line_labels: IntArray
-    incomplete: int  # frames whose joint search was cut short
 
 
 def associate_locally(
@@ -178,7 +177,6 @@ def associate_locally(
     line_starts = np.searchsorted(lines.frame, np.arange(len(recording) + 1))
     local = LocalMap.empty()
     counts = [0, 0]
-    incomplete = 0
     lost = set(recording.lost.tolist())
     for frame in range(len(recording)):
         if frame in lost:
@@ -192,11 +190,10 @@ def associate_locally(
             some = slice(starts[frame], starts[frame + 1])
             if some.start < some.stop:
                 seen = _seen(circles, lines, some, is_line, setting)
-                local, labels[some], complete = _observed(local, frame, seen, counts, setting)
-                incomplete += not complete
+                local, labels[some] = _observed(local, frame, seen, counts, setting)
         if progress:
             progress(frame + 1)
-    return LocalAssociation(circle_labels, line_labels, incomplete)
+    return LocalAssociation(circle_labels, line_labels)
 
 
 class _Seen(NamedTuple):
@@ -222,7 +219,7 @@ def _seen(
 
 def _observed(
     local: LocalMap, frame: int, seen: _Seen, counts: list[int], setting: AssociateSettings
-) -> tuple[LocalMap, IntArray, bool]:
+) -> tuple[LocalMap, IntArray]:
     """The map after rows of one kind, and their labels; new landmarks raise `counts`."""
     width = seen.measured.shape[1]
     candidates = np.flatnonzero(local.is_line == seen.is_line)
@@ -236,11 +233,11 @@ def _observed(
         sway = setting.tilt_sigma_rad * tilt_jacobian(local.mean[candidates])
     all_sway = sway.reshape(-1, 2)
     predicted = local.covariance[np.ix_(index.ravel(), index.ravel())] + all_sway @ all_sway.T
-    pairing = compatible(
+    landmark = compatible(
         setting.method, innovations, predicted, seen.noise, setting.gate_probability
     )
-    rows, fresh = np.flatnonzero(pairing.landmark >= 0), np.flatnonzero(pairing.landmark < 0)
-    paired = pairing.landmark[rows]
+    rows, fresh = np.flatnonzero(landmark >= 0), np.flatnonzero(landmark < 0)
+    paired = landmark[rows]
     labels = np.empty(len(seen.measured), dtype=np.int64)
     labels[rows] = local.number[candidates[paired]]
     labels[fresh] = counts[seen.is_line] + np.arange(len(fresh))
@@ -250,7 +247,7 @@ def _observed(
             local, index[paired], innovations[rows, paired], seen.noise[rows], sway[paired]
         )
         local.last_frame[candidates[paired]] = frame
-    return _with_new(local, frame, seen, fresh, labels[fresh]), labels, pairing.complete
+    return _with_new(local, frame, seen, fresh, labels[fresh]), labels
 
 
 def _updated(

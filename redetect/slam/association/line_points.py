@@ -49,16 +49,13 @@ class Rays(NamedTuple):
     widest_rad: float  # half the field of view, below a right angle
 
 
-class Search(NamedTuple):
-    """How points are searched."""
-
-    widest_sigma: float  # of all rays (rad)
-    detected: float = 0.7  # probability that a vertical in view gives a row
-    gate: float = 3.0  # standard deviations within which a ray may be that row
-    window: int = 40  # frames before and after a crossing that are considered
-    least_score: float = 4.0  # of a point: log likelihood ratio of the rows with it to without
-
-
+# Probability that a vertical in view gives a row, and standard deviations within which a ray may be
+# that row.
+_DETECTED, _GATE = 0.7, 3.0
+# Frames before and after a crossing that are considered.
+_WINDOW = 40
+# Of a point: log likelihood ratio of the rows with it to without.
+_LEAST_SCORE = 4.0
 # Numbers of steps between frames whose rays are intersected.
 _GAPS = np.array([2, 4, 7, 11])
 # Least angle between two rays that are intersected, in standard deviations, and how far away.
@@ -111,7 +108,7 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
 
 @kernel()
 def _best_run(
-    point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, search: Search
+    point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, reach: float
 ) -> tuple[float, IntArray]:
     """The unbroken stretch of frames with the most evidence for a vertical at a point.
 
@@ -120,12 +117,11 @@ def _best_run(
     point is in the field of view, adds that of the probability to miss a vertical. Returns the sum
     over the stretch, and its rays.
     """
-    reach = search.gate * search.widest_sigma
     start, bearing, sigma = rays.start, rays.bearing, rays.sigma
-    first, last = max(0, frame - search.window), min(len(start) - 1, frame + search.window)
+    first, last = max(0, frame - _WINDOW), min(len(start) - 1, frame + _WINDOW)
     rows = np.full(last - first, -1, dtype=np.int64)
     widest = math.tan(rays.widest_rad)
-    missed = math.log(1.0 - search.detected)
+    missed = math.log(1.0 - _DETECTED)
     best, total = 0.0, 0.0
     best_first, best_last, began = first, first, first
     for f in range(first, last):
@@ -149,7 +145,7 @@ def _best_run(
                 end = middle
         while i < start[f + 1] and bearing[i] <= seen + reach:
             off = (seen - bearing[i]) / sigma[i]
-            if free[i] and abs(off) < search.gate and worth[i] - 0.5 * off * off > gained:
+            if free[i] and abs(off) < _GATE and worth[i] - 0.5 * off * off > gained:
                 gained, rows[f - first] = worth[i] - 0.5 * off * off, i
             i += 1
         if total <= 0.0:
@@ -188,15 +184,16 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
 
 @kernel()
 def take_points(
-    points: FloatArray, frames: IntArray, rays: Rays, search: Search
+    points: FloatArray, frames: IntArray, rays: Rays, reach: float
 ) -> tuple[IntArray, FloatArray]:
     """The best of all points with the rays that it takes, then the best by the other rays, ...
 
-    Takes `points` (k, 2), `frames` (k,); returns `labels` (n,), `found` (m, 2).
+    Takes `points` (k, 2), `frames` (k,), and how far off the widest gate lets a bearing be (rad);
+    returns `labels` (n,), `found` (m, 2).
     """
     # How much likelier a ray is from a vertical than from anywhere, as a logarithm.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)
-    worth = np.log(search.detected / (rays.sigma * _ROOT_TWO_PI * clutter))
+    worth = np.log(_DETECTED / (rays.sigma * _ROOT_TWO_PI * clutter))
     free = np.ones(len(rays.angle), dtype=np.bool_)
     labels = np.full(len(free), -1, dtype=np.int64)
     found = np.empty((len(free), 2))
@@ -204,22 +201,22 @@ def take_points(
     # Scores only fall as rows are assigned: a point still first when rescored is the best.
     waiting = [(0.0, 0) for _ in range(0)]
     for k in range(len(points)):
-        score, _ = _best_run(points[k], frames[k], rays, free, worth, search)
-        if score >= search.least_score:
+        score, _ = _best_run(points[k], frames[k], rays, free, worth, reach)
+        if score >= _LEAST_SCORE:
             waiting.append((-score, k))
     heapq.heapify(waiting)
     while len(waiting) > 0:
         k = heapq.heappop(waiting)[1]
         point = points[k]
-        score, used = _best_run(point, frames[k], rays, free, worth, search)
-        if score < search.least_score:
+        score, used = _best_run(point, frames[k], rays, free, worth, reach)
+        if score < _LEAST_SCORE:
             continue
         if len(waiting) > 0 and score < -waiting[0][0]:
             heapq.heappush(waiting, (-score, k))
             continue
         for _ in range(3):
             better = _meeting_point(rays, used, point)
-            improved, others = _best_run(better, frames[k], rays, free, worth, search)
+            improved, others = _best_run(better, frames[k], rays, free, worth, reach)
             if improved <= score:
                 break
             point, score, used = better, improved, others
@@ -338,8 +335,7 @@ def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
     Returns `labels` (n,), `points` (k, 2).
     """
     points, frames = _crossings(rays)
-    search = Search(widest_sigma=float(rays.sigma.max(initial=0.0)))
-    taken, found = take_points(points, frames, rays, search)
+    taken, found = take_points(points, frames, rays, _GATE * float(rays.sigma.max(initial=0.0)))
     labels = np.empty(len(taken), dtype=np.int64)
     labels[rays.row] = taken
     return labels, found

@@ -11,7 +11,7 @@ J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 4
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -231,9 +231,7 @@ def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
     return csr_array(seen @ seen.T)
 
 
-def find_matches(
-    stretches: list[Stretch], search: Search, progress: Callable[[str], None] | None = None
-) -> list[Match]:
+def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
     """All pairs of stretches that show one place more surely than by chance, the surest first.
 
     Landmarks that two stretches share already are left out; stretches that share three or more need
@@ -245,8 +243,6 @@ def find_matches(
     together = shared_landmarks(stretches)
     for k in range(0, len(stretches), search.later_step):
         later = stretches[k]
-        if progress:
-            progress(f"stretch {k + 1} of {len(stretches)}")
         shared = together[[k], :k].toarray()[0]
         gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
         apart = (gap >= STRETCH_FRAMES) & (shared < SHARED_BY_ONE_PLACE)

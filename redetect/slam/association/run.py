@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +84,6 @@ class RunAssociation:
     local_line_labels: IntArray
     matches: tuple[Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the path that goes with them; None without map level
-    incomplete_frames: int  # frames whose joint search was cut short
 
 
 def associate_run(
@@ -148,7 +146,6 @@ def associate_run(
         in_order(local.line_labels),
         matches,
         path,
-        local.incomplete,
     )
 
 
@@ -267,13 +264,9 @@ def _closed(
     path, xy = solved(path)
     matches: list[Match] = []
     for number in range(1, _MOST_ROUNDS + 1):
-        stretches = stretches_of(frames, labels, xy, len(recording))
-        found = consistent_matches(
-            find_matches(stretches, search, partial(_of_round, report, number)),
-            matches,
-            path,
-            recording.step_covariance,
-        )
+        report(f"loops, round {number}")
+        found = find_matches(stretches_of(frames, labels, xy, len(recording)), search)
+        found = consistent_matches(found, matches, path, recording.step_covariance)
         labels, matched = merge_labels(
             frames, labels, pairs_by_votes(match.pairs for match in found)
         )
@@ -296,10 +289,6 @@ def _closed(
 def _frames_of_labels(recording: Recording) -> IntArray:
     """(n,) frames of the rows of discs, or of lines where there are none."""
     return recording.circles.frame if len(recording.circles) else recording.lines.frame
-
-
-def _of_round(report: Progress, number: int, text: str) -> None:
-    report(f"round {number}: {text}")
 
 
 def _without_lines(recording: Recording) -> Recording:

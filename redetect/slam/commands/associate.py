@@ -61,7 +61,6 @@ def perform(options: Associate) -> int:
                 "noise": factor,
                 "seconds": round(seconds, 2),
                 "loop_matches": len(found.matches),
-                "incomplete_frames": found.incomplete_frames,
                 "scores": {
                     kind: {stage: asdict(score) for stage, score in stages.items()}
                     for kind, stages in scores.items()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,16 +18,13 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
-from redetect.slam.recording import UNKNOWN_ID, Recording, landmark_files
+from redetect.slam.recording import Recording, landmark_files
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
     *("frame", "prefix", "line", "id", "kind", "new_id", "x_m", "y_m"),
     *("from_own_m", "row_chi_squared", "chi_squared", "mended_chi_squared"),
 )
-# Keyword and numbers of a row before its identifiers.
-_WORDS_BEFORE_IDS = 7
-_WORD = re.compile(rb"\S+")
 
 
 def perform(options: Options) -> int:
@@ -62,7 +58,7 @@ def perform(options: Options) -> int:
 
 
 def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
-    """Rows of a file, those that contradict mended or left out; all other bytes as they were."""
+    """Rows of a file, those that contradict mended or left out; all others as they were."""
     new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
     disc = -1
     for row in rows:
@@ -70,22 +66,7 @@ def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]
         if not isinstance(row.record, CircleLandmark) or disc not in new_id:
             yield row
         elif apply == "mend":
-            yield _with_id(row, row.record, new_id[disc])
-
-
-def _with_id(row: Row, record: CircleLandmark, number: int) -> Row:
-    """A row whose first known identifier is another; the rest of its text remains."""
-    place = next(k for k, i in enumerate(record.ids) if i >= 0)
-    ids = (*record.ids[:place], number, *record.ids[place + 1 :])
-    if number == UNKNOWN_ID:
-        ids = (UNKNOWN_ID,)
-    changed = replace(record, ids=ids)
-    # Continuation lines may break a word; rows with them are laid out anew.
-    if row.source is None or b"\\" in row.source or len(ids) != len(record.ids):
-        return row.with_record(changed)
-    word = list(_WORD.finditer(row.source))[_WORDS_BEFORE_IDS + place]
-    source = row.source[: word.start()] + b"%d" % number + row.source[word.end() :]
-    return Row(changed, source, row.line)
+            yield row.with_record(replace(row.record, ids=(new_id[disc],)))
 
 
 def _table(recording: Recording, audit: Audit, rows: Iterable[Row]) -> list[list[object]]:

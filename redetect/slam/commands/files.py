@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -15,7 +16,6 @@ from camera import Camera, camera_in, read_camera
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
-from redetect.slam.models import OdometryNoise
 from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, landmark_files, read_recording
 from redetect.storage import OutputExistsError, demand_writable, write_bytes
@@ -27,17 +27,27 @@ def files_of(flags: RunFlags, run: Path) -> list[Path]:
     return landmark_files(run, circles=circles, lines=flags.lines, stem=flags.stem)
 
 
-def recordings_of(flags: RunFlags) -> list[Recording]:
-    """Read the rows of the runs that a command names; assumptions on their odometry are printed."""
+def read_runs(flags: RunFlags) -> list[Recording]:
+    """Read the rows of the runs that a command names."""
     circles = flags.circles or not flags.lines
-    recordings = [
+    return [
         read_recording(
             run, circles=circles, lines=flags.lines, stem=flags.stem, noise=flags.odometry_noise
         )
         for run in flags.runs
     ]
+
+
+def recordings_of(flags: RunFlags) -> list[Recording]:
+    """`read_runs`, and print what is assumed of their odometry."""
+    recordings = read_runs(flags)
     for recording in recordings:
-        print_assumed(recording.unstated_steps, len(recording), flags.odometry_noise)
+        if recording.unstated_steps:
+            print(
+                f"{recording.unstated_steps} of {len(recording)} steps state no covariance: taken "
+                f"for {flags.odometry_noise.sentence()} (--odometry-noise)",
+                file=sys.stderr,
+            )
     return recordings
 
 
@@ -45,16 +55,6 @@ def recording_of(flags: RunFlags) -> Recording:
     """`recordings_of` the one run that a command names."""
     (recording,) = recordings_of(flags)
     return recording
-
-
-def print_assumed(unstated: int, total: int, noise: OdometryNoise) -> None:
-    """Print the noise that was assumed of the steps that state none, if there are any."""
-    if unstated:
-        print(
-            f"{unstated} of {total} steps state no covariance: taken for {noise.sentence()} "
-            "(--odometry-noise)",
-            file=sys.stderr,
-        )
 
 
 def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
@@ -99,14 +99,12 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
 
 
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A command's flags as a JSON file has them."""
-    return {
-        name: json.loads(json.dumps(value, default=str))
-        for name, value in asdict(cast(Any, command)).items()
-        if name not in but
-    }
+    """A command's flags for a JSON file."""
+    flags: dict[str, Any] = asdict(cast(Any, command))
+    return {name: value for name, value in flags.items() if name not in but}
 
 
 def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write a summary."""
-    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode(), overwrite=overwrite)
+    """Write a summary; paths become text."""
+    text = json.dumps(content, indent=1, default=os.fspath) + "\n"
+    write_bytes(path, text.encode(), overwrite=overwrite)

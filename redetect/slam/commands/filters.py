@@ -17,10 +17,9 @@ from redetect.landmarks.map_file import (
     LandmarkMap,
     Path2D,
     covariance_file,
-    read_joint_covariance,
     read_map,
     read_path,
-    write_joint_covariance,
+    with_joint_covariance,
     write_map,
     write_path,
 )
@@ -57,7 +56,6 @@ class _Result(NamedTuple):
     title: str  # of the pictures
     figures: dict[str, Any]  # of its own, for the JSON file
     said: list[str]  # of its own, for the terminal
-    joint: FloatArray | None = None  # covariance of a map that it made
 
 
 def perform(command: Localize | Ekf) -> int:
@@ -105,37 +103,37 @@ def perform(command: Localize | Ekf) -> int:
     draw_map(output / MAP_PICTURE, result.landmark_map, run.path, reference=reference, **drawing)
     if reference is not None:
         draw_errors(output / ERROR_PICTURE, run.path, reference.poses, **drawing)
-    if result.joint is not None:
+    if isinstance(command, Ekf):
         write_map(output / MAP_NAME, result.landmark_map, head, overwrite=command.force)
-        write_joint_covariance(output / MAP_NAME, result.joint, overwrite=command.force)
     return 0
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
     landmark_map = read_map(command.map)
     map_errors = _map_errors(command)
-    joint, said = None, []
+    said = []
     if map_errors == "considered":
-        joint = read_joint_covariance(command.map, landmark_map)
-        if joint is None:
+        landmark_map = with_joint_covariance(landmark_map, command.map)
+        if landmark_map.joint_covariance is None:
             name = covariance_file(command.map).name
             said.append(f"errors of the map taken as independent: no {name}")
-    began = _now()
-    run = localized_run_of(command, recording, landmark_map, joint)
+    jointly = ", jointly" if landmark_map.joint_covariance is not None else ""
+    began = time.perf_counter()
+    run = localized_run_of(command, recording, landmark_map)
     return _Result(
         run,
         landmark_map,
         f"{command.run} in {command.map}",
         f"{command.run.name}: localised",
-        {"map_errors": map_errors if joint is None else f"{map_errors}, jointly"},
+        {"map_errors": map_errors + jointly},
         [*said, _time_line(began, len(recording))],
     )
 
 
 def localized_run_of(
-    command: Localize, recording: Recording, landmark_map: LandmarkMap, joint: FloatArray | None
+    command: Localize, recording: Recording, landmark_map: LandmarkMap
 ) -> FilterRun:
-    """What a command asks for: a run's rows localised in a map, whose joint covariance is `joint`.
+    """What a command asks for: a run's rows localised in a map.
 
     Raises `SlamError` if no row shows a landmark of the map, or a flag is out of its range.
     """
@@ -149,7 +147,6 @@ def localized_run_of(
         covariance,
         camera_xy_of(recording, command.run, command.camera),
         map_errors=_map_errors(command),
-        joint_covariance=joint,
     )
     associator = Associator(command.association, command.gate_probability)
     run = run_filter(recording, localizer, associator)
@@ -194,7 +191,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = camera_xy_of(recording, command.run, command.camera)
     ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
     associator = Associator(command.association, command.gate_probability)
-    began = _now()
+    began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
     time_line = _time_line(began, len(recording))
     landmark_map = ekf.landmark_map()
@@ -220,21 +217,12 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
         f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end",
         figures,
         [*said, time_line],
-        ekf.map_covariance(),
     )
 
 
-def _now() -> tuple[float, float]:
-    """Seconds on the clock, and of the processor."""
-    return time.perf_counter(), time.thread_time()
-
-
-def _time_line(began: tuple[float, float], steps: int) -> str:
-    seconds, working = (now - then for now, then in zip(_now(), began))
-    return (
-        f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s; of processor "
-        f"{working:.2f} s, {steps / working:.0f} steps/s"
-    )
+def _time_line(began: float, steps: int) -> str:
+    seconds = time.perf_counter() - began
+    return f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s"
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:

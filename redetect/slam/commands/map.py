@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -12,10 +11,7 @@ import numpy as np
 
 from redetect import slam
 from redetect.landmarks.map_file import (
-    LandmarkMap,
     covariance_file,
-    no_landmarks,
-    write_joint_covariance,
     write_map,
     write_path,
 )
@@ -37,16 +33,13 @@ from redetect.slam.mapping.run_map import (
     MappedRun,
     Mounting,
     as_json,
-    landmark_map,
     map_run,
-    path_of,
     table_lines,
 )
-from redetect.slam.mapping.solve import joint_covariance
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
-from redetect.storage.bounds import ABOVE_0, FINITE, demand, from_to
+from redetect.storage.bounds import ABOVE_0, FINITE, demand
 
 TABLE_NAME = "table.json"
 
@@ -73,14 +66,12 @@ def perform(command: Map) -> int:
     output.mkdir(parents=True, exist_ok=True)
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {slam.__version__}: {name}"]
-    final = landmark_map(mapped.graph, mapped.estimate, mapped.covariance)
-    path = path_of(recording, mapped.estimate, mapped.covariance)
-    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    final, path = mapped.landmarks, mapped.path
     few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
     if few:
-        joint = joint_covariance(mapped.graph, mapped.estimate, weighting_of(command))
-        write_joint_covariance(output / MAP_NAME, joint, overwrite=command.force)
-    else:
+        final = mapped.landmarks_jointly()
+    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    if not few:
         # One of another map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     ends = first_poses(runs)
@@ -94,13 +85,11 @@ def perform(command: Map) -> int:
             f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
             "localize` takes their errors to be independent"
         )
-    first = landmark_map(mapped.graph, mapped.start, None)
-    start = LandmarkMap(discs=first.discs, lines=no_landmarks())
     draw_map(
         output / MAP_PICTURE,
         final,
         path,
-        before=(start, path_of(recording, mapped.start, None)),
+        before=mapped.before,
         title=name,
         overwrite=command.force,
         interactive=command.interactive,
@@ -111,30 +100,23 @@ def perform(command: Map) -> int:
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     """The map of a run's rows that a command asks for."""
-    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0, tilt_deg=from_to(0.0, 45.0))
-    if command.tilt_deg and command.row_errors != "recorded":
-        raise SlamError("--tilt-deg compares rows as recorded: expected --row-errors recorded")
+    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0)
     camera = None
-    if command.calibrate or command.tilt_deg or len(recording.lines):
+    if command.calibrate or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
-    return map_run(
-        recording,
-        camera,
-        weighting_of(command),
-        start=command.start,
-        solver=command.solver,
-        name=str(command.run),
-    )
-
-
-def weighting_of(command: Map) -> Weighting:
-    """The terms of the sum of squares that a command asks for."""
-    return Weighting(
+    weighting = Weighting(
         loss=command.loss,
         loss_scale=command.loss_scale,
         calibrate=command.calibrate,
         row_errors=command.row_errors,
-        tilt_sigma_rad=math.radians(command.tilt_deg),
+    )
+    return map_run(
+        recording,
+        camera,
+        weighting,
+        start=command.start,
+        solver=command.solver,
+        name=str(command.run),
     )
 
 

@@ -138,7 +138,7 @@ def triangulate(
     bearing_rad: FloatArray,
     sigma_rad: FloatArray,
     camera_xy: FloatArray,
-    pose_covariance: FloatArray | None = None,
+    pose_covariance: FloatArray,
 ) -> FloatArray | None:
     """The most likely place of a line that bearings from several poses show.
 
@@ -158,13 +158,10 @@ def triangulate(
     for _ in range(_MOST_ITERATIONS):
         if np.any(np.sum((xy - origin) * ahead, axis=1) < _NEAREST_M):
             return None
-        by_pose, by_line = bearing_rows(poses, poses, xy, xy, camera_xy)
+        by_pose, by_line = bearing_jacobians(poses, xy, camera_xy)
+        by_poses = _by_all_poses(by_pose)
         error = wrap_angle(bearing_rad - bearing_of_vertical(poses, xy, camera_xy))
-        covariance = noise
-        if pose_covariance is not None:
-            by_poses = _by_all_poses(by_pose)
-            covariance = by_poses @ pose_covariance @ by_poses.T + noise
-        weighted = np.linalg.solve(covariance, by_line)
+        weighted = np.linalg.solve(by_poses @ pose_covariance @ by_poses.T + noise, by_line)
         normal = weighted.T @ by_line
         if np.linalg.det(normal) <= 1e-12 * np.trace(normal) ** 2:
             return None
@@ -183,24 +180,6 @@ def _by_all_poses(by_pose: FloatArray) -> FloatArray:
     return by_poses.reshape(count, 3 * count)
 
 
-def bearing_rows(
-    poses: FloatArray,
-    poses_at: FloatArray,
-    line_xy: FloatArray,
-    line_at: FloatArray,
-    camera_xy: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of one line's bearings by the poses and by its place.
-
-    Takes `poses, line_xy` (k, 3), (2,), `poses_at, line_at` (k, 3), (2,), `camera_xy` (2,); returns
-    `by_pose` (k, 3), `by_line` (k, 2).
-    """
-    _, by_line = bearing_jacobians(poses, line_xy, camera_xy)
-    offset = line_at - poses_at[:, :2]
-    by_heading = by_line[:, 0] * offset[:, 1] - by_line[:, 1] * offset[:, 0]
-    return np.column_stack([-by_line, by_heading]), by_line
-
-
 def start_line(
     poses: FloatArray,
     poses_at: FloatArray,
@@ -211,14 +190,16 @@ def start_line(
 ) -> LineStart | None:
     """Place a line by bearings from several poses.
 
-    Takes `poses, poses_at` (k, 3), `bearing_rad, sigma_rad` (k,), `camera_xy` (2,),
-    `pose_covariance` (3 k, 3 k).
+    Takes `poses` (k, 3), and those at which derivatives by the headings are evaluated, `poses_at`
+    (k, 3); `bearing_rad, sigma_rad` (k,), `camera_xy` (2,), `pose_covariance` (3 k, 3 k).
     """
     xy = triangulate(poses, bearing_rad, sigma_rad, camera_xy, pose_covariance)
     if xy is None:
         return None
-    by_pose, by_line = bearing_rows(poses, poses_at, xy, xy, camera_xy)
-    by_poses = _by_all_poses(by_pose / sigma_rad[:, None])
+    _, by_line = bearing_jacobians(poses, xy, camera_xy)
+    offset = xy - poses_at[:, :2]
+    by_heading = by_line[:, 0] * offset[:, 1] - by_line[:, 1] * offset[:, 0]
+    by_poses = _by_all_poses(np.column_stack([-by_line, by_heading]) / sigma_rad[:, None])
     error = wrap_angle(bearing_rad - bearing_of_vertical(poses, xy, camera_xy)) / sigma_rad
     both, upper = np.linalg.qr(by_line / sigma_rad[:, None], mode="complete")
     inverse = np.linalg.inv(upper[:2])

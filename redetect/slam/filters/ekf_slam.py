@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dgemm
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
@@ -28,16 +29,15 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
+    POSE_SIZE,
     Associator,
+    Filter,
     FilterRun,
     FrameRows,
     Innovation,
-    RowCount,
     innovation_of,
     run_filter,
 )
-from redetect.slam.filters.joint_covariance import POSE_SIZE, JointCovariance
-from redetect.slam.models import move, move_jacobians
 from redetect.slam.recording import UNKNOWN_ID, Recording
 
 JacobiansAt = Literal["first", "latest"]
@@ -47,9 +47,11 @@ JacobiansAt = Literal["first", "latest"]
 LARGEST_RANGE_SIGMA = 0.05
 
 _POSE = np.arange(POSE_SIZE)
+# By as many numbers the state grows; some too many cost less than moving its covariance often.
+_CHUNK = 64
 
 
-class EkfSlam:
+class EkfSlam(Filter):
     """The filter.
 
     Parameters
@@ -76,42 +78,15 @@ class EkfSlam:
         *,
         jacobians: JacobiansAt = "first",
     ) -> None:
-        spread = np.zeros((3, 3)) if start_covariance is None else np.asarray(start_covariance)
-        self.covariance = JointCovariance(spread)
-        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
-        self.disc_slots: dict[int, int] = {}
-        self.line_slots: dict[int, int] = {}
+        super().__init__(start, start_covariance, camera_xy, first_estimates=jacobians == "first")
         self.disc_rows: Counter[int] = Counter()
         self.line_rows: Counter[int] = Counter()
-        self.count = RowCount()
         self.frame = -1
-        self._state = np.array(start, dtype=np.float64)
-        # The same array unless Jacobians are evaluated elsewhere.
-        self._linearised = self._state.copy() if jacobians == "first" else self._state
         self._waiting = WaitingLines()
-
-    @property
-    def pose_covariance(self) -> FloatArray:
-        """(3, 3)."""
-        return self.block(_POSE)
-
-    @property
-    def state(self) -> FloatArray:
-        """The pose, then landmarks and kept poses, as the slots say: (n,)."""
-        return self._state[: self.covariance.size]
-
-    def block(self, index: IntArray) -> FloatArray:
-        """Rows and columns `index` of the state's covariance."""
-        return self.covariance.block(index)
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
-        at = self._linearised
-        pose = move(self._state[:POSE_SIZE], step)
-        by_pose, by_step = move_jacobians(self._state[:POSE_SIZE], step)
-        by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
-        self.covariance.move_pose(by_pose, by_step @ noise @ by_step.T)
-        self._state[:POSE_SIZE] = at[:POSE_SIZE] = pose
+        super().predict(step, noise)
         self.frame += 1
 
     def measure(self, rows: FrameRows) -> None:
@@ -156,16 +131,13 @@ class EkfSlam:
         self._give_up(self._waiting.forget())
 
     def landmark_map(self) -> LandmarkMap:
-        """The landmarks that are in the state, with their marginal covariances."""
+        """The landmarks that are in the state, with their covariances."""
+        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
         return LandmarkMap(
             discs=self._landmarks(self.disc_slots, self.disc_rows),
             lines=self._landmarks(self.line_slots, self.line_rows),
+            joint_covariance=self.block((slots[:, None] + np.arange(2)).ravel()),
         )
-
-    def map_covariance(self) -> FloatArray:
-        """Joint covariance of `landmark_map`: discs, then lines; (2 M, 2 M), m^2."""
-        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
-        return self.block((slots[:, None] + np.arange(2)).ravel())
 
     def _update(self, rows: FrameRows) -> None:
         """Use rows whose landmarks are in the state."""
@@ -177,14 +149,12 @@ class EkfSlam:
 
     def _apply(self, innovation: Innovation) -> None:
         """Update the state."""
-        error, jacobian, index, noise = innovation
-        projected = self.covariance.projected(index, jacobian)
-        change, squared = self.covariance.measure(
-            projected, jacobian @ projected[index] + noise, error
+        factor, last = self._whitened(innovation)
+        # P - K S K^T, in place.
+        self._covariance = dgemm(
+            -1.0, factor, factor, 1.0, self._covariance, trans_b=1, overwrite_c=1
         )
-        self._state[: len(change)] += change
-        self.count.innovation_squared += squared
-        self.count.innovation_numbers += len(error)
+        self._state += factor @ last
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
         pose, at = self._state, self._linearised
@@ -234,7 +204,7 @@ class EkfSlam:
         poses = self._state[index].reshape(-1, POSE_SIZE)
         if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
             return False
-        known = self.covariance.block(index)
+        known = self.block(index)
         poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
         start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
         if start is None:
@@ -260,13 +230,11 @@ class EkfSlam:
     def _keep_pose(self) -> int:
         """Put a copy of the pose into the state; returns where."""
         copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-        pose, at = self._state[:POSE_SIZE].copy(), self._linearised[:POSE_SIZE].copy()
+        pose, at = self._state[_POSE], self._linearised[_POSE]
         if not self._waiting.free_slots:
             return self._append(_POSE, copy, none, pose, at)
         slot = self._waiting.free_slots.pop()
-        self.covariance.replace(slot, _POSE, copy, none)
-        self._linearised[slot : slot + POSE_SIZE] = at
-        self._state[slot : slot + POSE_SIZE] = pose
+        self._put(slot, _POSE, copy, none, pose, at)
         return slot
 
     def _append(
@@ -277,25 +245,19 @@ class EkfSlam:
         value: FloatArray,
         linearised: FloatArray,
     ) -> int:
-        slot = self.covariance.append(index, jacobian, noise)
-        if self.covariance.size > len(self._state):
-            separate = self._linearised is not self._state
-            self._state = np.resize(self._state, 2 * self.covariance.size)
-            self._linearised = (
-                np.resize(self._linearised, len(self._state)) if separate else self._state
-            )
-        self._linearised[slot : slot + len(value)] = linearised
-        self._state[slot : slot + len(value)] = value
+        """`_put` numbers at the end of the state; returns where they begin."""
+        slot, self.size = self.size, self.size + len(value)
+        if self.size > len(self._state):
+            self._grow(_CHUNK)
+        self._put(slot, index, jacobian, noise, value, linearised)
         return slot
 
     def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
-        place = np.array(list(slots.values()), dtype=np.int64)
+        places = np.array(list(slots.values()), dtype=np.int64)[:, None] + np.arange(2)
         return Landmarks(
             ids=np.array(list(slots), dtype=np.int64),
-            xy=np.stack([self._state[place], self._state[place + 1]], axis=-1),
-            covariance=np.array([self.block(slot + np.arange(2)) for slot in place]).reshape(
-                -1, 2, 2
-            ),
+            xy=self._state[places],
+            covariance=self._covariance[places[:, :, None], places[:, None, :]],
             rows=np.array([rows[number] for number in slots], dtype=np.int64),
         )
 

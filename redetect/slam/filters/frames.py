@@ -6,13 +6,15 @@ each other, each frame for itself, by `redetect.slam.association.compatibility`.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
@@ -25,7 +27,13 @@ from redetect.slam.association.compatibility import (
     individual_distances,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_jacobians, bearing_of_vertical, disc_in_robot
+from redetect.slam.models import (
+    bearing_jacobians,
+    bearing_of_vertical,
+    disc_in_robot,
+    move,
+    move_jacobians,
+)
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 NO_CAMERA = np.zeros(2)
@@ -152,30 +160,130 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
         )
 
 
-class Filter(Protocol):
-    """A filter that is taken through a run."""
+POSE_SIZE = 3
+_POSE = np.arange(POSE_SIZE)
 
-    disc_slots: dict[int, int]
-    line_slots: dict[int, int]
-    camera_xy: FloatArray
-    count: RowCount
+
+class Filter(ABC):
+    """The pose and landmarks of a robot with their joint covariance, to be taken through a run.
+
+    Parameters
+    ----------
+    start : (3,) array_like
+        Pose at the start (m, m, rad).
+    start_covariance : (3, 3) array_like or None
+        Its covariance; none if the start defines the map.
+    camera_xy : (2,) array_like
+        The camera's centre in the robot frame (m); only lines need it.
+    first_estimates : bool
+        Whether derivatives are evaluated at the poses as predicted and at the first estimates of
+        landmarks, or at the latest ones.
+
+    Attributes
+    ----------
+    disc_slots, line_slots : dict of int to int
+        Where in the state landmarks begin, by their identifiers.
+    count : RowCount
+    size : int
+        How many numbers the state has.
+    """
+
+    def __init__(
+        self,
+        start: ArrayLike,
+        start_covariance: ArrayLike | None,
+        camera_xy: ArrayLike,
+        *,
+        first_estimates: bool,
+    ) -> None:
+        self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        self.disc_slots: dict[int, int] = {}
+        self.line_slots: dict[int, int] = {}
+        self.count = RowCount()
+        self.size = POSE_SIZE
+        self._state = np.array(start, dtype=np.float64)
+        # The same array unless derivatives are evaluated elsewhere.
+        self._linearised = self._state.copy() if first_estimates else self._state
+        self._covariance = np.zeros((POSE_SIZE, POSE_SIZE))
+        if start_covariance is not None:
+            self._covariance += np.asarray(start_covariance, dtype=np.float64)
 
     @property
     def state(self) -> FloatArray:
-        """The pose, then landmarks, as the slots say."""
+        """The pose, then landmarks, as the slots say: (n,)."""
+        return self._state[: self.size]
 
     @property
     def pose_covariance(self) -> FloatArray:
         """(3, 3)."""
+        return self.block(_POSE)
 
     def block(self, index: IntArray) -> FloatArray:
-        """Rows and columns of the state's covariance."""
+        """Rows and columns `index` of the state's covariance."""
+        return np.asarray(self._covariance[np.ix_(index, index)])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """The robot moves by an odometry step (3,), of covariance (3, 3)."""
+        at = self._linearised
+        pose = move(self._state[_POSE], step)
+        by_pose, by_step = move_jacobians(self._state[_POSE], step)
+        by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
+        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose, pose)
 
+    @abstractmethod
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame."""
+
+    def _whitened(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+        """The state's covariance with an innovation (n, m), and the innovation (m,), both whitened.
+
+        That is, over a root of the innovation's covariance; `SlamError` where there is none.
+        """
+        error, jacobian, index, noise = innovation
+        projected = self._covariance[:, index] @ jacobian.T
+        try:
+            root = np.linalg.cholesky(jacobian @ projected[index] + noise)
+        except np.linalg.LinAlgError:
+            raise SlamError(
+                "the covariance of the innovation is not positive definite: rows or steps with "
+                "covariances that contradict each other"
+            ) from None
+        both = dtrtrs(root, np.vstack([projected, error]).T, lower=1)[0].T
+        self.count.innovation_squared += float(both[-1] @ both[-1])
+        self.count.innovation_numbers += len(error)
+        return both[:-1], both[-1]
+
+    def _grow(self, count: int) -> None:
+        """Lengthen the arrays by some numbers, 0 so far. BLAS has matrices by columns."""
+        separate, before = self._linearised is not self._state, len(self._state)
+        self._state = np.pad(self._state, (0, count))
+        self._linearised = np.pad(self._linearised, (0, count)) if separate else self._state
+        covariance = np.zeros((before + count, before + count), order="F")
+        covariance[:before, :before] = self._covariance
+        self._covariance = covariance
+
+    def _put(
+        self,
+        slot: int,
+        index: IntArray,
+        jacobian: FloatArray,
+        noise: FloatArray,
+        value: FloatArray,
+        linearised: FloatArray,
+    ) -> None:
+        """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
+
+        Takes where the others are, `index` (k,), its derivative by them, `jacobian` (d, k), and the
+        measurement's covariance, `noise` (d, d).
+        """
+        own = slice(slot, slot + len(value))
+        columns = self._covariance[:, index] @ jacobian.T
+        spread = jacobian @ columns[index] + noise
+        columns[own] = 0.5 * (spread + spread.T)
+        self._covariance[:, own] = columns
+        self._covariance[own] = columns.T
+        self._linearised[own] = linearised
+        self._state[own] = value
 
 
 Association = Literal["known", "nearest", "joint"]
@@ -217,7 +325,7 @@ class Associator:
             seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
             spread = jacobian @ estimate.block(index) @ jacobian.T
             innovation = rows.xy[:, None] - seen.reshape(-1, 2)
-            landmark, _ = compatible(
+            landmark = compatible(
                 self.method, innovation, spread, rows.covariance, self.gate_probability
             )
             found[landmark >= 0] = names[landmark[landmark >= 0]]
@@ -241,10 +349,10 @@ class Associator:
         innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
         spread = jacobian @ estimate.block(index) @ jacobian.T
         noise = rows.sigma_rad[:, None, None] ** 2
-        pairing = compatible(
+        landmark = compatible(
             self.method, innovation[:, :, None], spread, noise, self.gate_probability
         )
-        return tuple((int(names[j]),) if j >= 0 else () for j in pairing.landmark)
+        return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
 
 def run_filter(
@@ -294,14 +402,3 @@ def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArr
     reach = np.sqrt(spread[0, 0] + spread[1, 1]) + np.sqrt(spread[2, 2]) * np.hypot(*seen_xy.T)
     near = np.any(away < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
     return names[near], slots[near]
-
-
-def innovation_root(covariance: FloatArray) -> FloatArray:
-    """Cholesky factor of an innovation's covariance; `SlamError` where there is none."""
-    try:
-        return np.asarray(np.linalg.cholesky(covariance))
-    except np.linalg.LinAlgError:
-        raise SlamError(
-            "the covariance of the innovation is not positive definite: rows or steps with "
-            "covariances that contradict each other"
-        ) from None

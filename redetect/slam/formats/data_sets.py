@@ -15,8 +15,8 @@ algorithm for real-time implementation", IEEE Transactions on Robotics and Autom
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,13 +24,12 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import Frame
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import finite, text_rows, to_dataset
+from redetect.slam.formats.text import finite, rows_of_words, to_dataset
 from redetect.slam.models import chain_steps
-from redetect.slam.recording import CircleRows, LineRows, Recording, frames_of_discs
+from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -48,32 +47,9 @@ _SAME_M, _BEHIND_M = 0.5, 1.5
 _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class RangeBearing:
-    """A run."""
-
-    times: FloatArray  # (N,): of the frames (s), ascending
-    # (N, 3): movements before each frame in the data set's axes: dx, dy (m), dphi (rad).
-    steps: FloatArray
-    frame: IntArray  # (n,): the frame of each measurement, ascending
-    # (n,): from the origin of the robot frame; 0 forward, positive to the left.
-    range_m: FloatArray
-    bearing_rad: FloatArray
-    ids: IntArray  # (n,): the landmark; -1 where it is not known
-
-    @property
-    def prefixes(self) -> tuple[str, ...]:
-        """Names of the frames: their times."""
-        return tuple(f"{time:.3f}" for time in self.times)
-
-
-def frames_of(run: RangeBearing, sigma_m: float, sigma_rad: float) -> list[Frame]:
-    """The run as frames, whose steps state no covariance; landmarks as discs."""
-    xy, covariance = discs_of_ranges(run.range_m, run.bearing_rad, sigma_m, sigma_rad)
-    unstated = np.zeros((len(run.steps), 3, 3))
-    rows = CircleRows(run.frame, xy, covariance, run.ids)
-    recording = Recording(run.prefixes, run.steps, unstated, rows, LineRows.of())
-    return frames_of_discs(recording, np.ones(len(xy)))
+def _names(times: FloatArray) -> tuple[str, ...]:
+    """Names of frames: their times (s)."""
+    return tuple(f"{time:.3f}" for time in times)
 
 
 def discs_of_ranges(
@@ -110,9 +86,18 @@ def _steps_between(
     return between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
 
 
-def read_robot(odometry: Path) -> RangeBearing:
-    """What a robot logged; other robots that it saw are left out."""
-    velocity = _table(odometry, ("time", "v", "omega"))
+class _Seen(NamedTuple):
+    """Landmarks that a robot saw."""
+
+    times: FloatArray  # (N,): of the frames (s), ascending
+    frame: IntArray  # (n,): the frame of each measurement, ascending
+    range_m: FloatArray  # (n,): from the origin of the robot frame
+    bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
+    ids: IntArray  # (n,): the landmark
+
+
+def _seen_by_robot(odometry: Path) -> _Seen:
+    """The measurements beside a robot's odometry; other robots that it saw are left out."""
     seen = _table(_beside(odometry, MEASUREMENTS), ("time", "barcode", "range", "bearing"))
     barcodes = _table(odometry.with_name(BARCODES), ("subject", "barcode"))
     subject = {int(barcode): int(number) for number, barcode in barcodes}
@@ -120,29 +105,38 @@ def read_robot(odometry: Path) -> RangeBearing:
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
-    if len(times) == 0 or len(velocity) == 0:
+    return _Seen(times, frame, seen[order, 2], seen[order, 3], ids[order])
+
+
+def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
+    """What a robot logged, its landmarks as discs; steps state no covariance.
+
+    Takes the standard deviations of ranges and bearings.
+    """
+    velocity, seen = _table(odometry, ("time", "v", "omega")), _seen_by_robot(odometry)
+    if len(seen.times) == 0 or len(velocity) == 0:
         raise SlamError(f"{odometry}: no odometry, or no landmark seen: expected both")
-    return RangeBearing(
-        times=times,
-        steps=to_dataset(_velocity_steps(velocity, times), "robotics"),
-        frame=frame,
-        range_m=seen[order, 2],
-        bearing_rad=seen[order, 3],
-        ids=ids[order],
-    )
+    steps = _velocity_steps(velocity, seen.times)
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad)
+    return _run(seen.times, steps, CircleRows(seen.frame, *rows, seen.ids))
+
+
+def _run(times: FloatArray, steps: FloatArray, rows: CircleRows) -> Recording:
+    """A run of movements (N, 3), X forward, before frames at some times (N,)."""
+    unstated = np.zeros((len(steps), 3, 3))
+    return Recording(_names(times), to_dataset(steps), unstated, rows, LineRows.of())
 
 
 def read_truth(odometry: Path) -> Path2D:
     """True poses of a robot at the times of its frames, and first that at the start."""
-    run = read_robot(odometry)
+    times, logged = _seen_by_robot(odometry).times, _table(odometry, ("time", "v", "omega"))
     truth = _table(_beside(odometry, TRUTH), ("time", "x", "y", "theta"))
-    if len(truth) == 0:
-        raise SlamError(f"{odometry}: no true pose beside it: expected some")
-    begin = _table(odometry, ("time", "v", "omega"))[0, 0]
-    at = np.concatenate([[min(begin, run.times[0])], run.times])
+    if min(len(truth), len(times), len(logged)) == 0:
+        raise SlamError(f"{odometry}: no odometry, landmark seen or true pose: expected some")
+    at = np.concatenate([[min(logged[0, 0], times[0])], times])
     columns = (truth[:, 1], truth[:, 2], np.unwrap(truth[:, 3]))
     poses = np.stack([np.interp(at, truth[:, 0], column) for column in columns], axis=1)
-    return Path2D(("start", *run.prefixes), to_dataset(poses, "robotics"))
+    return Path2D(("start", *_names(times)), to_dataset(poses))
 
 
 def read_landmarks(path: Path) -> LandmarkMap:
@@ -152,7 +146,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    xy = to_dataset(table[:, 1:3], "robotics")
+    xy = to_dataset(table[:, 1:3])
     return LandmarkMap(
         Landmarks(table[:, 0].astype(np.int64), xy, covariance, count), no_landmarks()
     )
@@ -178,18 +172,15 @@ def _beside(odometry: Path, ending: str) -> Path:
 def _table(path: Path, names: tuple[str, ...]) -> FloatArray:
     """The numbers of a file, sorted by the first column as they come."""
     rows = []
-    for line, text in text_rows(path):
-        if text.startswith("#"):
-            continue
-        words = text.split()
+    for line, words in rows_of_words(path):
         if len(words) != len(names):
             raise SlamError(f"{path}:{line}: {len(words)} numbers: expected {', '.join(names)}")
         rows.append([finite(path, line, name, word) for name, word in zip(names, words)])
     return np.array(rows, dtype=np.float64).reshape(-1, len(names))
 
 
-def read_drive(drive: Path) -> RangeBearing:
-    """What the car logged, with the trees found in its scans."""
+def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
+    """What the car logged, the trees found in its scans as discs; see `read_robot`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
@@ -199,14 +190,10 @@ def read_drive(drive: Path) -> RangeBearing:
     times, scans = scanned[usable] / 1000.0, laser[usable] / 100.0
     found = [trees_of(scan) for scan in scans]
     trees = np.concatenate([np.zeros((0, 2)), *found])
-    return RangeBearing(
-        times=times,
-        steps=to_dataset(_car_steps(time / 1000.0, speed, steering, times), "robotics"),
-        frame=np.repeat(np.arange(len(found)), [len(some) for some in found]),
-        range_m=trees[:, 0],
-        bearing_rad=trees[:, 1],
-        ids=np.full(len(trees), -1),
-    )
+    frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
+    rows = discs_of_ranges(trees[:, 0], trees[:, 1], sigma_m, sigma_rad)
+    steps = _car_steps(time / 1000.0, speed, steering, times)
+    return _run(times, steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
 
 
 def trees_of(scan: FloatArray) -> FloatArray:

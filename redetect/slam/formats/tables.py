@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.slam.formats.g2o import in_turned_axes
-from redetect.slam.formats.text import Axes, covariance_from_dataset, from_dataset
+from redetect.slam.formats.text import covariance_from_dataset, from_dataset
 from redetect.slam.recording import Recording
 
 _TRIANGLE_3 = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi_rad2")
@@ -37,10 +37,10 @@ class Table(NamedTuple):
     rows: list[tuple[Any, ...]]
 
 
-def odometry_table(recording: Recording, axes: Axes) -> Table:
+def odometry_table(recording: Recording) -> Table:
     """A run's steps."""
-    steps = from_dataset(recording.steps, axes)
-    before = covariance_from_dataset(recording.step_covariance, axes)
+    steps = from_dataset(recording.steps)
+    before = covariance_from_dataset(recording.step_covariance)
     after = in_turned_axes(before, steps[:, 2])
     triangles = [spread[:, *np.triu_indices(3)] for spread in (before, after)]
     numbers = np.concatenate([steps, *triangles], axis=1).tolist()
@@ -50,11 +50,11 @@ def odometry_table(recording: Recording, axes: Axes) -> Table:
     return Table(ODOMETRY_COLUMNS, rows)
 
 
-def disc_table(recording: Recording, axes: Axes) -> Table:
+def disc_table(recording: Recording) -> Table:
     """The measurements of discs that have an identifier."""
     some = recording.circles
-    covariance = covariance_from_dataset(some.covariance, axes)[:, *np.triu_indices(2)]
-    numbers = np.concatenate([from_dataset(some.xy, axes), covariance], axis=1).tolist()
+    covariance = covariance_from_dataset(some.covariance)[:, *np.triu_indices(2)]
+    numbers = np.concatenate([from_dataset(some.xy), covariance], axis=1).tolist()
     rows = [
         (some.frame[k] + 1, recording.prefixes[some.frame[k]], some.ids[k], *numbers[k])
         for k in np.flatnonzero(some.identified)
@@ -62,10 +62,10 @@ def disc_table(recording: Recording, axes: Axes) -> Table:
     return Table(DISC_COLUMNS, rows)
 
 
-def bearing_table(recording: Recording, camera_xy: ArrayLike, axes: Axes) -> Table:
+def bearing_table(recording: Recording, camera_xy: ArrayLike) -> Table:
     """The bearings of verticals that have identifiers, from the camera's place (2,)."""
     some = recording.lines
-    camera = from_dataset(camera_xy, axes).tolist()
+    camera = from_dataset(camera_xy).tolist()
     rows = [
         (
             *(some.frame[k] + 1, recording.prefixes[some.frame[k]]),

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterable, Iterator
 from typing import Literal
 
@@ -29,7 +28,7 @@ from redetect.storage.bounded import read_content
 
 Axes = Literal["robotics", "dataset"]
 
-#: What each kind of axes means, for the heads of files.
+#: What each kind of axes means.
 MEANING: dict[str, str] = {
     "robotics": "X forward, Y left",
     "dataset": "X left, Y backward",
@@ -41,7 +40,7 @@ _ORDER = np.array([1, 0, 2])
 _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
-def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
+def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = False) -> FloatArray:
     """Vectors, poses or steps in the data set's axes, brought into others, or `back`.
 
     Takes (..., 2) or (..., 3): x, y and, of poses and steps, the angle; returns the same shape.
@@ -53,12 +52,14 @@ def from_dataset(values: ArrayLike, axes: Axes, *, back: bool = False) -> FloatA
     return np.asarray(old[..., order] * sign)
 
 
-def to_dataset(values: ArrayLike, axes: Axes) -> FloatArray:
+def to_dataset(values: ArrayLike) -> FloatArray:
     """Undo `from_dataset`."""
-    return from_dataset(values, axes, back=True)
+    return from_dataset(values, back=True)
 
 
-def covariance_from_dataset(covariance: ArrayLike, axes: Axes, *, back: bool = False) -> FloatArray:
+def covariance_from_dataset(
+    covariance: ArrayLike, axes: Axes = "robotics", *, back: bool = False
+) -> FloatArray:
     """Covariances (or information matrices) (..., d, d) of what `from_dataset` turns, turned."""
     old = np.array(covariance, dtype=np.float64)
     if axes == "dataset":
@@ -72,16 +73,7 @@ def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
     return order, (_SIGNS[order] if back else _SIGNS[:size])
 
 
-#: Begins the comment that says which axes a file is in.
-AXES_COMMENT = "# AXES"
-
-#: The largest number of a vertex: other tools keep it in 31 bits.
-LARGEST_NUMBER = 2**31 - 1
-
 _LARGEST_FILE_BYTES = 1 << 28
-# Narrower than `float` and `int`, which also take nan, infinity and 1_000.
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
-_WHOLE = re.compile(r"[0-9]{1,10}", re.ASCII)
 
 
 def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
@@ -90,40 +82,21 @@ def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: 
     write_bytes(path, content, overwrite=overwrite)
 
 
-def text_rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
-    """Rows of a text file with their line numbers, without blank ones; comments are among them."""
+def rows_of_words(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
+    """The words of a text file's rows with their line numbers, without comments and blank rows."""
     content = read_content(path, _LARGEST_FILE_BYTES, "file", SlamError)
     for number, source in enumerate(content.split(b"\n"), 1):
-        text = source.decode("utf-8", "surrogateescape").strip()
-        if text:
-            yield number, text
+        words = source.decode("utf-8", "surrogateescape").split()
+        if words and not words[0].startswith("#"):
+            yield number, words
 
 
 def finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
     """A word as a finite number; `SlamError` where it is none."""
-    value = float(word) if len(word) <= 400 and _NUMBER.fullmatch(word) else math.nan
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
     if not math.isfinite(value):
         raise SlamError(f"{path}:{line}: {name} is {word[:30]!a}: expected a finite number")
     return value
-
-
-def whole(path: str | os.PathLike[str], line: int, name: str, word: str) -> int:
-    """A word as the number of a vertex; `SlamError` where it is none."""
-    value = int(word) if _WHOLE.fullmatch(word) else LARGEST_NUMBER + 1
-    if value > LARGEST_NUMBER:
-        raise SlamError(
-            f"{path}:{line}: {name} is {word[:30]!a}: expected a whole number of 0 to "
-            f"{LARGEST_NUMBER}"
-        )
-    return value
-
-
-def demand_axes(path: str | os.PathLike[str], line: int, comment: str, axes: Axes) -> None:
-    """Refuse a file whose comment says that it is in other axes than those requested."""
-    if comment.startswith(AXES_COMMENT + " "):
-        said = (comment[len(AXES_COMMENT) :].split() or [""])[0]
-        if said != axes:
-            raise SlamError(
-                f"{path}:{line}: the file's axes are {said[:20]!a}: expected {axes}, or --axes to "
-                "name them"
-            )

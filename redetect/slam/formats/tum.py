@@ -1,7 +1,7 @@
-"""Paths as TUM trajectories: a row ``t x y z qx qy qz qw`` for each pose.
+"""Paths as TUM trajectories: a row ``t x y z qx qy qz qw`` for each pose; X forward, Y left.
 
 Comments begin with ``#``. A path on the floor has z, qx and qy 0. Of a run without times t is the
-number of the step, 0 for the start. Files of times have rows ``name t``.
+number of the step, 0 for the start.
 """
 
 from __future__ import annotations
@@ -14,17 +14,7 @@ import numpy as np
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import (
-    AXES_COMMENT,
-    MEANING,
-    Axes,
-    demand_axes,
-    finite,
-    from_dataset,
-    text_rows,
-    to_dataset,
-    write_text,
-)
+from redetect.slam.formats.text import finite, from_dataset, rows_of_words, to_dataset, write_text
 
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 # How far a pose may lie off the floor (m; quaternion) and still be a pose on it.
@@ -37,17 +27,12 @@ def write_tum(
     poses: Path2D,
     *,
     times: Mapping[str, float] | None = None,
-    axes: Axes = "robotics",
     comments: Sequence[str] = (),
     overwrite: bool = False,
 ) -> None:
     """Write a path as a TUM trajectory."""
-    rows = [
-        *(f"# {comment}" for comment in comments),
-        f"{AXES_COMMENT} {axes} ({MEANING[axes]})",
-        f"# {' '.join(_COLUMNS)}",
-    ]
-    numbers = (from_dataset(poses.poses, axes) + 0.0).tolist()
+    rows = [f"# {comment}" for comment in (*comments, " ".join(_COLUMNS))]
+    numbers = (from_dataset(poses.poses) + 0.0).tolist()
     for number, (name, (x, y, theta)) in enumerate(zip(poses.prefixes, numbers)):
         half, t = 0.5 * theta, str(number)
         if times is not None:
@@ -58,20 +43,16 @@ def write_tum(
     write_text(path, rows, overwrite=overwrite)
 
 
-def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D:
+def read_tum(path: str | os.PathLike[str]) -> Path2D:
     """Read a TUM trajectory of a path on the floor; the result is in the data set's axes.
 
     Angles are in [-pi, pi). The first pose is called ``start``, the others by their time as it is
-    written. Raises `SlamError` if the file cannot be read, is not a path on the floor, its times do
-    not ascend, or it says that its axes are others; the message names file and line.
+    written. Raises `SlamError` if the file cannot be read, is not a path on the floor, or its times
+    do not ascend; the message names file and line.
     """
     prefixes: list[str] = []
     numbers: list[list[float]] = []
-    for line, text in text_rows(path):
-        if text.startswith("#"):
-            demand_axes(path, line, text, axes)
-            continue
-        words = text.split()
+    for line, words in rows_of_words(path):
         if len(words) != len(_COLUMNS):
             raise SlamError(
                 f"{path}:{line}: {len(words)} values: expected {len(_COLUMNS)}: "
@@ -91,5 +72,5 @@ def read_tum(path: str | os.PathLike[str], *, axes: Axes = "robotics") -> Path2D
         raise SlamError(f"{path}: no poses: expected rows of {' '.join(_COLUMNS)}")
     table = np.array(numbers, dtype=np.float64)
     theta = wrap_angle(2.0 * np.arctan2(table[:, 6], table[:, 7]))
-    poses = to_dataset(np.column_stack([table[:, 1:3], theta]), axes) + 0.0  # no -0.0
+    poses = to_dataset(np.column_stack([table[:, 1:3], theta])) + 0.0  # no -0.0
     return Path2D(tuple(prefixes), poses)

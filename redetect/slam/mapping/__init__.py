@@ -2,5 +2,5 @@
 
 `run_map` is the way from rows to a map: `graph` holds the measurements and unknowns, `graph_terms`
 their whitened errors and Jacobians, `initial_lines` the start of lines, `solve` (or `solve_gtsam`)
-the minimum and its covariances, `chi_squared` the table of the data set's report.
+the minimum and its covariances. `audit` finds mistaken identifiers.
 """

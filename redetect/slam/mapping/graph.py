@@ -44,7 +44,7 @@ class Graph:
     member_row: IntArray
     member_line: IntArray
     camera_xy: FloatArray  # (2,): where in the robot frame bearings are taken from (m)
-    camera: Camera | None = None  # as calibrated; needed where the mounting or a tilt is estimated
+    camera: Camera | None = None  # as calibrated; needed where the mounting is estimated
     # (K, 2): where lines are believed to be (m), which bounds those that bearings leave open.
     line_prior: FloatArray | None = None
 
@@ -68,9 +68,6 @@ class Estimate:
     line_xy: FloatArray  # (K, 2): vertical lines in the map (m)
     # (3, 4): robot_from_camera as mounted; None: as calibrated, and discs are taken as rows say.
     mounting: FloatArray | None = None
-    # (N + 1, 2): pitch and roll per pose (rad), x and y of a rotation vector in the robot frame;
-    # None: the robot is upright.
-    tilt: FloatArray | None = None
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:

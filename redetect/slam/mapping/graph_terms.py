@@ -1,10 +1,9 @@
-"""Whitened errors of odometry, discs, lines and tilt at an estimate, with their Jacobians."""
+"""Whitened errors of odometry, discs and lines at an estimate, with their Jacobians."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -21,12 +20,8 @@ from redetect.slam.models import (
     disc_in_robot,
     disc_jacobians,
 )
-from redetect.slam.mounting import (
-    rows_as_recorded,
-    rows_through_mounting,
-    turn_to_the_left,
-)
-from redetect.storage.bounds import Bounds, Positive, demand_fields
+from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
+from redetect.storage.bounds import Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
 
@@ -36,8 +31,6 @@ MOUNTING_UNKNOWNS = 4
 #: Standard deviation of where lines are believed to be, if anywhere (m).
 LINE_PRIOR_M = 3.0
 
-_SWAY_RAD = Bounds("from 0 to less than a right angle", 0.0, 0.5 * math.pi, below=True)
-
 
 @dataclass(frozen=True)
 class Weighting:
@@ -45,15 +38,12 @@ class Weighting:
 
     loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
     loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
-    calibrate: bool = False  # whether the camera's rotation and height are unknowns
+    calibrate: bool = False  # whether the camera's rotation and height are unknowns, of discs alone
     # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
     # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
     # row that the calibrated camera would have written is compared with the one it wrote, which is
     # where that covariance belongs.
     row_errors: RowErrors = "corrected"
-    # Standard deviation of each pose's pitch and roll; 0: the robot is upright. With a tilt, rows
-    # are compared as recorded.
-    tilt_sigma_rad: Annotated[float, _SWAY_RAD] = 0.0
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
@@ -62,18 +52,16 @@ class Weighting:
 class Layout(NamedTuple):
     """Where in the vector of unknowns each kind begins: poses except the first are first."""
 
-    first_tilt: int
     first_disc: int
     first_line: int
     size: int
 
 
-def layout_of(graph: Graph, weighting: Weighting) -> Layout:
+def layout_of(graph: Graph) -> Layout:
     """Layout of a problem's unknowns."""
-    steps = len(graph.steps)
-    first_disc = (5 if weighting.tilt_sigma_rad > 0.0 else 3) * steps
+    first_disc = 3 * len(graph.steps)
     first_line = first_disc + 2 * len(graph.disc_ids)
-    return Layout(3 * steps, first_disc, first_line, first_line + 2 * len(graph.line_ids))
+    return Layout(first_disc, first_line, first_line + 2 * len(graph.line_ids))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +71,6 @@ class Errors:
     odometry: FloatArray  # (N, 3)
     discs: FloatArray  # (n, 2): NaN where a disc would be out of the camera's sight
     lines: FloatArray  # (q,)
-    tilt: FloatArray  # (N, 2) or (0, 2)
     prior: FloatArray  # (K, 2) or (0, 2): lines less where they are believed to be
 
 
@@ -91,14 +78,11 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
     """Whitened errors at an estimate: predicted minus measured, in standard deviations."""
     step = between(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
     step[:, 2] = wrap_angle(step[:, 2])
-    tilt, near = np.zeros((0, 2)), graph.line_prior
-    if estimate.tilt is not None and weighting.tilt_sigma_rad > 0.0:
-        tilt = estimate.tilt[1:] / weighting.tilt_sigma_rad
+    near = graph.line_prior
     return Errors(
         odometry=_apply(graph.step_whitening, step),
         discs=_apply(graph.disc_whitening, _disc_rows(graph, estimate, weighting)[0]),
         lines=_bearing_errors(graph, estimate),
-        tilt=tilt,
         prior=np.zeros((0, 2)) if near is None else (estimate.line_xy - near) / LINE_PRIOR_M,
     )
 
@@ -112,7 +96,6 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
             (error.odometry, Loss()),
             (error.discs, loss),
             (error.lines[:, None], loss),
-            (error.tilt, Loss()),
             (error.prior, Loss()),
         ]
     )
@@ -123,30 +106,24 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
 
     The mounting changes by a rotation vector in the robot frame, applied from the left, and height.
     """
-    layout = layout_of(graph, weighting)
+    layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
     loss = Loss(weighting.loss, weighting.loss_scale)
     by_first, by_second = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     step = 3 * np.arange(len(graph.steps), dtype=np.int64)
-    by_pose, by_tilt, by_disc, by_mounting = (
+    by_pose, by_disc, by_mounting = (
         graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
     )
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
-    tilted, lines = weighting.tilt_sigma_rad > 0.0, len(graph.line_ids)
-    if tilted:
-        seen.append((layout.first_tilt + 2 * (graph.disc_pose - 1), by_tilt))
     whiten = graph.step_whitening
     blocks = [
         Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
         Block(error.discs, seen, by_mounting if weighting.calibrate else None, loss),
-        *_line_blocks(graph, estimate, weighting, error.lines, loss),
+        *_line_blocks(graph, estimate, error.lines, loss),
     ]
-    if tilted:
-        every = np.arange(error.tilt.size, dtype=np.int64)
-        level = np.full((len(every), 1, 1), 1.0 / weighting.tilt_sigma_rad)
-        blocks.append(Block(error.tilt.reshape(-1, 1), [(layout.first_tilt + every, level)]))
     if len(error.prior):
+        lines = len(graph.line_ids)
         of_line = layout.first_line + 2 * np.arange(lines, dtype=np.int64)
         near = np.tile(np.eye(2) / LINE_PRIOR_M, (lines, 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
@@ -159,26 +136,21 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 
 def _disc_rows(
     graph: Graph, estimate: Estimate, weighting: Weighting
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """(n, 2) discs as rows would have them, less the rows (m).
 
-    And its derivatives (n, 2, k) by pose, tilt, disc and mounting.
+    And its derivatives (n, 2, k) by pose, disc and mounting.
     """
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
     seen, (by_pose, by_disc) = disc_in_robot(pose, disc), disc_jacobians(pose, disc)
-    none = np.zeros((len(seen), 2, 0))
-    mounting, tilt = estimate.mounting, estimate.tilt
-    if mounting is None and tilt is None:
-        return seen - graph.disc_xy, by_pose, none, by_disc, none
+    if estimate.mounting is None:
+        return seen - graph.disc_xy, by_pose, by_disc, np.zeros((len(seen), 2, 0))
     assert graph.camera is not None
-    if mounting is not None and weighting.row_errors == "corrected":
-        rows, moves = rows_through_mounting(graph.camera, graph.disc_xy, mounting)
-        return seen - rows, by_pose, none, by_disc, -moves
-    if mounting is None:
-        mounting = np.array(graph.camera.robot_from_camera)
-    tilted = np.zeros((len(seen), 2)) if tilt is None else tilt[graph.disc_pose]
-    rows, by = rows_as_recorded(graph.camera, seen, mounting, tilted)
-    return rows - graph.disc_xy, by.floor @ by_pose, by.tilt, by.floor @ by_disc, by.mounting
+    if weighting.row_errors == "corrected":
+        rows, moves = rows_through_mounting(graph.camera, graph.disc_xy, estimate.mounting)
+        return seen - rows, by_pose, by_disc, -moves
+    rows, by_floor, by_mounting = rows_as_recorded(graph.camera, seen, estimate.mounting)
+    return rows - graph.disc_xy, by_floor @ by_pose, by_floor @ by_disc, by_mounting
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:
@@ -195,33 +167,22 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
     bearing = bearing_of_vertical(
         estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
     )
-    turn = 0.0
-    if estimate.mounting is not None and graph.camera is not None:
-        turn, _ = turn_to_the_left(graph.camera, estimate.mounting)
-    off = wrap_angle(bearing - turn - graph.bearing_rad[graph.member_row])
+    off = wrap_angle(bearing - graph.bearing_rad[graph.member_row])
     mean = np.bincount(graph.member_row, share * off, minlength=len(graph.line_pose))
     return np.asarray(mean / graph.bearing_sigma_rad)
 
 
-def _line_blocks(
-    graph: Graph, estimate: Estimate, weighting: Weighting, error: FloatArray, loss: Loss
-) -> list[Block]:
+def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss) -> list[Block]:
     """A row's derivatives are those of all its lines."""
     if len(graph.line_pose) == 0:
         return []
-    layout = layout_of(graph, weighting)
+    layout = layout_of(graph)
     pose, share = _members(graph)
     by_pose, by_line = bearing_jacobians(
         estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
     )
     scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
     by_pose, by_line = by_pose * scale, by_line * scale
-    shared = None
-    if weighting.calibrate and estimate.mounting is not None and graph.camera is not None:
-        # Rows' bearings were put into the robot frame as calibrated: a camera that is really
-        # turned to the left sees landmarks further to the right than they are.
-        _, by_turn = turn_to_the_left(graph.camera, estimate.mounting)
-        shared = (-by_turn / graph.bearing_sigma_rad[:, None])[:, None, :]
     # The k-th line of each row; rows of fewer lines have none there.
     order = np.argsort(graph.member_row, kind="stable")
     count = np.bincount(graph.member_row, minlength=len(graph.line_pose))
@@ -233,4 +194,4 @@ def _line_blocks(
         member = order[start + np.minimum(k, count - 1)]
         first = layout.first_line + 2 * graph.member_line[member]
         by.append((np.where(k < count, first, -1), by_line[member][:, None, :]))
-    return [Block(error[:, None], by, shared, loss)]
+    return [Block(error[:, None], by, loss=loss)]

@@ -15,7 +15,7 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.least_squares.solver import LossKind
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
@@ -30,7 +30,7 @@ from redetect.slam.mapping.graph import (
 )
 from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.solve import Marginals, Solution, marginals, solve
+from redetect.slam.mapping.solve import Marginals, Solution, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -48,7 +48,6 @@ class ChiSquared:
     odometry: float
     discs: float
     lines: float
-    tilt: float
     # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
     chi_squared: float
     expected: int  # dim(z) - dim(x): numbers measured less numbers estimated
@@ -63,16 +62,12 @@ def chi_squared(
 ) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
-    parts = [
-        float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines, error.tilt)
-    ]
+    parts = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
     # The start is measured (it is the origin) and estimated, so it adds as much as it takes.
-    measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose) + error.tilt.size
-    unknown = 3 * poses + 2 * landmarks + error.tilt.size
-    if weighting.calibrate:
-        unknown += MOUNTING_UNKNOWNS
+    measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose)
+    unknown = 3 * poses + 2 * landmarks + MOUNTING_UNKNOWNS * weighting.calibrate
     # What a lost step says is as good as nothing.
     expected = measured - unknown - 3 * lost_steps
     factor = sum(parts) / expected if expected > 0 else math.nan
@@ -84,7 +79,6 @@ def chi_squared(
         odometry=parts[0],
         discs=parts[1],
         lines=parts[2],
-        tilt=parts[3],
         chi_squared=sum(parts),
         expected=expected,
         factor=factor,
@@ -150,7 +144,9 @@ class Mounting:
 class MappedRun:
     """A least-squares map and how it came about."""
 
+    prefixes: tuple[str, ...]  # names of the poses: the start, then the frames
     graph: Graph
+    weighting: Weighting
     start: Estimate  # odometry and first sight, without lines
     estimate: Estimate  # the minimum
     covariance: Marginals
@@ -159,6 +155,32 @@ class MappedRun:
     cost: float  # what was minimised: chi-squared, or less under a robust loss
     steps: int  # of all descents together
     mounting: Mounting | None
+
+    @property
+    def landmarks(self) -> LandmarkMap:
+        """The map."""
+        graph, at, spread = self.graph, self.estimate, self.covariance
+        return LandmarkMap(
+            discs=Landmarks(graph.disc_ids, at.disc_xy, spread.discs, graph.disc_row_counts),
+            lines=Landmarks(graph.line_ids, at.line_xy, spread.lines, graph.line_row_counts),
+        )
+
+    @property
+    def path(self) -> Path2D:
+        """The poses."""
+        return Path2D(self.prefixes, self.estimate.poses, self.covariance.poses)
+
+    @property
+    def before(self) -> tuple[LandmarkMap, Path2D]:
+        """Discs and poses at first sight, without covariances."""
+        graph, zero = self.graph, np.zeros_like(self.covariance.discs)
+        discs = Landmarks(graph.disc_ids, self.start.disc_xy, zero, graph.disc_row_counts)
+        return LandmarkMap(discs, no_landmarks()), Path2D(self.prefixes, self.start.poses)
+
+    def landmarks_jointly(self) -> LandmarkMap:
+        """The map with the joint covariance of its landmarks."""
+        joint = joint_covariance(self.graph, self.estimate, self.weighting)
+        return replace(self.landmarks, joint_covariance=joint)
 
 
 def map_run(
@@ -180,8 +202,7 @@ def map_run(
     recording : Recording
         The run. Rows without an identifier do not count.
     camera : Camera, optional
-        As calibrated: for lines (where bearings are taken from) and where the mounting or a tilt is
-        unknown.
+        As calibrated: for lines (where bearings are taken from) and where the mounting is unknown.
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
     start : (3,)
@@ -224,16 +245,18 @@ def map_run(
             )
         graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
     if only_start:
-        fixed = replace(wanted, calibrate=False, tilt_sigma_rad=0.0)
+        fixed = replace(wanted, calibrate=False)
         for weighting in _on_the_way(fixed):
             estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
     as_calibrated = trail[-1].cost
-    if wanted.calibrate or wanted.tilt_sigma_rad > 0.0:
+    if wanted.calibrate:
         estimate = keep(descend(graph, estimate, wanted))
     covariance = marginals(graph, estimate, wanted)
     return MappedRun(
+        prefixes=("start", *recording.prefixes),
         graph=graph,
+        weighting=wanted,
         start=begin,
         estimate=estimate,
         covariance=covariance,
@@ -273,26 +296,6 @@ def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) ->
         poses[here, 2] += motion[2]
         xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
     return replace(begin, poses=poses, disc_xy=np.where(np.isfinite(xy), xy, begin.disc_xy))
-
-
-def landmark_map(graph: Graph, estimate: Estimate, covariance: Marginals | None) -> LandmarkMap:
-    """Landmarks as a map; without covariances those are 0."""
-    discs, lines = len(graph.disc_ids), len(graph.line_ids)
-    zero = Marginals(np.zeros((0, 3, 3)), np.zeros((discs, 2, 2)), np.zeros((lines, 2, 2)), None)
-    spread = covariance or zero
-    return LandmarkMap(
-        discs=Landmarks(graph.disc_ids, estimate.disc_xy, spread.discs, graph.disc_row_counts),
-        lines=Landmarks(graph.line_ids, estimate.line_xy, spread.lines, graph.line_row_counts),
-    )
-
-
-def path_of(recording: Recording, estimate: Estimate, covariance: Marginals | None) -> Path2D:
-    """Poses as a path that begins at the start."""
-    return Path2D(
-        prefixes=("start", *recording.prefixes),
-        poses=estimate.poses,
-        covariance=None if covariance is None else covariance.poses,
-    )
 
 
 def _with_lines(
@@ -351,14 +354,14 @@ def _check_usable(
             f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
         )
     needs = "lines" if len(recording.lines) else ""
-    if weighting.calibrate or weighting.tilt_sigma_rad > 0.0:
+    if weighting.calibrate:
         needs = "the camera's mounting"
     if needs and camera is None:
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
     if weighting.calibrate and camera is not None:
-        if not np.any(recording.circles.ids >= 0):
+        if len(recording.lines):
             raise SlamError(
-                f"{name}: bearings do not say how the camera is mounted: expected discs"
+                f"{name}: bearings do not say how the camera is mounted: expected discs alone"
             )
         check_rows_fit_camera(camera, recording.circles.xy)
     check_connected(recording, name)

@@ -65,15 +65,14 @@ class _MapProblem:
         return linearise(self.graph, at, self.weighting)
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
-        return moved(at, layout_of(self.graph, self.weighting), step, shared)
+        return moved(at, layout_of(self.graph), step, shared)
 
     def with_best_positions(self, trial: Estimate, reached: float) -> tuple[Estimate, float]:
         """A trial with positions fitted to its headings, if that lowers the cost, and its cost."""
-        layout = layout_of(self.graph, self.weighting)
+        layout = layout_of(self.graph)
         problem = self.linear(trial)
         free = np.ones(layout.size, dtype=bool)
-        free[2 : layout.first_tilt : 3] = False
-        free[layout.first_tilt : layout.first_disc] = False
+        free[2 : layout.first_disc : 3] = False
         jacobian = problem.jacobian.tocsc()[:, np.flatnonzero(free)]
         step = np.zeros(layout.size)
         try:
@@ -144,9 +143,9 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
     Under a robust loss, rows' information is multiplied by their weights. Raises `SlamError` if the
     measurements do not determine the unknowns.
     """
-    layout = layout_of(graph, weighting)
+    layout = layout_of(graph)
     blocks = [
-        (3, np.arange(0, layout.first_tilt, 3)),
+        (3, np.arange(0, layout.first_disc, 3)),
         (2, np.arange(layout.first_disc, layout.first_line, 2)),
         (2, np.arange(layout.first_line, layout.size, 2)),
     ]
@@ -161,7 +160,7 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
 
     Returns (2 M, 2 M): discs, then lines (m^2).
     """
-    layout = layout_of(graph, weighting)
+    layout = layout_of(graph)
     landmarks = np.arange(layout.first_disc, layout.size)
     with _determined("covariances"):
         return chosen_covariance(equations_at(graph, estimate, weighting), landmarks)
@@ -169,18 +168,13 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
 
 def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:
     """An estimate after a step (K,) of all unknowns but the mounting, and (0,) or (4,) of that."""
-    poses, tilt, discs, lines = np.split(
-        step, [layout.first_tilt, layout.first_disc, layout.first_line]
-    )
+    poses, discs, lines = np.split(step, [layout.first_disc, layout.first_line])
     after = replace(
         estimate,
         poses=estimate.poses + np.concatenate([np.zeros((1, 3)), poses.reshape(-1, 3)]),
         disc_xy=estimate.disc_xy + discs.reshape(-1, 2),
         line_xy=estimate.line_xy + lines.reshape(-1, 2),
     )
-    if tilt.size and estimate.tilt is not None:
-        turned = np.concatenate([np.zeros((1, 2)), tilt.reshape(-1, 2)])
-        after = replace(after, tilt=estimate.tilt + turned)
     if mounting.size and estimate.mounting is not None:
         turn = Rotation.from_rotvec(mounting[:3]).as_matrix()
         changed = np.concatenate([turn @ estimate.mounting[:, :3], estimate.mounting[:, 3:]], 1)
@@ -190,16 +184,11 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
 
 
 def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estimate:
-    """A start that has all that is unknown: mounting as calibrated, no tilt."""
-    if not weighting.calibrate and weighting.tilt_sigma_rad == 0.0:
-        return replace(start, mounting=None, tilt=None)
+    """A start that has all that is unknown: the mounting as calibrated."""
+    if not weighting.calibrate:
+        return replace(start, mounting=None)
     if graph.camera is None:
         raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
-    if weighting.calibrate and start.mounting is None:
+    if start.mounting is None:
         start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
-    if weighting.tilt_sigma_rad > 0.0:
-        if weighting.calibrate and weighting.row_errors != "recorded":
-            raise SlamError("a separate tilt for each pose: expected row errors as recorded")
-        if start.tilt is None:
-            start = replace(start, tilt=np.zeros((len(start.poses), 2)))
     return start
