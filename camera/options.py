@@ -61,7 +61,7 @@ class Calibrate(BoardOnFloor):
     Parameters
     ----------
     output : Path
-        The .cam file. Beside it: .json with everything, and pictures of residuals and coverage.
+        The .cam file. Beside it: pictures of residuals and coverage.
     """
 
     images: Positional[tuple[Path, ...]]  #: Photographs, folders of them, or a video.
@@ -82,8 +82,7 @@ class Calibrate(BoardOnFloor):
     polynomial: Literal["auto", "on", "off"] = "auto"
     #: Keep pictures whose residuals are far above the others'.
     keep_outliers: bool = False
-    every: int = 15  #: Use only every N-th frame of a video.
-    #: Use at most this many pictures, evenly spaced, and at most this many frames per video.
+    #: Use at most this many pictures, and at most this many frames per video, evenly spaced.
     max_images: int = 60
     #: A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
     #: it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.

@@ -20,16 +20,14 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tif
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
 
-def calibration_images(
-    inputs: Sequence[Path], every: int, most: int
-) -> Iterator[tuple[str, GreyImage]]:
+def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
     """Names and grey images of photographs, folders of them, and videos, one after the other.
 
-    At most `most` images are used, evenly spaced, and at most `most` of every `every`-th frame of
-    each video. A file that is named twice is used once.
+    At most `most` images are used, and at most `most` frames of each video, evenly spaced. A file
+    that is named twice is used once.
     """
-    if every < 1 or most < 1:
-        raise CalibrationError(f"--every {every} and --max-images {most}: expected 1 or more")
+    if most < 1:
+        raise CalibrationError(f"--max-images {most}: expected 1 or more")
     images: list[Path] = []
     videos: list[Path] = []
     for path in inputs:
@@ -49,7 +47,7 @@ def calibration_images(
     for path in _evenly(_each_once(images), most):
         yield path.name, read_grey(path)
     for path in _each_once(videos):
-        yield from _frames(path, every, most)
+        yield from _frames(path, most)
 
 
 def read_grey(path: Path) -> GreyImage:
@@ -115,7 +113,7 @@ def _evenly(paths: list[Path], most: int) -> list[Path]:
     return [paths[i] for i in np.linspace(0, len(paths) - 1, most).round().astype(int)]
 
 
-def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]]:
+def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
     video = cv2.VideoCapture(str(path))
     try:
         if not video.isOpened():
@@ -124,7 +122,7 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         # The frames are spread over the whole video.
-        step = max(every, -(-count // most)) if count > 0 else every
+        step = max(1, -(-count // most))
         number = taken = 0
         while taken < most and video.grab():
             if number % step == 0:
