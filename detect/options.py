@@ -50,21 +50,14 @@ class PickedFrames:
     frames: tuple[str, ...] = ()
 
 
-#: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
-Axes = Literal["robotics", "dataset"]
-
-
 @dataclass(frozen=True)
 class SourceOptions:
     """Options of a source besides its name."""
 
     #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-    #: z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
-    #: nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), of image files
+    #: a file of STEP rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
-    #: Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
-    #: backward).
-    odometry_axes: Axes = "robotics"
     wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
     metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
     #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.

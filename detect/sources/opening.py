@@ -20,9 +20,8 @@ from detect.sources.image_files import (
 from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
+    FramesAlongPoses,
     PoseStream,
-    frames_along_poses,
-    frames_along_rows,
     tick_poses,
     tum_poses,
 )
@@ -144,8 +143,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
         poses = source.poses(named)
     elif named.endswith(".tum"):
-        path, axes = Path(named), options.odometry_axes
-        poses = PoseStream(named, path, lambda: tum_poses(path, axes))
+        poses = PoseStream(named, Path(named), lambda: tum_poses(Path(named)))
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
@@ -154,7 +152,12 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        return frames_along_rows(source, Path(named)), Path(named)
+        if not isinstance(source, ImageFiles):
+            raise DetectError(
+                f"{source.name}: --odometry {named}: STEP rows name image files: expected a "
+                "trajectory (.tum), ticks of wheels (.ticks), a topic of a bag (/odom), or none"
+            )
+        return source.along(Path(named)), Path(named)
     else:
         poses = None if named else source.poses(None)
     if poses is None:
@@ -164,7 +167,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             f"{source.name}: no times of the images: a trajectory needs them: "
             "name a file of rows 'prefix seconds' by --times"
         )
-    return frames_along_poses(source, poses), poses.path
+    return FramesAlongPoses(source, poses), poses.path
 
 
 def _is_ros2_bag(name: Path) -> bool:
