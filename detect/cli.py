@@ -32,7 +32,6 @@ from detect.viewing_options import (
     Draw,
     Explain,
     Export,
-    Gates,
     Grid,
     Report,
     RowFiles,
@@ -54,7 +53,7 @@ EXPERT: dict[type, frozenset[str]] = {
     LineSettings: all_but(LineSettings, "threshold", "join_px"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
     RowFiles: all_but(RowFiles, "rows", "reference"),
-    Gates: all_but(CompareOptions, "only_identified"),
+    CompareOptions: all_but(CompareOptions, "only_identified"),
     Grid: all_but(Grid, "threshold", "evidence", "noise_floor", "blur_px", "radius_m"),
 }  # fmt: skip
 

@@ -81,12 +81,13 @@ def perform(options: Tune) -> int:
     if not pairs:
         raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
 
-    gates = CompareOptions(**vars(options.gates), only_identified=options.only_identified)
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     tilts = None if options.tilt is None else read_tilts(options.tilt)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(run, pairs, settings, gates, workers, tilts=tilts, on_progress=advance)
+        tuned = tune_run(
+            run, pairs, settings, options.matching, workers, tilts=tilts, on_progress=advance
+        )
         trials = list(tuned)
     records = trial_records(grid, trials)
     head = {
@@ -94,7 +95,7 @@ def perform(options: Tune) -> int:
         "run": run.name,
         "reference": path.name,
         "frames": [frame.step.prefix for frame, _ in pairs],
-        "gate": asdict(gates),
+        "gate": asdict(options.matching),
         "camera": run.camera.content_hash,
         "settings": {name: _plain(value) for name, value in asdict(base).items()},
         "varied": varied,

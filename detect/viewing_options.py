@@ -28,46 +28,25 @@ from redetect.storage.bounds import (
     whole,
 )
 
-ErrorCovariance = Literal["detected", "reference", "sum"]
-
 
 @dataclass(frozen=True, kw_only=True)
-class Gates:
-    """Which detected and reference rows are the same landmark."""
+class CompareOptions:
+    """Which detected and reference rows are the same landmark, and which rows count."""
 
     #: Compare discs on the floor: they are the same within this distance, metres. By default they
     #: are compared in the image where there is a calibration, and within 0.1 m where there is none.
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
     tolerance_deg: Positive = 0.5  #: Bearings of the same line differ by at most this,
     sigmas: NotNegative = 2.0  #: or by this many standard deviations of the detected one.
-
-    def __post_init__(self) -> None:
-        demand_fields(self, CompareError)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(Gates):
-    """Which rows are the same landmark, and which rows count."""
-
-    #: Compare discs on the floor: they are the same within this Mahalanobis distance under the
-    #: reference row's covariance (standard deviations).
-    sigma: Annotated[MaybeFloat, ABOVE_0] = None
     #: In the image, discs are the same if they differ by at most half the width and height of the
     #: disc's own image, or by this (px), whichever is more.
     least_px: Positive = 3.0
     #: Count only reference rows that have an ID. Detected rows that fit a reference row without one
     #: are then neither right nor wrong: they are set aside.
     only_identified: bool = False
-    #: Count frames that only one file has, too: all their rows are missed, or extra.
-    all_frames: bool = False
-    #: Which covariance position errors of discs are measured in: the detected row's, the reference
-    #: row's, or, where both err independently, their sum.
-    error_covariance: ErrorCovariance = "detected"
 
-    @property
-    def on_floor(self) -> bool:
-        """Whether discs are to be compared on the floor even where there is a calibration."""
-        return self.gate_m is not None or self.sigma is not None
+    def __post_init__(self) -> None:
+        demand_fields(self, CompareError)
 
 
 @dataclass(frozen=True)
@@ -90,7 +69,7 @@ class Compare:
     #: beside the reference, if it is there.
     lookalikes: MaybePath = None
     #: Calibration, by default the one in the run folder: discs are compared in the image, each row
-    #: where it was seen. Without one, or with --gate-m or --sigma, on the floor.
+    #: where it was seen. Without one, or with --gate-m, on the floor.
     camera: MaybePath = None
     min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
     min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
@@ -140,7 +119,6 @@ class Draw(PickedFrames, RowsFlags):
     video: MaybePath = None  #: Write an MP4 file as well, or instead.
     fps: float = 10.0  #: Frames of the video per second.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +157,6 @@ class Report(RowsFlags):
 
     worst: int = 5  #: How many of the worst frames are shown.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,12 +247,11 @@ class Tune(PickedFrames, RowsFlags):
     #: Reference rows; by default map.circles (map.lines) in the run folder.
     reference: MaybePath = None
     tilt: MaybePath = None  #: Tilts of the frames: positions of discs are corrected for them.
-    only_identified: bool = False  #: Count only reference rows that have an ID.
     most: int = 1000  #: Refuse grids of more combinations than this.
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+    matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 
 

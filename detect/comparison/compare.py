@@ -46,9 +46,7 @@ from redetect.landmarks import (
     LineLandmark,
     associate,
     associate_positions,
-    associate_within_covariance,
     circle_arrays,
-    is_positive_definite,
     read_frames,
     wrap_angle,
 )
@@ -120,10 +118,10 @@ def compare_frames(
     Raises
     ------
     CompareError
-        If an image has two frames, or a covariance is needed and not positive definite.
+        If an image has two frames.
     """
     options = options or CompareOptions()
-    in_image = sight is not None and not options.on_floor
+    in_image = sight is not None and options.gate_m is None
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
@@ -135,16 +133,11 @@ def compare_frames(
         circle_arrays([row for m in matches for row in m.missed]),
         circle_arrays([row for m in matches for row in m.extra]),
     )
-    covariance = {
-        "detected": second.covariance,
-        "reference": first.covariance,
-        "sum": first.covariance + second.covariance,
-    }[options.error_covariance]
     lean, pairs = floor_pairs(
         None if sight is None else sight.camera,
         first.xy,
         second.xy,
-        covariance,
+        second.covariance,
         np.repeat(np.arange(len(matches)), [len(match.matched) for match in matches]),
     )
     apart = [] if sight is None else [apart_px(match) for match in matches]
@@ -158,7 +151,7 @@ def compare_frames(
         on_lookalikes=_on_lookalikes(matches, lookalikes, options),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
-        normalised_error=normalised_error(pairs.offset, covariance),
+        normalised_error=normalised_error(pairs.offset, second.covariance),
         reference_quality_matched=quantile(first.quality),
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
@@ -287,15 +280,13 @@ def match_runs(
 ) -> dict[str, Any]:
     """Match the rows of two runs, image by image: the fields of a `Comparison`.
 
-    Images are in the order of the reference, then those of `detected` alone, if they count.
+    Images are in the order of the reference; those that only one run has do not count.
     """
-    images = [name for name in reference if options.all_frames or name in detected]
-    if options.all_frames:
-        images += [name for name in detected if name not in reference]
+    images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
     for name in images:
-        frames = reference.get(name), detected.get(name)
+        frames = reference[name], detected[name]
         view = None if sight is None else sight.of(*frames)
         pair = pair_of(kind, name, *frames, known.get(name), view)
         matches.append(match_frame(pair, options))
@@ -342,12 +333,10 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     """Match the rows of one frame one to one.
 
     Detected rows that fit an unlisted disc or line (or a reference row without ID, if these do not
-    count), and no reference row that counts, are set aside. Raises CompareError if the gate needs a
-    reference disc's covariance and that is not positive definite.
+    count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if frame.kind == "circles":
-        _demand_measurable(frame, options)
         pair_up = partial(pair_discs, options=options, view=frame.view)
     counted, uncounted = frame.reference, list(frame.unlisted)
     if options.only_identified:
@@ -387,18 +376,14 @@ def pair_discs(
     In the image where there is a view, unless the options ask for the floor.
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
-    if view is not None and not options.on_floor:
+    if view is not None and options.gate_m is None:
         seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
         gate = view.gates(first.xy, options.least_px)
         apart = (again[None] - seen[:, None]) / gate[:, None]
         cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
         return associate(np.minimum(cost, 2.0), cost <= 1.0)
-    if options.sigma is None:
-        gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
-        return associate_positions(first.xy, second.xy, gate_m=gate_m)
-    return associate_within_covariance(
-        first.xy, second.xy, first.covariance, gate_sigma=options.sigma
-    )
+    gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
+    return associate_positions(first.xy, second.xy, gate_m=gate_m)
 
 
 def pair_lines(
@@ -431,12 +416,3 @@ def numbers(rows: Sequence[Any], name: str) -> FloatArray:
 def _turns(reference: Sequence[LineLandmark], detected: Sequence[LineLandmark]) -> FloatArray:
     """(N, M) bearings of detected lines less those of reference lines (rad)."""
     return wrap_angle(numbers(detected, "alpha") - numbers(reference, "alpha")[:, np.newaxis])
-
-
-def _demand_measurable(frame: FramePair, options: CompareOptions) -> None:
-    covariance = circle_arrays(frame.reference).covariance
-    if options.sigma is not None and not is_positive_definite(covariance).all():
-        raise CompareError(
-            f"frame {excerpt(frame.name)}: a reference row's covariance is not positive definite: "
-            "expected one to measure sigmas in; a gate in metres needs none"
-        )

@@ -38,7 +38,7 @@ from redetect.storage.messages import one_line
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     result = comparison_of(command)
-    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.on_floor):
+    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.gate_m):
         print("no calibration: positions are compared on the floor; --camera names one")
     Console().print(comparison_tables(result))
     if command.json is not None:
@@ -114,7 +114,7 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 def summary_rows(c: Comparison) -> dict[str, str]:
     """Names and words: what was found first, then how it was compared and how large errors are."""
-    only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
+    only = c.options.only_identified
     on_lookalikes = c.lookalikes_found
     joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
     rows = {
@@ -139,12 +139,12 @@ def summary_rows(c: Comparison) -> dict[str, str]:
         "reference": one_line(c.reference_name) + (", rows with an ID only" if only else ""),
         "detected": one_line(c.detected_name),
         "frames": f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the "
-        f"reference, {len(c.frames_only_in_detected)} only detected ({counted})",
+        f"reference, {len(c.frames_only_in_detected)} only detected (not counted)",
     }
     if isinstance(c, DiscComparison):
         rows |= _disc_rows(c)
     elif isinstance(c, LineComparison):
-        error = _normalised_error(c.normalised_error, "", "without a positive sigma")
+        error = _normalised_error(c.normalised_error, "without a positive sigma")
         rows |= {
             "same line": f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma",
             "bearing error": _median_and_most(c.bearing_median_deg, c.bearing_95_deg, 4, "deg"),
@@ -165,16 +165,10 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
         rows |= {"same disc": same, "image difference": apart}
-    elif c.options.sigma is None:
-        rows["same disc"] = f"on the floor, within {c.options.gate_m:g} m"
     else:
-        rows["same disc"] = f"on the floor, within {c.options.sigma:g} sigma"
-    covariance = c.options.error_covariance
-    source = ", covariance: " + ("detected plus reference" if covariance == "sum" else covariance)
+        rows["same disc"] = f"on the floor, within {c.options.gate_m:g} m"
     rows["position error"] = _median_and_most(c.error_median_m, c.error_95_m, 4, "m")
-    rows["normalised error"] = _normalised_error(
-        c.normalised_error, source, "not positive definite"
-    )
+    rows["normalised error"] = _normalised_error(c.normalised_error, "not positive definite")
     if c.lean is not None:
         rows["common lean"] = _lean_text(c.lean)
     for side, matched, fate, alone in (
@@ -214,14 +208,14 @@ def _median_and_most(median: float | None, most: float | None, decimals: int, un
     return f"median {number(median, decimals)} {unit}, 95 % {number(most, decimals)} {unit}"
 
 
-def _normalised_error(error: NormalisedError, covariance: str, unusable: str) -> str:
+def _normalised_error(error: NormalisedError, unusable: str) -> str:
     """How large normalised errors are, and how large they should be."""
     text = number(error.per_dof, 3)
     if error.band is not None:
         low, high = error.band
         text += f" squared per degree of freedom (95 % band {low:.3f} to {high:.3f})"
     left_out = f"; {error.left_out} {unusable} left out" if error.left_out else ""
-    return text + covariance + left_out
+    return text + left_out
 
 
 def _over_distance(c: DiscComparison) -> FigureTable:

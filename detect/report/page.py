@@ -21,7 +21,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import CompareOptions, Gates, Report, RowFiles
+from detect.viewing_options import Report, RowFiles
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
@@ -38,13 +38,12 @@ class ReportInputs:
     files: RunRows
     names: tuple[str, ...]
     rows: tuple[SeenRows, ...]
-    options: CompareOptions
     sight: Sight | None
     discs: DiscComparison | None
     lines: LineComparison | None
 
 
-def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
+def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
     """Read and compare all rows of a run.
 
     Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
@@ -54,7 +53,6 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
     if not names:
         raise DetectError(f"{run.folder}: no frames: expected some of them")
     rows = tuple(files.of(name) for name in names)
-    compare = CompareOptions(**vars(gates))
     sight = files.sight(run.camera) if isinstance(run, Run) else None
 
     def compared(kind: Kind) -> Comparison | None:
@@ -66,7 +64,6 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
             kind,
             reference,
             [detected for detected, _ in both if detected],
-            compare,
             sight=sight,
             names=(reference.name, files.detected[kind].name),
         )
@@ -74,7 +71,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
     discs, lines = compared("circles"), compared("lines")
     assert isinstance(discs, DiscComparison | None)
     assert isinstance(lines, LineComparison | None)
-    return ReportInputs(run, files, names, rows, compare, sight, discs, lines)
+    return ReportInputs(run, files, names, rows, sight, discs, lines)
 
 
 _JPEG_QUALITY = 88
@@ -88,7 +85,7 @@ def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
     except FrameError as error:
         return Part("note", f"{words}: {error}")
     rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
-    picture = draw_rows(image, inputs.sight, rows, settings, inputs.options)
+    picture = draw_rows(image, inputs.sight, rows, settings)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
@@ -101,7 +98,7 @@ def perform(options: Report) -> int:
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
     demand_place(output, overwrite=options.force)
-    inputs = gather(run, options.files, options.gates)
+    inputs = gather(run, options.files)
     page = report_page(inputs, options.worst)
     write_bytes(output, page, overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]

@@ -17,7 +17,6 @@ from detect.errors import DetectError
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -33,7 +32,6 @@ Captured = pytest.CaptureFixture[str]
 FloatArray = NDArray[np.float64]
 
 SETTINGS = CircleSettings()
-OPTIONS = CompareOptions()
 STEP = Step("x.0001", *[0.0] * 9)
 
 
@@ -110,7 +108,7 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
         lines=Frame(STEP, (vertical(published_camera, 0.3, 0.002),)),
         reference_lines=Frame(STEP, (vertical(published_camera, -0.4, 0.002),)),
     )
-    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, OPTIONS, "x.0001")
+    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, "x.0001")
     assert canvas.shape[0] > 288
     assert canvas[288:].any()
 
@@ -141,7 +139,7 @@ def test_without_reference_nothing_is_missed_or_extra(
     image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
     rows = SeenRows(circles=Frame(STEP, discs((0.2, -1.3))))
-    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, OPTIONS).astype(int)
+    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS).astype(int)
     edge = np.rint(published_camera.project_floor((0.2, -1.3) + 0.1 * _circle(32))).astype(int)
     apart = np.abs(canvas[edge[:, 1], edge[:, 0]] - (0, 170, 255)).sum(axis=1)
     assert np.median(apart) < 120
@@ -263,10 +261,6 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
     assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
     assert_refused(["draw", run, "-o", out, "--frames", "x"], small_run, "'x'", capsys)
-    with pytest.raises(SystemExit) as ended:
-        main(["draw", run, "-o", out, "--gate-m", "-1"])
-    assert ended.value.code == 2
-    assert "gate_m" in capsys.readouterr().err
     video = tmp_path / "v.mp4"
     video.write_bytes(b"mine")
     assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)
