@@ -45,8 +45,7 @@ class PickedFrames:
     """Selects the frames of a run."""
 
     every: int = 1  #: Only every n-th frame.
-    #: Only these frames: names of images, positions in the run, and ranges FROM:TO or FROM:TO:STEP
-    #: of positions without the last.
+    #: Only the frames of these images, by their names.
     frames: tuple[str, ...] = ()
 
 

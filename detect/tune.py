@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import itertools
 import json
@@ -23,7 +22,7 @@ from detect.drawing.inputs import select_frames
 from detect.errors import DetectError
 from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
-from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
+from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import PUBLISHED, CircleSettings
 from detect.settings_files import read_settings, word_value
@@ -34,11 +33,9 @@ from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Frame,
-    FrameTilt,
     LandmarkFileError,
     frames_of_rows,
     parse_rows,
-    read_tilts,
 )
 from redetect.reporting.page import figure_file
 from redetect.storage import OutputExistsError, write_bytes
@@ -50,8 +47,6 @@ def perform(options: Tune) -> int:
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
     grid = () if options.serve else combinations(type(base), varied, options.most)
     settings = [replace(base, **combination) for combination in grid]
-    if options.verticals and options.tilt is not None:
-        raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
 
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
@@ -65,7 +60,7 @@ def perform(options: Tune) -> int:
         frames = [frame for _, frame in selection]
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
-    outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}
+    outputs = {name: output / name for name in ("table.json", "curve.png")}
     for path in outputs.values():
         if path.exists() and not options.force:
             raise OutputExistsError(path)
@@ -83,11 +78,8 @@ def perform(options: Tune) -> int:
 
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
-    tilts = None if options.tilt is None else read_tilts(options.tilt)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(
-            run, pairs, settings, options.matching, workers, tilts=tilts, on_progress=advance
-        )
+        tuned = tune_run(run, pairs, settings, options.matching, workers, advance)
         trials = list(tuned)
     records = trial_records(grid, trials)
     head = {
@@ -100,14 +92,9 @@ def perform(options: Tune) -> int:
         "settings": {name: _plain(value) for name, value in asdict(base).items()},
         "varied": varied,
     }
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(records[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**r, "front": int(r["front"]), "knee": int(r["knee"])} for r in records)
     document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     contents = {
-        "table.csv": table.getvalue().encode(),
         "table.json": f"{document}\n".encode(),
         "curve.png": curve_picture(grid, trials, title),
     }
@@ -207,20 +194,17 @@ def tune_run(
     settings: Sequence[Settings],
     options: CompareOptions,
     workers: Workers,
-    *,
-    tilts: ByPrefix[FrameTilt] | None = None,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[Trial]:
     """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
 
-    `frames` come with their reference rows; `tilts`, by image prefix, correct positions of discs.
-    `on_progress` is called after every frame of every setting.
+    `frames` come with their reference rows; `on_progress` is called after every frame of every
+    setting.
     """
     kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
     changes: list[dict[str, Any]] = [{kind: each} for each in settings]
     plans = [FramePlan(run.camera, **change) for change in changes]
-    known = Known(tilts=tilts)
-    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
+    tasks = [FrameTask(frame) for frame, _ in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(detect_chunks(work, plans[0], workers)) as chunks:
         done = chain.from_iterable(chunks)

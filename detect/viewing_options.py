@@ -234,7 +234,7 @@ class Tune(PickedFrames, RowsFlags):
     Parameters
     ----------
     output : Path
-        Folder for table.csv, table.json and curve.png, or for what the page saves: tuned.json
+        Folder for table.json and curve.png, or for what the page saves: tuned.json
         (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
@@ -246,7 +246,6 @@ class Tune(PickedFrames, RowsFlags):
     preset: Preset = "default"
     #: Reference rows; by default map.circles (map.lines) in the run folder.
     reference: MaybePath = None
-    tilt: MaybePath = None  #: Tilts of the frames: positions of discs are corrected for them.
     most: int = 1000  #: Refuse grids of more combinations than this.
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames to process, at most as many as there are cores. What is written is the same.

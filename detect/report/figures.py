@@ -12,7 +12,6 @@ from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
-    DistanceBin,
     LineComparison,
     LinePairs,
 )
@@ -101,26 +100,6 @@ _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
 
-def counts_figure(rows: Sequence[SeenRows]) -> Part:
-    """Rows in each frame, over the run."""
-    with figure_file((_WIDE, 2.2), "svg") as (figure, content):
-        axes = figure.subplots()
-        for kind, name, colour, dashes in (
-            ("circles", "discs", DATA, "-"),
-            ("lines", "verticals", SECOND, "--"),
-            ("markers", "markers", MARK, ":"),
-        ):
-            frames = [getattr(seen, kind) for seen in rows]
-            counts = [np.nan if f is None else len(getattr(f, kind)) for f in frames]
-            if np.isfinite(counts).any():
-                axes.plot(counts, color=colour, ls=dashes, lw=1.0, label=name)
-        _finish(axes, "frame", "rows in it")
-        axes.set_ylim(bottom=0)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8, ncols=3)
-    return _part("Rows in each frame, over the run.", content, 2.2)
-
-
 def rates_figure(curve: RateCurve, axis: str) -> Part:
     """Recall and precision over a threshold, and precision over recall with the knee."""
     with figure_file((_WIDE, 3.1), "svg") as (figure, content):
@@ -168,27 +147,6 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
         f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
         "the covariances are right, wider if they are too small."
     )
-    return _part(words, content, 2.8)
-
-
-def distance_figure(bins: Sequence[DistanceBin]) -> Part:
-    """Recall and precision by forward distance, over how many rows there are."""
-    shown = [part for part in bins if part.reference or part.detected]
-    with figure_file((_WIDE, 2.8), "svg") as (figure, content):
-        at = np.arange(len(shown))
-        rows, rates = figure.subplots(1, 2)
-        for key, shift, colour in (("reference", -0.2, REFERENCE), ("detected", 0.2, DATA)):
-            heights = [getattr(part, key) for part in shown]
-            rows.bar(at + shift, heights, 0.4, color=colour, label=f"{key} rows")
-        for key, mark, colour in (("recall", "o-", DATA), ("precision", "s--", SECOND)):
-            share = np.array([getattr(part, key) for part in shown], dtype=np.float64)
-            rates.plot(at, share, mark, color=colour, lw=1.2, ms=4, label=key)
-        rates.set_ylim(0.0, 1.05)
-        for axes, name in ((rows, "rows"), (rates, "share")):
-            axes.set_xticks(at, [str(part) for part in shown], fontsize=7)
-            _finish(axes, "forward distance / m", name)
-            axes.legend(fontsize=8)
-    words = "Rows, recall and precision by forward distance, each side's rows by their own."
     return _part(words, content, 2.8)
 
 

@@ -156,7 +156,7 @@ def _summary(inputs: ReportInputs) -> list[Part]:
     if len(inputs.rows) < 2:
         return parts
     plan = figures.floor_map(inputs.rows)
-    return [*parts, figures.counts_figure(inputs.rows), *([] if plan is None else [plan])]
+    return parts if plan is None else [*parts, plan]
 
 
 # -- against the reference --------------------------------------------------------------------
@@ -168,8 +168,6 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [_summary_of(result)]
-    if result.reference or result.detected:
-        parts.append(figures.distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
     parts += _rates(figures.rates_over(result, np.unique(levels)), "least quality", "quality")

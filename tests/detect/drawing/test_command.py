@@ -158,13 +158,9 @@ def _circle(points: int) -> FloatArray:
     [
         ([], 1, [0, 1, 2]),
         ([], 2, [0, 2]),
-        (["1"], 1, [1]),
-        (["s.0002", "0"], 1, [0, 2]),
+        (["s.0002", "s.0000"], 1, [0, 2]),
         (["images/s.0002.png"], 1, [2]),
-        (["1:"], 1, [1, 2]),
-        ([":2"], 1, [0, 1]),
-        (["0:9:2"], 1, [0, 2]),
-        (["0:3"], 2, [0, 2]),
+        (["s.0000", "s.0001", "s.0002"], 2, [0, 2]),
     ],
 )
 def test_frames_are_selected(
@@ -180,9 +176,6 @@ def test_frames_are_selected(
     ("wanted", "every", "says"),
     [
         (["s.0009"], 1, "expected the name of an image"),
-        (["3"], 1, "0 to 2"),
-        (["5:9"], 1, "none of the run's 3 frames"),
-        (["0:3:0"], 1, "step is 0"),
         ([], 0, "every is 0"),
     ],
 )
@@ -246,7 +239,7 @@ def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path
     (small_run / "detected.markers").write_text(
         f"STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_M rawseeds 5 0.9 {corners}\n"
     )
-    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "0"]) == 0
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "s.0000"]) == 0
     picture = cv2.imread(str(tmp_path / "d" / "s.0000.png"))
     assert picture is not None
     green = np.abs(picture[50, 110:150].astype(int) - (60, 220, 60)).sum(axis=1)
