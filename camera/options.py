@@ -162,8 +162,7 @@ class Convert:
     #: lines (`half`); `double`: the other way (`nohalf`).
     rows: Literal["same", "halve", "double"] = "same"
     limit_px: float = 0.05  #: Largest deviation that is accepted, pixels.
-    #: Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP); the
-    #: target's camera is called so, too, where its format can have such a name.
+    #: Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP).
     camera_name: str = ""
     #: A .cam file whose pose the .cam file gets; other formats have none, and without this it is
     #: the identity, until `camera floor` finds it.

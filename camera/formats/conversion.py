@@ -38,8 +38,6 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-# The rational model's coefficients before those of the thin prism.
-_WITHOUT_PRISM = 8
 # A largest deviation after least squares from which on a fuller model is tried.
 _NEAR_PX = 0.02
 
@@ -166,8 +164,7 @@ def convert_to_foreign(
     rows : str
         `same`, `halve` or `double`.
     free : int, optional
-        Number of the model's first coefficients that may differ from 0; by default all. A thin
-        prism's are taken over, but never fitted.
+        Number of the model's first coefficients that may differ from 0; by default all.
 
     Returns
     -------
@@ -211,7 +208,6 @@ def convert_to_foreign(
         return _measured(camera, check)
 
     # From few coefficients to all: so a fit does not start in a wrong valley.
-    number = min(number, _WITHOUT_PRISM)
     counts = sorted({min(count, number) for count in (1, 2, 4, 5, 6, 7, 8)})
     spans = [np.eye(len(start))[:, : 4 + count] for count in counts]
     return _nearest(CameraFit(pixels, project, possible, measured), start, spans)

@@ -6,8 +6,7 @@ where its files are read) and a distortion of normalised coordinates x = X/Z, y 
 radtan
     k1 k2 p1 p2 k3: polynomial in r^2, with Brown's tangential terms.
 rational
-    k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4: the same over 1 + k4 r^2 + k5 r^4 + k6 r^6, and OpenCV's
-    thin prism.
+    k1 k2 p1 p2 k3 k4 k5 k6: the same over 1 + k4 r^2 + k5 r^4 + k6 r^6.
 fisheye
     k1 k2 k3 k4: polynomial in the angle (Kannala and Brandt; OpenCV's fisheye, ROS's and Kalibr's
     equidistant).
@@ -32,7 +31,7 @@ from redetect.storage.messages import excerpt
 Model = Literal["radtan", "rational", "fisheye"]
 
 #: Number of coefficients that `ForeignCamera.distortion` holds for each model.
-COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 12, "fisheye": 4}
+COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 8, "fisheye": 4}
 
 #: Place of p1, before p2, in those of `radtan` and `rational`.
 P1 = 2
@@ -86,12 +85,6 @@ class ForeignCamera:
     def matrix(self) -> list[float]:
         """The 9 numbers of the camera matrix, row by row."""
         return [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
-
-    @property
-    def printed_distortion(self) -> tuple[float, ...]:
-        """The coefficients without a thin prism that is 0."""
-        d = self.distortion
-        return d[:8] if self.model == "rational" and not any(d[8:]) else d
 
     def distort(self, normalised: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
@@ -152,12 +145,8 @@ def distorted(
     k1, k2, p1, p2, k3 = coefficients[:5]
     factor = 1.0 + q * (k1 + q * (k2 + q * k3))
     if model == "rational":
-        k4, k5, k6 = coefficients[5:8]
+        k4, k5, k6 = coefficients[5:]
         factor = factor / (1.0 + q * (k4 + q * (k5 + q * k6)))
     u = x * factor + 2.0 * p1 * x * y + p2 * (q + 2.0 * x * x)
     v = y * factor + p1 * (q + 2.0 * y * y) + 2.0 * p2 * x * y
-    if model == "rational":
-        s1, s2, s3, s4 = coefficients[8:12]
-        u = u + q * (s1 + s2 * q)
-        v = v + q * (s3 + s4 * q)
     return np.stack([u, v], axis=-1)

@@ -6,7 +6,6 @@ YAML is read safely: plain values only, bounded, without aliases. OpenCV's own d
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -137,7 +136,6 @@ _DISTORTION = (
     "Distortion_Coefficients",
     "D",
 )
-_TILT = 12
 _FISHEYE = ("1", "true", "fisheye", "equidistant")
 
 
@@ -166,9 +164,9 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
         raise ConversionError(
             f"{name}: {count} distortion coefficients: expected 4, 5, 8, 12 or 14"
         )
-    if any(coefficients[_TILT:]):
+    if any(beyond := coefficients[COEFFICIENTS["rational"] :]):
         raise ConversionError(
-            f"{name}: a tilted sensor (tau {excerpt(coefficients[_TILT:])}) can't be converted"
+            f"{name}: a thin prism or a tilted sensor ({excerpt(beyond)}) can't be converted"
         )
     return "radtan" if count <= 5 else "rational"
 
@@ -203,7 +201,7 @@ def foreign(
 
 def format_opencv(camera: ForeignCamera) -> str:
     """The text of an OpenCV YAML file; OpenCV's FileStorage reads it."""
-    d = camera.printed_distortion
+    d = camera.distortion
     lines = ["%YAML:1.0", "---", f"image_width: {camera.width}", f"image_height: {camera.height}"]
     lines += _opencv_matrix("camera_matrix", 3, 3, camera.matrix)
     lines += _opencv_matrix("distortion_coefficients", len(d), 1, d)
@@ -231,7 +229,6 @@ ROS_NAMES: dict[Model, str] = {
 _ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
     "fisheye": "fisheye"
 }
-_ROS_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
@@ -278,18 +275,15 @@ def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None
         )
 
 
-def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
-    """The text of a camera_info YAML file, as camera_calibration writes it.
-
-    A name that is no word, such as a number, is left out for ``camera``.
-    """
-    d, matrix = camera.printed_distortion, camera.matrix
+def format_ros(camera: ForeignCamera) -> str:
+    """The text of a camera_info YAML file, as camera_calibration writes it."""
+    d, matrix = camera.distortion, camera.matrix
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
     identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     lines = [
         f"image_width: {camera.width}",
         f"image_height: {camera.height}",
-        f"camera_name: {camera_name if _ROS_NAME.fullmatch(camera_name) else 'camera'}",
+        "camera_name: camera",
         *_ros_matrix("camera_matrix", 3, 3, matrix),
         f"distortion_model: {ROS_NAMES[camera.model]}",
         *_ros_matrix("distortion_coefficients", 1, len(d), d),
@@ -307,7 +301,6 @@ def _ros_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> l
 _KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
 _KALIBR_COEFFICIENTS = 4
 _LONGEST_LIST = 100
-_KALIBR_NAME = re.compile(r"cam\d+", re.ASCII)
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
@@ -351,14 +344,14 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     return foreign(where, _KALIBR_MODELS[label], width, height, (fx, fy, cx, cy), d)
 
 
-def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
-    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name."""
+def format_kalibr(camera: ForeignCamera) -> str:
+    """The text of a camchain of one camera, ``cam0``."""
     if camera.model == "rational" or any(camera.distortion[_KALIBR_COEFFICIENTS:]):
         raise ConversionError("Kalibr has no rational model and no k3: expected radtan or fisheye")
     d = ", ".join(shortest(value) for value in camera.distortion[:_KALIBR_COEFFICIENTS])
     pinhole = ", ".join(shortest(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     lines = [
-        f"{camera_name if _KALIBR_NAME.fullmatch(camera_name) else 'cam0'}:",
+        "cam0:",
         "  camera_model: pinhole",
         f"  intrinsics: [{pinhole}]",
         f"  distortion_model: {'equi' if camera.model == 'fisheye' else 'radtan'}",
