@@ -25,7 +25,7 @@ from redetect.storage.bounds import (
 )
 
 Preset = Literal["default", "published"]
-DiscPreset = Literal["default", "published", "report"]
+DetectorPreset = Literal["default", "published", "report"]
 LineEnds = Literal["lf", "crlf"]
 
 
@@ -97,7 +97,6 @@ class DetectorFlags(RunFlags):
         named after the video or bag and beside it.
     """
 
-    preset: Preset = "default"  #: Values that the other flags start from.
     #: JSON file with the values that the other flags start from: that of `detect tune --serve`, or
     #: a result's .log.json, to detect with the same ones again.
     settings: MaybePath = None
@@ -146,7 +145,7 @@ class Circles(DetectorFlags):
         rows (all of them and only those), `report` what the report prints of it.
     """
 
-    preset: DiscPreset = "default"  # type: ignore[assignment]
+    preset: DetectorPreset = "default"
     #: Tilts of the frames (written by `detect lines`): positions are corrected for them.
     tilt: MaybePath = None
     #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
@@ -172,7 +171,7 @@ class Lines(DetectorFlags):
         they are known, `report` is what the report prints of their detector.
     """
 
-    preset: Literal["default", "published", "report"] = "default"  # type: ignore[assignment]
+    preset: DetectorPreset = "default"
     #: The tilt file to write; by default the output's name with the ending .tilt.
     tilt: MaybePath = None
     #: A .lines file whose IDs are carried over where the match is unambiguous.
@@ -199,8 +198,6 @@ class Markers(DetectorFlags):
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
         camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
         without one, edges are taken to be straight in the images.
-    preset : str
-        Values that the other flags start from: `published` is the report's detector.
     """
 
     #: Folder for images with the markers drawn in, and with what was rejected.
@@ -222,6 +219,7 @@ class All(DetectorFlags):
         named after the video or bag and beside it.
     """
 
+    preset: Preset = "default"  #: Values that the other flags start from.
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     #: A .lines file whose IDs are carried over where the match is unambiguous.
     line_ids_from: MaybePath = None
