@@ -170,7 +170,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     parts = [_summary_of(result)]
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
-    parts += _rates(figures.rates_over(result, np.unique(levels)), "least quality", "quality")
+    parts += _rates(figures.rates_over(result, np.unique(levels)))
     if result.matched:
         parts.append(figures.floor_figure(result.pairs, lean=result.lean is not None))
     what = "two components for each matched disc"
@@ -185,13 +185,8 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     result = inputs.lines
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
-    sigma = [row.sigma for match in result.frames for row in match.frame.detected]
-    levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
-    # Quantiles between rows may round below the greatest.
-    curve = figures.rates_over(result, np.nextafter(np.unique(levels), np.inf))
     return [
         _summary_of(result),
-        *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),
         *_honesty(result, "one for each matched vertical"),
         *([figures.bearings_figure(result.pairs)] if result.matched else []),
     ]
@@ -205,10 +200,10 @@ def _summary_of(result: Comparison) -> Part:
     )
 
 
-def _rates(curve: figures.RateCurve, axis: str, name: str) -> list[Part]:
+def _rates(curve: figures.RateCurve) -> list[Part]:
     count = len(curve.threshold)
     if not count:
-        return [Part("note", "No rows: no rates over thresholds.")]
+        return [Part("note", "No rows: no rates over the quality.")]
     best = figures.knee(curve.recall, curve.precision)
     chosen = set(np.linspace(0, count - 1, _TABLE_POINTS).astype(int).tolist())
     chosen |= {best} - {None}
@@ -220,9 +215,9 @@ def _rates(curve: figures.RateCurve, axis: str, name: str) -> list[Part]:
         )
         for k in sorted(chosen)
     )
-    head = (name, "rows kept", "recall", "precision")
-    table = Part("table", f"Rates over the threshold ({axis})", head, rows)
-    return [table] if count < 2 else [figures.rates_figure(curve, axis), table]
+    head = ("least quality", "rows kept", "recall", "precision")
+    table = Part("table", "Rates over the quality", head, rows)
+    return [table] if count < 2 else [figures.rates_figure(curve), table]
 
 
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:

@@ -71,18 +71,6 @@ def test_rates_of_a_case_made_by_hand() -> None:
     np.testing.assert_allclose(curve.precision, [2 / 5, 2 / 4, 2 / 3, 1.0, 1.0, np.nan])
 
 
-def test_rates_of_verticals_count_joined_ones_as_comparing_does() -> None:
-    wanted = [line(0.0, 0.001), line(0.004, 0.001), line(0.5, 0.001), line(-0.5, 0.001)]
-    found = [line(0.001, 0.01), line(0.502, 0.002), line(1.0, 0.004)]
-    result = compared_lines([(wanted, found)])
-    curve = rates_over(result, [0.003, 0.005, 0.02])
-    # The wide one represents both lines that it covers.
-    np.testing.assert_allclose(curve.recall, [1 / 4, 1 / 4, 3 / 4])
-    np.testing.assert_allclose(curve.precision, [1.0, 1 / 2, 2 / 3])
-    np.testing.assert_allclose(curve.threshold, np.degrees([0.003, 0.005, 0.02]))
-    assert (result.recall, result.precision) == (curve.recall[-1], curve.precision[-1])
-
-
 def test_rows_set_aside_are_not_kept() -> None:
     """At the least threshold, the rates are those of the comparison."""
     discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
