@@ -84,8 +84,6 @@ class MarkerDetections:
     corners: FloatArray
     covariance: FloatArray  # (N, 4, 2, 2) of each corner, pixels squared
     quality: FloatArray  # (N,) 1 less the mean difference between cells' whiteness and pattern
-    margin: FloatArray  # (N,) how much nearer the pattern is than the second best, in cells
-    explained: FloatArray  # (N,) share of the grey values' variance, noise aside, by the fit
     candidates: tuple[Candidate, ...]  # all regions that came as far as having corners
     rejected: Counter[str]  # how many regions and candidates were not taken, by cause
 
@@ -111,8 +109,7 @@ class _Marker(NamedTuple):
     id: int
     corners: FloatArray  # (4, 2) in the printed order, straight pixels
     covariance: FloatArray  # (4, 2, 2)
-    identity: Identity
-    explained: float
+    quality: float
     blur_px: float
 
 
@@ -187,9 +184,7 @@ def detect_markers(
         ids=np.array([m.id for m in markers], dtype=np.int64),
         corners=np.array(outlines).reshape(-1, 4, 2),
         covariance=np.array(spreads).reshape(-1, 4, 2, 2),
-        quality=np.array([max(0.0, 1.0 - m.identity.distance) for m in markers]),
-        margin=np.array([m.identity.margin for m in markers]),
-        explained=np.array([m.explained for m in markers]),
+        quality=np.array([m.quality for m in markers]),
         candidates=tuple(candidates),
         rejected=+rejected,
     )
@@ -240,9 +235,9 @@ def _identified(
     fit = fit_marker(picture, start, templates, template)
     if fit is None:
         return NOT_FITTED
-    identity = verified_identity(fit, template, templates, settings)
-    if isinstance(identity, str):
-        return identity
+    quality = verified_quality(fit, template, templates, settings)
+    if isinstance(quality, str):
+        return quality
     best: RefinedQuadrangle | PatternFit = fit
     if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
@@ -250,10 +245,10 @@ def _identified(
         again = refine_quadrangle(picture, fit.corners, outline, templates.border, capture_px)
         if again is not None and _contradicts(again, fit):
             best = again
-    number, turns = templates.turned_id(identity.template)
+    number, turns = templates.turned_id(template)
     printed = (np.arange(4) - turns) % 4
     corners, covariance = best.corners[printed], best.covariance[printed]
-    return _Marker(number, corners, covariance, identity, fit.explained, fit.blur_px)
+    return _Marker(number, corners, covariance, quality, fit.blur_px)
 
 
 def _contradicts(refined: RefinedQuadrangle, fit: PatternFit) -> bool:
@@ -322,14 +317,6 @@ _PLAIN_LEAST_AGREEMENT = 0.95
 _PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
-class Identity(NamedTuple):
-    """A marker recognised."""
-
-    template: int
-    distance: float  # mean absolute difference between cells and pattern, 0 to 1
-    margin: float  # squared distance to the second best pattern less that to the best, in cells
-
-
 def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:
     """(G, G) grey values of the grid's cells, each the mean of 3x3; None if some are outside."""
     centres, cell = templates.dictionary.centres, templates.dictionary.cell
@@ -358,10 +345,10 @@ def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) 
     return [int(template) for template in best if correlation[template] >= least]
 
 
-def verified_identity(
+def verified_quality(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
-) -> Identity | str:
-    """The identity of a fitted template by its cells, or the cause of its rejection."""
+) -> float | str:
+    """The quality of a fitted template, or the cause of its rejection by its cells."""
     weakness = templates.weakness
     if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
         return TOO_SMALL
@@ -388,7 +375,7 @@ def verified_identity(
         return AMBIGUOUS
     if decoys < _LEAST_LOG_ODDS:
         return NO_MARKER
-    return Identity(best, distance, margin)
+    return max(0.0, 1.0 - distance)
 
 
 def _between(pair: tuple[float, float], share: float) -> float:
