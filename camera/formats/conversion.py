@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import CameraError, ConversionError
-from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
+from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
 from camera.uncertainty import UNPOSED, intrinsics_of, with_intrinsics
 from redetect.array_types import FloatArray
@@ -189,15 +189,8 @@ def convert_to_foreign(
     if model != "fisheye":
         start[4 + P1 : 4 + P1 + 2] = _tangential(source)
 
-    def seen(parameters: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):
-            moved = distorted(model, parameters[4:], rays)
-            return np.asarray(moved * parameters[:2] + parameters[2:4])
-
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        steps = np.diag(1e-6 * np.maximum(np.abs(parameters), 1.0))
-        differences = [seen(parameters + step) - seen(parameters - step) for step in steps]
-        return seen(parameters), np.stack(differences, axis=-1) / (2.0 * np.diag(steps))
+        return projected(model, parameters, rays)
 
     def possible(parameters: FloatArray) -> bool:
         return bool(min(parameters[:2]) > 0.0)

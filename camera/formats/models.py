@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from camera.errors import ConversionError
@@ -40,7 +41,7 @@ _LARGEST_SIDE_PX = 65536
 # Number of steps from the image's centre in which the inverse is found.
 _WALK = 24
 _NEWTON_STEPS = 20
-_CONVERGED_PX = 1e-7
+_ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
 _SMALLEST_STEP = 1e-6
 
 
@@ -88,22 +89,23 @@ class ForeignCamera:
 
     def distort(self, normalised: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
-        moved = distorted(self.model, self.distortion, normalised)
-        return np.asarray(moved * [self.fx, self.fy] + [self.cx, self.cy], dtype=np.float64)
+        parameters = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        pixels, _ = projected(self.model, parameters, normalised.reshape(-1, 2))
+        return pixels.reshape(normalised.shape)
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
 
         Newton's method, continued outwards from the centre to avoid branches past a fold.
         """
-        target = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
-        xy = np.zeros_like(target)
+        centre = np.array([self.cx, self.cy])
+        xy = np.zeros_like(pixels)
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
                 for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
-                    error = share * target - distorted(self.model, self.distortion, xy)
+                    error = centre + share * (pixels - centre) - self.distort(xy)
                     xy = xy + (inverse_2x2(self._jacobian(xy)) @ error[..., None])[..., 0]
-                    if np.abs(error).max() < 1e-15:
+                    if np.abs(error).max() < _ROUNDING_PX:
                         break
             off = np.abs(self.distort(xy) - pixels).max(axis=-1)
             determinant = np.linalg.det(self._jacobian(xy))
@@ -118,35 +120,31 @@ class ForeignCamera:
         return np.asarray(xy)
 
     def _jacobian(self, xy: FloatArray) -> FloatArray:
-        """(..., 2, 2) d(distorted) / d(x, y), by central differences."""
-        model, d = self.model, self.distortion
+        """(N, 2, 2) d(u, v) / d(x, y), by central differences."""
         step = _SMALLEST_STEP * (1.0 + np.linalg.norm(xy, axis=-1, keepdims=True))
         differences = [
-            distorted(model, d, xy + step * axis) - distorted(model, d, xy - step * axis)
-            for axis in np.eye(2)
+            self.distort(xy + step * axis) - self.distort(xy - step * axis) for axis in np.eye(2)
         ]
         return np.stack([difference / (2.0 * step) for difference in differences], axis=-1)
 
 
-def distorted(
-    model: Model, coefficients: tuple[float, ...] | FloatArray, normalised: FloatArray
-) -> FloatArray:
-    """(..., 2) distorted normalised coordinates of (..., 2) undistorted ones."""
-    x, y = normalised[..., 0], normalised[..., 1]
-    q = x * x + y * y
+def projected(
+    model: Model, parameters: FloatArray, normalised: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels of undistorted normalised coordinates (N, 2), by OpenCV.
+
+    `parameters` (P,) are fx, fy, cx, cy and the coefficients. Returns (N, 2) pixels and their (N,
+    2, P) derivatives by the parameters.
+    """
+    fx, fy, cx, cy = parameters[:4]
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    points = np.column_stack([normalised, np.ones(len(normalised))])[:, None]
+    nowhere = np.zeros(3)
     if model == "fisheye":
-        r = np.sqrt(q)
-        angle = np.arctan(r)
-        a = angle * angle
-        k1, k2, k3, k4 = coefficients
-        bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-        factor = np.where(r > 1e-12, bent / np.where(r > 1e-12, r, 1.0), 1.0)
-        return np.asarray(normalised * factor[..., None])
-    k1, k2, p1, p2, k3 = coefficients[:5]
-    factor = 1.0 + q * (k1 + q * (k2 + q * k3))
-    if model == "rational":
-        k4, k5, k6 = coefficients[5:]
-        factor = factor / (1.0 + q * (k4 + q * (k5 + q * k6)))
-    u = x * factor + 2.0 * p1 * x * y + p2 * (q + 2.0 * x * x)
-    v = y * factor + p1 * (q + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.stack([u, v], axis=-1)
+        seen = cv2.fisheye.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
+        first = 0
+    else:
+        seen = cv2.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
+        first = 6  # after those by the pose
+    by_parameters = seen[1].reshape(len(points), 2, -1)[:, :, first : first + len(parameters)]
+    return np.asarray(seen[0], np.float64).reshape(-1, 2), np.asarray(by_parameters)
