@@ -11,7 +11,7 @@ import pycolmap
 
 from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.yaml_files import foreign, name_of_one, shortest
+from camera.formats.yaml_files import foreign, name_of_one
 from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5
@@ -107,7 +107,7 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
 def format_colmap(camera: ForeignCamera) -> str:
     """The text of a cameras.txt of one camera, number 1."""
     name, parameters = colmap_parameters(camera)
-    values = " ".join(shortest(value) for value in parameters)
+    values = " ".join(map(repr, parameters))
     return (
         "# Camera list with one line of data per camera:\n"
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"

@@ -6,6 +6,7 @@ YAML is read safely: plain values only, bounded, without aliases. OpenCV's own d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -120,14 +121,6 @@ def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float
     return m[0], m[4], m[2], m[5]
 
 
-def shortest(value: float) -> str:
-    """The shortest text that reads back as the same float, with the dot that YAML 1.1 wants."""
-    text = repr(float(value) + 0.0)
-    if "e" in text and "." not in text:
-        return text.replace("e", ".0e")
-    return text
-
-
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _DISTORTION = (
     "distortion_coefficients",
@@ -210,14 +203,19 @@ def format_opencv(camera: ForeignCamera) -> str:
 
 
 def _opencv_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
-    data = ", ".join(shortest(value) for value in values)
     return [
         f"{key}: !!opencv-matrix",
         f"   rows: {rows}",
         f"   cols: {columns}",
         "   dt: d",
-        f"   data: [ {data} ]",
+        f"   data: {_yaml_of(list(values)).strip()}",
     ]
+
+
+def _yaml_of(content: object) -> str:
+    """YAML with keys in their order and lists of numbers on one line."""
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=math.inf)
+    return text
 
 
 #: Names of the models in ROS (sensor_msgs/distortion_models.h).
@@ -277,25 +275,23 @@ def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None
 
 def format_ros(camera: ForeignCamera) -> str:
     """The text of a camera_info YAML file, as camera_calibration writes it."""
-    d, matrix = camera.distortion, camera.matrix
-    projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
-    identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    lines = [
-        f"image_width: {camera.width}",
-        f"image_height: {camera.height}",
-        "camera_name: camera",
-        *_ros_matrix("camera_matrix", 3, 3, matrix),
-        f"distortion_model: {ROS_NAMES[camera.model]}",
-        *_ros_matrix("distortion_coefficients", 1, len(d), d),
-        *_ros_matrix("rectification_matrix", 3, 3, identity),
-        *_ros_matrix("projection_matrix", 3, 4, projection),
-    ]
-    return "\n".join([*lines, ""])
 
+    def matrix(rows: int, *values: float) -> dict[str, Any]:
+        return {"rows": rows, "cols": len(values) // rows, "data": list(values)}
 
-def _ros_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
-    data = ", ".join(shortest(value) for value in values)
-    return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+    m = camera.matrix
+    return _yaml_of(
+        {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_name": "camera",
+            "camera_matrix": matrix(3, *m),
+            "distortion_model": ROS_NAMES[camera.model],
+            "distortion_coefficients": matrix(1, *camera.distortion),
+            "rectification_matrix": matrix(3, *np.eye(3).ravel().tolist()),
+            "projection_matrix": matrix(3, *m[:3], 0.0, *m[3:6], 0.0, *m[6:], 0.0),
+        }
+    )
 
 
 _KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
@@ -348,14 +344,14 @@ def format_kalibr(camera: ForeignCamera) -> str:
     """The text of a camchain of one camera, ``cam0``."""
     if camera.model == "rational" or any(camera.distortion[_KALIBR_COEFFICIENTS:]):
         raise ConversionError("Kalibr has no rational model and no k3: expected radtan or fisheye")
-    d = ", ".join(shortest(value) for value in camera.distortion[:_KALIBR_COEFFICIENTS])
-    pinhole = ", ".join(shortest(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
-    lines = [
-        "cam0:",
-        "  camera_model: pinhole",
-        f"  intrinsics: [{pinhole}]",
-        f"  distortion_model: {'equi' if camera.model == 'fisheye' else 'radtan'}",
-        f"  distortion_coeffs: [{d}]",
-        f"  resolution: [{camera.width}, {camera.height}]",
-    ]
-    return "\n".join([*lines, ""])
+    return _yaml_of(
+        {
+            "cam0": {
+                "camera_model": "pinhole",
+                "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+                "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
+                "distortion_coeffs": list(camera.distortion[:_KALIBR_COEFFICIENTS]),
+                "resolution": [camera.width, camera.height],
+            }
+        }
+    )

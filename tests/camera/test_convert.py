@@ -217,9 +217,9 @@ def test_a_thin_prism_is_refused() -> None:
     text = (
         format_opencv(RATIONAL)
         .replace("rows: 8", "rows: 12")
-        .replace("0.03 ]", "0.03, 0, 0, 0.04, 0 ]")
+        .replace("0.03]", "0.03, 0, 0, 0.04, 0]")
     )
-    assert "0.04, 0 ]" in text
+    assert "0.04, 0]" in text
     with pytest.raises(ConversionError, match=r"a thin prism or a tilted sensor"):
         parse_opencv(text)
     assert parse_opencv(text.replace("0.04", "0")) == RATIONAL
