@@ -16,15 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from detect import __version__
-from detect.comparison.compare import compare_frames, compare_line_frames
-from detect.comparison.result import DiscComparison, LineComparison
+from detect.comparison.compare import compare_frames
+from detect.comparison.result import DiscComparison
 from detect.drawing.inputs import select_frames
 from detect.errors import DetectError
-from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
-from detect.settings import PUBLISHED, CircleSettings
+from detect.settings import CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
@@ -43,9 +42,9 @@ from redetect.storage import OutputExistsError, write_bytes
 
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
-    base = _base(options)
+    base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
-    grid = () if options.serve else combinations(type(base), varied, options.most)
+    grid = () if options.serve else combinations(varied, options.most)
     settings = [replace(base, **combination) for combination in grid]
 
     demand_recording(options.run)
@@ -55,8 +54,6 @@ def perform(options: Tune) -> int:
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 
-        if not isinstance(base, CircleSettings):
-            raise DetectError("--serve and --verticals: the page is for discs")
         frames = [frame for _, frame in selection]
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
@@ -64,7 +61,7 @@ def perform(options: Tune) -> int:
     for path in outputs.values():
         if path.exists() and not options.force:
             raise OutputExistsError(path)
-    path = options.reference or run.folder / ("map.lines" if options.verticals else "map.circles")
+    path = options.reference or run.folder / "map.circles"
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     reference = FramesByImage(path)
@@ -113,16 +110,6 @@ def perform(options: Tune) -> int:
     return report_failures(len(failures), failures)
 
 
-def _base(options: Tune) -> Settings:
-    """The values of what is not varied."""
-    if options.settings is not None:
-        read = read_settings(options.settings)
-        return read.lines if options.verticals else read.circles
-    if options.verticals:
-        return PRESETS[options.preset]
-    return PUBLISHED if options.preset == "published" else CircleSettings()
-
-
 def _plain(value: Any) -> Any:
     """A setting for JSON: what it does not have (infinity, tuples) as words."""
     plain = isinstance(value, bool | int | str) or (
@@ -135,7 +122,7 @@ def _plain(value: Any) -> Any:
 Combination = dict[str, Any]
 
 
-def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
+def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     """The values of a parameter that are to be tried, each once.
 
     `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
@@ -152,10 +139,10 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
             words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
         except (InvalidOperation, ValueError):
             raise DetectError(expected) from None
-    return tuple(dict.fromkeys(word_value(kind, name, word.strip()) for word in words))
+    return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 
 
-def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
+def combinations(varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises
@@ -165,14 +152,12 @@ def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Comb
         raise DetectError(
             "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
         )
-    values = {name: parameter_values(kind, name, text) for name, text in varied.items()}
+    values = {name: parameter_values(name, text) for name, text in varied.items()}
     count = math.prod(len(v) for v in values.values())
     if count > most:
         raise DetectError(f"the grid has {count} combinations: expected at most {most} (--most)")
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
 
-
-Settings = CircleSettings | LineSettings
 
 # Largest number of points that are labelled.
 _MOST_NAMED = 12
@@ -191,19 +176,17 @@ class Trial(NamedTuple):
 def tune_run(
     run: Run,
     frames: Sequence[tuple[RunFrame, Frame]],
-    settings: Sequence[Settings],
+    settings: Sequence[CircleSettings],
     options: CompareOptions,
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[Trial]:
-    """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
+    """Detect discs in frames of a run with each setting; yields the trial of each.
 
     `frames` come with their reference rows; `on_progress` is called after every frame of every
     setting.
     """
-    kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
-    changes: list[dict[str, Any]] = [{kind: each} for each in settings]
-    plans = [FramePlan(run.camera, **change) for change in changes]
+    plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame, _ in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(detect_chunks(work, plans[0], workers)) as chunks:
@@ -213,21 +196,17 @@ def tune_run(
             failures: list[str] = []
             for _, each in islice(done, len(tasks)):
                 found += frames_of_rows(
-                    parse_rows(io.BytesIO(each.rows[kind].encode("utf-8", "surrogateescape")))
+                    parse_rows(io.BytesIO(each.rows["circles"].encode("utf-8", "surrogateescape")))
                 )
                 failures += [] if each.error is None else [each.error]
                 on_progress()
-            compare = compare_frames if kind == "circles" else compare_line_frames
-            result = compare([rows for _, rows in frames], found, options)
+            result = compare_frames([rows for _, rows in frames], found, options)
             yield Trial(figures_of(result), tuple(failures))
 
 
-def figures_of(result: DiscComparison | LineComparison) -> dict[str, Any]:
+def figures_of(result: DiscComparison) -> dict[str, Any]:
     """What a table has of a comparison; `matched` are the reference rows that were found."""
     recall, precision = result.recall, result.precision
-    median = (
-        result.error_median_m if isinstance(result, DiscComparison) else result.bearing_median_deg
-    )
     return {
         "reference": result.reference,
         "detected": result.detected,
@@ -235,7 +214,7 @@ def figures_of(result: DiscComparison | LineComparison) -> dict[str, Any]:
         "recall": recall,
         "precision": precision,
         "f1": None if recall is None or precision is None else float(f1_score(recall, precision)),
-        f"error_median_{result.unit}": median,
+        "error_median_m": result.error_median_m,
         "normalised_error": result.normalised_error.per_dof,
     }
 

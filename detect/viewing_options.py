@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import CompareError
-from detect.line_settings import LineSettings
-from detect.options import PickedFrames, Preset, RunFlags, SourceOptions
+from detect.options import PickedFrames, RunFlags, SourceOptions
 from detect.settings import CircleSettings
 from redetect.storage.bounds import (
     ABOVE_0,
@@ -199,7 +198,7 @@ class Demo:
 if TYPE_CHECKING:
 
     class Grid:
-        """One `str` or None for each field of `CircleSettings` and of `LineSettings`."""
+        """One `str` or None for each field of `CircleSettings`."""
 
 else:
 
@@ -207,12 +206,9 @@ else:
         def values_of(name: str) -> object:
             return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
 
-        names = {f.name: None for kind in (CircleSettings, LineSettings) for f in fields(kind)}
-        # Several numbers are no value of a grid.
-        del names["refine_steps_px"], names["blurred_widths"]
         return make_dataclass(
             "Grid",
-            [(name, values_of(name), field(default=None)) for name in names],
+            [(f.name, values_of(f.name), field(default=None)) for f in fields(CircleSettings)],
             namespace={"__doc__": "Parameters to be varied: FROM:TO:STEP, or values with commas."},
             frozen=True,
         )
@@ -226,10 +222,9 @@ class Tune(PickedFrames, RowsFlags):
 
     Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
 
-    Any parameter of `detect circles` (with --verticals: of `detect lines`) can be varied: by
-    FROM:TO:STEP, both ends included, or by values with commas between them. All combinations are
-    tried. With --serve, the settings of discs are turned by hand on a page instead, which needs no
-    reference rows, and labels discs.
+    Any parameter of `detect circles` can be varied: by FROM:TO:STEP, both ends included, or by
+    values with commas between them. All combinations are tried. With --serve, they are turned by
+    hand on a page instead, which needs no reference rows, and labels discs.
 
     Parameters
     ----------
@@ -241,11 +236,7 @@ class Tune(PickedFrames, RowsFlags):
     serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
-    verticals: bool = False  #: Tune the detector of verticals instead of that of discs.
-    #: `default` or `published`: the values of all parameters that are not varied.
-    preset: Preset = "default"
-    #: Reference rows; by default map.circles (map.lines) in the run folder.
-    reference: MaybePath = None
+    reference: MaybePath = None  #: Reference rows; by default map.circles in the run folder.
     most: int = 1000  #: Refuse grids of more combinations than this.
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames to process, at most as many as there are cores. What is written is the same.
