@@ -11,7 +11,10 @@ import numpy as np
 from camera.boards.board import Board
 from camera.calibration.adjustment import (
     Adjusted,
+    Estimate,
     Points,
+    circle_shifts,
+    project_estimate,
 )
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
@@ -98,6 +101,9 @@ def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
     return warnings
 
 
+# Residual, in standard deviations, beyond which a point is an outlier.
+_WRONG_POINT = 8.0
+_FEWEST_POINTS = 8
 # Pictures that leave the ratio of the scales more uncertain than this leave it open.
 _ASPECT_SIGMA = 0.003
 
@@ -169,6 +175,9 @@ def calibrate(
         demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)
         start, measured = consensus.estimate.of(used), measured.of(used)
+        measured, wrong = _without_wrong_points(
+            start, measured, consensus.fit.sigma_px, settings, radius
+        )
         lens, tried = choose_lens(start, measured, settings, radius)
     except (StartError, np.linalg.LinAlgError):
         raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
@@ -176,6 +185,8 @@ def calibrate(
     adjusted, points = tried[lens].adjusted, tried[lens].points
     demand_different_views(adjusted)
     warnings = warnings_of(adjusted, points, normals_spread_deg(adjusted.estimate.rotations))
+    if wrong:
+        warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
     return Calibration(adjusted, points, names, outliers, lens, holdout, tuple(warnings))
 
@@ -229,3 +240,24 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
         width=size[0],
         height=size[1],
     )
+
+
+def _without_wrong_points(
+    estimate: Estimate,
+    points: Points,
+    sigma_px: float,
+    settings: CalibrationSettings,
+    radius_m: float,
+) -> tuple[Points, int]:
+    """Leave out points that were found wrongly; the second result says how many."""
+    if not settings.robust:
+        return points, 0
+    seen = points.pixels
+    if radius_m > 0.0:
+        shifts = circle_shifts(estimate, points, radius_m)
+        seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
+    residuals = seen - project_estimate(estimate, points)[0]
+    right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
+    # A picture with too few points left is unchanged: the robust loss deals with it.
+    right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
+    return points.where(right), int(np.sum(~right))

@@ -92,6 +92,7 @@ def test_a_picture_stays_for_all_but_a_point_that_is_wrong() -> None:
         view.pixels[view.indices[9]] += (5.0, -4.0)
     found = calibrate(views, BOARD, (640, 480), SETTINGS)
     assert found.outliers == ()
+    assert found.warnings[0].startswith("6 points left out")
     assert_true(found)
 
 
