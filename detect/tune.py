@@ -44,7 +44,7 @@ def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
-    grid = () if options.serve else combinations(varied, options.most)
+    grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
 
     demand_recording(options.run)
@@ -142,20 +142,17 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 
 
-def combinations(varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
+def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises
-    DetectError if nothing is varied, there are more than `most`, or as `parameter_values` does.
+    DetectError if nothing is varied, or as `parameter_values` does.
     """
     if not varied:
         raise DetectError(
             "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
         )
     values = {name: parameter_values(name, text) for name, text in varied.items()}
-    count = math.prod(len(v) for v in values.values())
-    if count > most:
-        raise DetectError(f"the grid has {count} combinations: expected at most {most} (--most)")
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
 
 

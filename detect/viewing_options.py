@@ -37,9 +37,6 @@ class CompareOptions:
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
     tolerance_deg: Positive = 0.5  #: Bearings of the same line differ by at most this,
     sigmas: NotNegative = 2.0  #: or by this many standard deviations of the detected one.
-    #: In the image, discs are the same if they differ by at most half the width and height of the
-    #: disc's own image, or by this (px), whichever is more.
-    least_px: Positive = 3.0
     #: Count only reference rows that have an ID. Detected rows that fit a reference row without one
     #: are then neither right nor wrong: they are set aside.
     only_identified: bool = False
@@ -64,9 +61,6 @@ class Compare:
     #: Discs (lines) that may be detected but need not be: rows on them are neither right nor wrong;
     #: by default unlisted.circles (unlisted.lines) beside the reference, if it is there.
     unlisted: MaybePath = None
-    #: What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
-    #: beside the reference, if it is there.
-    lookalikes: MaybePath = None
     #: Calibration, by default the one in the run folder: discs are compared in the image, each row
     #: where it was seen. Without one, or with --gate-m, on the floor.
     camera: MaybePath = None
@@ -237,7 +231,6 @@ class Tune(PickedFrames, RowsFlags):
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
     reference: MaybePath = None  #: Reference rows; by default map.circles in the run folder.
-    most: int = 1000  #: Refuse grids of more combinations than this.
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None

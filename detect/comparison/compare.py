@@ -66,12 +66,11 @@ def compare_with_file(
     *,
     sight: Sight | None = None,
     unlisted: Path | None = None,
-    lookalikes: Path | None = None,
     names: tuple[str, str] | None = None,
 ) -> Comparison:
     """Compare discs, or lines, with those of a reference file.
 
-    The rest as in `compare_frames`; unlisted ones and look-alikes are by default those in the
+    The rest as in `compare_frames`; look-alikes, and by default unlisted ones, are those in the
     reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
     names = names or (str(reference), "detected")
@@ -84,7 +83,7 @@ def compare_with_file(
     uncounted = rows("unlisted", unlisted)
     if kind == "lines":
         return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
-    alike = rows("lookalikes", lookalikes)
+    alike = rows("lookalikes", None)
     return compare_frames(
         wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
@@ -147,8 +146,7 @@ def compare_frames(
     true = sight is not None and sight.reference_level
     ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
     return DiscComparison(
-        **common,
-        on_lookalikes=_on_lookalikes(matches, lookalikes, options),
+        **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
         normalised_error=normalised_error(pairs.offset, second.covariance),
@@ -304,6 +302,7 @@ def match_runs(
         "detected": detected_rows,
         "found": found,
         **counts,
+        "on_lookalikes": None,
         "recall": found / wanted if wanted else None,
         "precision": counts["matched"] / detected_rows if detected_rows else None,
         "frames": tuple(matches),
@@ -378,7 +377,7 @@ def pair_discs(
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and options.gate_m is None:
         seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
-        gate = view.gates(first.xy, options.least_px)
+        gate = view.gates(first.xy)
         apart = (again[None] - seen[:, None]) / gate[:, None]
         cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
         return associate(np.minimum(cost, 2.0), cost <= 1.0)

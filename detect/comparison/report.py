@@ -27,7 +27,7 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.seen import Sight
+from detect.seen import LEAST_GATE_PX, Sight
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
@@ -53,8 +53,6 @@ def perform(command: Compare) -> int:
 
 def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     """The comparison that a command asks for; with a camera, if it isn't named by its file."""
-    if command.lines and command.lookalikes:
-        raise DetectError("--lookalikes are of discs: expected none with --lines")
     kind: Kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
@@ -78,7 +76,6 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
         command.matching,
         sight=sight,
         unlisted=command.unlisted,
-        lookalikes=command.lookalikes,
         names=(str(reference), str(detected)),
     )
 
@@ -115,7 +112,7 @@ def comparison_tables(comparison: Comparison) -> Group:
 def summary_rows(c: Comparison) -> dict[str, str]:
     """Names and words: what was found first, then how it was compared and how large errors are."""
     only = c.options.only_identified
-    on_lookalikes = c.lookalikes_found
+    on_lookalikes = c.on_lookalikes
     joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
     rows = {
         "found": f"{c.found} of {c.reference} reference rows{joined}",
@@ -162,7 +159,7 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         how = "at the pixels where they were seen" if c.in_image else "on the floor"
         rows["levelled"] = f"{'; '.join(_levelled_side(*s) for s in sides)}: compared {how}"
     if c.in_image:
-        same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
+        same = f"in the image, within half the disc's image or {LEAST_GATE_PX:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
         rows |= {"same disc": same, "image difference": apart}
     else:

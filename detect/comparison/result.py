@@ -194,6 +194,7 @@ class Comparison(ABC):
     missed: int
     extra: int
     set_aside: int
+    on_lookalikes: int | None  # extra rows on what resembles a disc, where that is known
     recall: float | None
     precision: float | None
     frames: tuple[FrameMatch, ...] = field(repr=False)
@@ -207,7 +208,7 @@ class Comparison(ABC):
             f"{self.missed} missed, in {len(self.frames)} frames."
         )
         extra = f"{self.matched} of {self.detected} detected rows are {self.what} of the reference;"
-        alike = self.lookalikes_found
+        alike = self.on_lookalikes
         if alike is None:
             extra += f" {self.extra} are on nothing that it has (look-alikes are not known)."
         else:
@@ -216,11 +217,6 @@ class Comparison(ABC):
                 f"{self.extra - alike or 'none'} on nothing known."
             )
         return found, extra, *self._error_sentences()
-
-    @property
-    def lookalikes_found(self) -> int | None:
-        """Extra rows on known look-alikes; None where no look-alikes are listed."""
-        return None
 
     @abstractmethod
     def _error_sentences(self) -> tuple[str, str]:
@@ -266,7 +262,6 @@ class DiscComparison(Comparison):
 
     what, unit = "discs", "m"
 
-    on_lookalikes: int | None  # extra rows on what resembles a disc
     error_median_m: float | None
     error_95_m: float | None
     normalised_error: NormalisedError
@@ -283,11 +278,6 @@ class DiscComparison(Comparison):
     floor: tuple[FloorBin, ...]
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
-
-    @property
-    def lookalikes_found(self) -> int | None:
-        """As `on_lookalikes`."""
-        return self.on_lookalikes
 
     def _error_sentences(self) -> tuple[str, str]:
         median, most = (

@@ -15,10 +15,8 @@ from detect.comparison.result import Comparison, DiscComparison, Kind, LineCompa
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
-from detect.line_settings import LineSettings
 from detect.report import figures
 from detect.seen import Sight
-from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.viewing_options import Report, RowFiles
@@ -107,8 +105,9 @@ def perform(options: Report) -> int:
     return 0
 
 
-_NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
-_SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}
+_NAMES = {
+    "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
+}  # fmt: skip
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
@@ -132,27 +131,15 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
 
 def _summary(inputs: ReportInputs) -> list[Part]:
     shown = [("frames", str(len(inputs.rows)))]
-    rows = []
-    for kind, path in inputs.files.detected.items():
-        frames = [getattr(seen, kind) for seen in inputs.rows]
-        counts = [
-            0 if frame is None else 1 if kind == "tilt" else len(getattr(frame, kind))
-            for frame in frames
-        ]
-        name = "frames with a tilt" if kind == "tilt" else _NAMES[kind].lower()
-        shown.append((name, str(sum(counts))))
-        rows.append(
-            (_NAMES[kind], path.name, str(sum(counts)), str(sum(count > 0 for count in counts)))
-        )
+    for kind in inputs.files.detected:
+        frames = [frame for seen in inputs.rows if (frame := getattr(seen, kind)) is not None]
+        count = len(frames) if kind == "tilt" else sum(len(getattr(f, kind)) for f in frames)
+        shown.append((_NAMES[kind], str(count)))
     for name, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
         if result is not None:
             shown.append((f"recall of {name}", number(result.recall, 3)))
             shown.append((f"precision of {name}", number(result.precision, 3)))
-    head = ("what", "file", "rows", "frames with some")
-    parts = [
-        Part("figures", rows=tuple(shown)),
-        Part("table", "Files of rows", head, tuple(rows), left=(0, 1)),
-    ]
+    parts = [Part("figures", rows=tuple(shown))]
     if len(inputs.rows) < 2:
         return parts
     plan = figures.floor_map(inputs.rows)
@@ -278,42 +265,20 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
     tilts = [seen.tilt for seen in inputs.rows if seen.tilt is not None]
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
-    rows = []
-    for name, value, variance in (
-        ("pitch", [t.pitch for t in tilts], [t.cpp for t in tilts]),
-        ("roll", [t.roll for t in tilts], [t.crr for t in tilts]),
-    ):
-        angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
-        values = (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))
-        rows.append((name, *(f"{v:.3f}" for v in values)))
-    head = ("degrees", "mean", "deviation", "largest", f"median of its {_SIGMA}")
     lines = np.median([t.lines for t in tilts])
-    caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
+    words = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)."
     figure = [figures.tilt_figure(inputs.rows)] if len(tilts) > 1 else []
-    return [*figure, Part("table", caption, head, tuple(rows))]
+    return [*figure, Part("note", words)]
 
 
 def _settings(inputs: ReportInputs) -> list[Part]:
     parts: list[Part] = []
     for kind, head in inputs.files.heads.items():
-        default = _SETTINGS[kind]() if kind in _SETTINGS else None
-        # As heads write them.
-        usual = (
-            {name: str(value).replace(" ", "") for name, value in vars(default).items()}
-            if default
-            else {}
-        )
         name = inputs.files.detected[kind].name
         parts.append(Part("heading", name))
         if head.settings:
-            changed = [usual.get(key, value) != value for key, value in head.settings]
-            rows = tuple(
-                (key, value, usual.get(key, "") if differs else "")
-                for (key, value), differs in zip(head.settings, changed)
-            )
-            bold = tuple(np.flatnonzero(changed).tolist())
-            caption = f"Settings in the head of {name}; bold where not the default"
-            parts.append(Part("table", caption, ("setting", "value", "default"), rows, bold=bold))
+            caption = f"Settings in the head of {name}"
+            parts.append(Part("table", caption, ("setting", "value"), head.settings))
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
     parts.append(Part("note", f"Page written by detect report, version {__version__}."))

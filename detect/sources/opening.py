@@ -6,16 +6,13 @@ import math
 import re
 from pathlib import Path
 
-from camera import camera_in, read_camera
+from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import (
     IMAGE_SUFFIXES,
     WILDCARDS,
     ImageFiles,
-    RunFrames,
-    bits_of_images,
-    images_of_folder,
 )
 from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
@@ -80,20 +77,18 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
-    own = _own_odometry(name) if name.is_dir() else None
-    if own is not None and options.plain and not _is_ros2_bag(name):
-        camera = camera_in(name) if camera_path is None else read_camera(camera_path)
-        images = images_of_folder(name)
-        frames: Frames = RunFrames(images, own, options.bits or bits_of_images(images))
-        frames = FirstFrames(frames, options.frames) if options.frames else frames
-        run = ImageRun(name, frames, own, name / "detected")
-        return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
-    frames, odometry = _frames(source, options)
+    frames: Frames
+    odometry: Path | None
+    if options.plain and isinstance(source, ImageFiles) and (own := _own_odometry(name)):
+        frames, odometry, has_times = source.along(own), own, False
+    else:
+        frames, odometry = _frames(source, options)
+        has_times = source.has_times
     frames = FirstFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
-    run = ImageRun(base.parent, frames, odometry, base, has_times=source.has_times)
+    run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     if camera is None:
         return run
     if source.size is not None and source.size != (camera.width, camera.height):

@@ -238,13 +238,3 @@ def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path
     found = compare(camera, raw, level)
     assert found.recall == found.precision == 1.0
     assert found.image_95_px == pytest.approx(0.0, abs=1e-6)
-
-
-def test_what_is_beside_discs_is_nothing_to_lines(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["compare", str(tmp_path), "--lines", "--lookalikes", "unlisted.circles"]
-    assert main(arguments) == 1
-    assert capsys.readouterr().err == (
-        "error: --lookalikes are of discs: expected none with --lines\n"
-    )
