@@ -111,8 +111,6 @@ class Board(BoardFlags):
     columns: int = 1  #: As in `camera calibrate`; of discs, how many side by side.
     rows: int = 1  #: Likewise, of a column.
     square_m: float = 0.025  #: Side of a square, or the distance of rows of circles (m).
-    #: The paper, upright or not; `auto`: the smallest that it fits on.
-    page: Literal["auto", "A4", "A3", "A2", "A1", "A0"] = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
