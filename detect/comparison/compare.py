@@ -29,7 +29,6 @@ from detect.comparison.result import (
     FrameMatch,
     FramePair,
     Kind,
-    Levelling,
     LineComparison,
     LinePairs,
 )
@@ -143,7 +142,6 @@ def compare_frames(
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
-    true = sight is not None and sight.reference_level
     ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
     return DiscComparison(
         **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
@@ -158,8 +156,8 @@ def compare_frames(
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
-        reference_levelling=_levelling(matches, wanted, true=true),
-        detected_levelling=_levelling(matches, found),
+        reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
+        detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
         floor=tuple(floor_bin(pairs, lean, part) for part in ranges),
         lean=lean,
         pairs=pairs,
@@ -239,15 +237,6 @@ def _on_lookalikes(
         for m in matches
         if m.frame.name in known
     )
-
-
-def _levelling(
-    matches: Sequence[FrameMatch], frames: Mapping[str, Frame], *, true: bool = False
-) -> Levelling:
-    by = [frames[m.frame.name].levelled_by for m in matches if m.frame.name in frames]
-    tilts = np.degrees([tilt for tilt in by if tilt is not None]).reshape(-1, 2)
-    medians = (quantile(tilts[:, 0]), quantile(tilts[:, 1]))
-    return Levelling(len(matches), len(tilts), true and not len(tilts), *medians)
 
 
 #: Of discs that are compared on the floor, where nothing else is said (m).

@@ -19,7 +19,6 @@ from detect.comparison.result import (
     Comparison,
     DiscComparison,
     Kind,
-    Levelling,
     LineComparison,
     NormalisedError,
     number,
@@ -154,10 +153,12 @@ def summary_rows(c: Comparison) -> dict[str, str]:
 
 def _disc_rows(c: DiscComparison) -> dict[str, str]:
     rows = {}
-    if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        sides = ("reference", c.reference_levelling), ("detected", c.detected_levelling)
+    if c.reference_levelled or c.detected_levelled:
         how = "at the pixels where they were seen" if c.in_image else "on the floor"
-        rows["levelled"] = f"{'; '.join(_levelled_side(*s) for s in sides)}: compared {how}"
+        rows["levelled"] = (
+            f"{c.reference_levelled} frames of the reference, {c.detected_levelled} detected ones: "
+            f"compared {how}"
+        )
     if c.in_image:
         same = f"in the image, within half the disc's image or {LEAST_GATE_PX:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
@@ -175,18 +176,6 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         text = f"median {number(matched, 3)} matched, {number(alone, 3)} {fate}"
         rows[f"{side} quality"] = text
     return rows
-
-
-def _levelled_side(name: str, side: Levelling) -> str:
-    if side.pitch_deg is None or side.roll_deg is None:
-        if side.true:
-            return f"{name} rows are level"
-        return f"{name} rows are where the camera as calibrated saw them"
-    which = "all" if side.levelled == side.frames else f"{side.levelled} of {side.frames}"
-    return (
-        f"{name} rows are levelled in {which} frames "
-        f"(medians: pitch {side.pitch_deg:.2f}, roll {side.roll_deg:.2f} deg)"
-    )
 
 
 def _lean_text(lean: CommonLean) -> str:

@@ -107,17 +107,6 @@ class DistanceBin(ForwardRange):
 
 
 @dataclass(frozen=True)
-class Levelling:
-    """How many frames' rows are levelled, and by what (medians)."""
-
-    frames: int
-    levelled: int
-    true: bool  # rows are level positions that no tilt was applied to
-    pitch_deg: float | None
-    roll_deg: float | None
-
-
-@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
@@ -273,8 +262,8 @@ class DiscComparison(Comparison):
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
-    reference_levelling: Levelling
-    detected_levelling: Levelling
+    reference_levelled: int  # frames whose rows are levelled by a tilt
+    detected_levelled: int
     floor: tuple[FloorBin, ...]
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
