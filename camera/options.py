@@ -34,29 +34,10 @@ class BoardFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardOnFloor(BoardFlags):
-    """A board that lies on the floor."""
-
-    #: Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
-    floor_origin: tuple[float, float] = (0.0, 0.0)
-    #: By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
-    #: axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
-    #: back right, 180: at the front left. With 180 the board appears upright in the image.
-    floor_yaw: float = 0.0
-    #: Folder for pictures to check by: the corners found and projected in each photograph; of the
-    #: floor's photograph its grid and the horizon, and the floor from above.
-    pictures: MaybePath = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibrate(BoardOnFloor):
+class Calibrate(BoardFlags):
     """Calibrate a camera from photographs or a video of a board.
 
     Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam
-
-    With the pose from a photograph of the same board on the floor, its middle 1.5 m ahead of the
-    robot: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025
-    --floor floor.jpg --floor-origin 0 -1.5 --floor-yaw 180 -o my.cam
 
     Parameters
     ----------
@@ -84,9 +65,8 @@ class Calibrate(BoardOnFloor):
     keep_outliers: bool = False
     #: Use at most this many pictures, and at most this many frames per video, evenly spaced.
     max_images: int = 60
-    #: A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
-    #: it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.
-    floor: MaybePath = None
+    #: Folder for pictures to check by: the corners found and projected in each photograph.
+    pictures: MaybePath = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +94,7 @@ class Board(BoardFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Floor(BoardOnFloor):
+class Floor(BoardFlags):
     """Give a calibrated camera its pose, from a board or known places on the floor.
 
     Example: camera floor my.cam floor.jpg --columns 9 --rows 6 --square-m 0.025
@@ -131,6 +111,15 @@ class Floor(BoardOnFloor):
     columns: int = 0
     rows: int = 0  #: Likewise, of a column.
     square_m: float = 0.0  #: Side of a square, or the distance of rows of circles (m).
+    #: Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
+    floor_origin: tuple[float, float] = (0.0, 0.0)
+    #: By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
+    #: axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
+    #: back right, 180: at the front left. With 180 the board appears upright in the image.
+    floor_yaw: float = 0.0
+    #: Folder for pictures to check by: the floor's grid and the horizon in the photograph, and the
+    #: floor from above.
+    pictures: MaybePath = None
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,7 @@ from camera.calibration.calibrate import (
     calibrate,
     calibrate_freely,
 )
-from camera.calibration.floor import (
-    describe_pose,
-    file_name,
-    floor_points,
-    place_on_floor,
-    placed_camera,
-    write_floor_pictures,
-    write_picture,
-)
+from camera.calibration.floor import file_name, write_picture
 from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
@@ -57,8 +49,6 @@ def perform(options: Calibrate) -> int:
     # Checked first, not after minutes of work.
     for path in (output, *names.values()):
         demand_place(path, overwrite=options.force)
-    if options.floor is not None and not options.floor.exists():
-        raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
     board = board_of(options)
     settings = CalibrationSettings(
         aspect=0.5 if options.half else 1.0,
@@ -74,31 +64,21 @@ def perform(options: Calibrate) -> int:
     if board.kind == "checkerboard":
         board = true_board(images(), board)
     views, size = find_views(images(), board)
-    # Found before the calibration, which takes minutes.
-    floor = None if options.floor is None else floor_points(options, board, options.floor, size)
     calibrated = calibrate_freely if options.free_aspect else calibrate
     calibration = calibrated(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
-    if floor is not None:
-        covariance = calibration.adjusted.covariance
-        placed = place_on_floor(camera, floor.pixels, floor.xy, covariance, floor.radius_m)
-        camera = placed_camera(camera, placed, covariance)
-        print(describe_pose(placed))
-    else:
-        print(
-            "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
-            "board on the floor"
-        )
+    print(
+        "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
+        "board on the floor"
+    )
     if options.pictures is not None:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
                 place = options.pictures / f"{file_name(name)}.corners.png"
                 write_picture(picture, place, force=options.force)
-        if options.floor is not None:
-            write_floor_pictures(options, options.floor, camera)
     drawn = pictures(calibration, camera)
     for name, path in names.items():
         write_bytes(path, drawn[name], overwrite=options.force)
