@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from redetect.storage.bounds import MaybePath
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
-Format = Literal["auto", "cam", "opencv", "ros", "kalibr", "colmap"]
+Format = Literal["cam", "opencv", "ros", "kalibr", "colmap"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,12 +135,10 @@ class Convert:
     --limit-px nothing is written.
     """
 
-    source: Positional[Path]  #: The calibration to convert.
-    target: Positional[Path]  #: The file to write.
-    from_format: Format = "auto"  #: `auto`: from the file's ending and content.
-    #: `auto`: from the ending: .cam; cameras.txt; .opencv.yaml, .ros.yaml or .kalibr.yaml, and
-    #: camera_info.yaml, camchain.yaml.
-    to_format: Format = "auto"
+    source: Positional[Path]  #: The calibration to convert; its content says the format.
+    #: The file to write; its name says the format: .cam; cameras.txt; .opencv.yaml, .ros.yaml or
+    #: .kalibr.yaml, and camera_info.yaml, camchain.yaml.
+    target: Positional[Path]
     #: Distortion model of the target: `radtan` (k1 k2 p1 p2, with OpenCV and ROS also k3),
     #: `rational` (k1 to k6), `fisheye` (equidistant); `auto`: the first of them that is within the
     #: limit.

@@ -86,8 +86,6 @@ class RowFiles:
     reference: MaybePath = None
     #: Reference rows of verticals, by default map.lines in the run folder if it exists.
     reference_lines: MaybePath = None
-    #: Hold nothing against reference rows, not even where there are some.
-    no_reference: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,12 +43,8 @@ def perform(options: Convert) -> int:
     """Carry the command out; returns the exit code."""
     demand_place(options.target, overwrite=options.force)
     text = read_text(options.source)
-    from_format = options.from_format
-    if from_format == "auto":
-        from_format = format_of_text(options.source, text)
-    to_format = options.to_format
-    if to_format == "auto":
-        to_format = format_of_name(options.target)
+    from_format = format_of_text(options.source, text)
+    to_format = format_of_name(options.target)
     source = parse(text, from_format, str(options.source), options.camera_name)
     try:
         converted = convert(source, to_format, options)
@@ -108,8 +104,8 @@ def format_of_name(path: Path) -> Format:
             if part in name:
                 return found
     raise ConversionError(
-        f"{path}: the name does not say which format: give --to-format opencv, ros, kalibr or "
-        "colmap, or end it in .cam, .opencv.yaml, .ros.yaml, .kalibr.yaml or cameras.txt"
+        f"{path}: the name does not say which format: end it in .cam, .opencv.yaml, .ros.yaml, "
+        ".kalibr.yaml or cameras.txt"
     )
 
 
@@ -144,7 +140,7 @@ def format_of_text(path: Path, text: str) -> Format:
     raise ConversionError(
         f"{path}: neither a .cam file nor a camera in OpenCV's, ROS's, Kalibr's or COLMAP's format "
         "that is recognised (they have image_width, distortion_model, cam0 with intrinsics, or are "
-        "a cameras.txt): give --from-format"
+        "a cameras.txt)"
     )
 
 

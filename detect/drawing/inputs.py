@@ -151,9 +151,9 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     reference: dict[str, Path] = {}
     for kind, named in (("circles", options.reference), ("lines", options.reference_lines)):
         path = named or run.folder / f"map.{kind}"
-        if named is not None and not named.is_file() and not options.no_reference:
+        if named is not None and not named.is_file():
             raise DetectError(f"{named}: no such file: expected reference rows")
-        if kind in detected and path.is_file() and not options.no_reference:
+        if kind in detected and path.is_file():
             reference[kind] = path
     return RunRows(detected, reference)
 

@@ -273,6 +273,6 @@ def test_the_command_converts_and_refuses(
     assert main([*to_kalibr, "--limit-px", "0.2"]) == 0
     assert parse_kalibr(kalibr.read_text()).model == "fisheye"
     assert main(["convert", str(cam), str(tmp_path / "e.yaml")]) == 1
-    assert "--to-format" in capsys.readouterr().err
+    assert "does not say which format" in capsys.readouterr().err
     assert main(["convert", str(cam), str(yaml)]) == 1
     assert "--force" in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_it_starts_without_anything_heavy(project_root: Path) -> None:
         ("detect all RUN --circles.radus_m=1", "did you mean --circles.radius-m?"),
         ("slam map RUN --loops huber", "slam map: no flag '--loops': did you mean --loss?"),
         ("groundtruth pose RUN", "did you mean poses?"),
-        ("camera convert a b --formato x", "did you mean --to-format?"),
+        ("camera convert a b --limit 1", "did you mean --limit-px?"),
         ("explain IMAGE --polaritty dark", "did you mean --polarity?"),
     ],
 )
