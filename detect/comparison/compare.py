@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from detect.comparison.floor import floor_bin, floor_pairs, normalised_error, quantile
+from detect.comparison.floor import floor_difference, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
+    DiscPairs,
     DistanceBin,
     ForwardRange,
     FrameMatch,
@@ -152,13 +153,12 @@ def compare_frames(
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
-        bins=tuple(_distance_bin(part, sides, error_m) for part in ranges),
+        bins=tuple(_distance_bin(part, sides, pairs, lean is not None) for part in ranges),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
         reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
-        floor=tuple(floor_bin(pairs, lean, part) for part in ranges),
         lean=lean,
         pairs=pairs,
     )
@@ -201,7 +201,7 @@ def compare_line_frames(
 
 
 def _distance_bin(
-    part: ForwardRange, sides: tuple[CircleArrays, ...], error_m: FloatArray
+    part: ForwardRange, sides: tuple[CircleArrays, ...], pairs: DiscPairs, has_lean: bool
 ) -> DistanceBin:
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
     inside = [part.holds(side.xy) for side in sides]
@@ -220,8 +220,10 @@ def _distance_bin(
         precision=second / (second + extra) if second + extra else None,
         reference_quality_median=wanted,
         detected_quality_median=found,
-        error_median_m=quantile(error_m[inside[0]]),
+        error_median_m=quantile(np.linalg.norm(pairs.offset[inside[0]], axis=1)),
         quality_difference=None if wanted is None or found is None else found - wanted,
+        before=floor_difference(pairs.offset[inside[0]], pairs.away[inside[0]]),
+        after=floor_difference(pairs.left[inside[0]], pairs.away[inside[0]]) if has_lean else None,
     )
 
 

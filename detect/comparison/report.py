@@ -227,7 +227,7 @@ def _over_distance(c: DiscComparison) -> FigureTable:
 def floor_table(c: DiscComparison) -> FigureTable:
     """Differences on the floor by forward distance, before and after the common lean."""
     rows = []
-    for part in c.floor:
+    for part in c.bins:
         if part.before.pairs and part.after is not None:
             figures = [*astuple(part.before)[1:], *astuple(part.after)[1:]]
             shown = (number(value, 3) for value in figures)

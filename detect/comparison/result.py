@@ -91,22 +91,6 @@ class ForwardRange:
 
 
 @dataclass(frozen=True)
-class DistanceBin(ForwardRange):
-    """Discs at a range of forward distances; qualities and errors are medians."""
-
-    reference: int
-    missed: int
-    detected: int
-    extra: int
-    recall: float | None
-    precision: float | None
-    reference_quality_median: float | None
-    detected_quality_median: float | None
-    error_median_m: float | None
-    quality_difference: float | None
-
-
-@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
@@ -118,9 +102,22 @@ class FloorDifference:
 
 
 @dataclass(frozen=True)
-class FloorBin(ForwardRange):
-    """Floor differences at a range of forward distances, before and after the common lean."""
+class DistanceBin(ForwardRange):
+    """Discs at a range of forward distances; qualities and errors are medians.
 
+    Differences are of matched discs on the floor, before and after the common lean.
+    """
+
+    reference: int
+    missed: int
+    detected: int
+    extra: int
+    recall: float | None
+    precision: float | None
+    reference_quality_median: float | None
+    detected_quality_median: float | None
+    error_median_m: float | None
+    quality_difference: float | None
     before: FloorDifference
     after: FloorDifference | None
 
@@ -264,7 +261,6 @@ class DiscComparison(Comparison):
     image_95_px: float | None
     reference_levelled: int  # frames whose rows are levelled by a tilt
     detected_levelled: int
-    floor: tuple[FloorBin, ...]
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
 

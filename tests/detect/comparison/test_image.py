@@ -133,7 +133,7 @@ def test_a_lean_is_a_difference_on_the_floor_not_missed_rows(published_camera: C
     assert lean.roll_sigma_deg < 0.05
     assert lean.left.median_m is not None
     assert lean.left.median_m < 0.02
-    far = next(part for part in found.floor if part.from_m == 3.0)
+    far = next(part for part in found.bins if part.from_m == 3.0)
     assert far.before.along_m is not None
     assert far.before.along_m > 0.2
     assert far.after is not None
