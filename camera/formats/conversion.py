@@ -190,7 +190,7 @@ def convert_to_foreign(
         start[4 + P1 : 4 + P1 + 2] = _tangential(source)
 
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return projected(model, parameters, rays)
+        return projected(model, parameters, rays)[:2]
 
     def possible(parameters: FloatArray) -> bool:
         return bool(min(parameters[:2]) > 0.0)

@@ -19,7 +19,7 @@ OpenCV, Camera Calibration and 3D Reconstruction; COLMAP, src/colmap/sensor/mode
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -42,7 +42,6 @@ _LARGEST_SIDE_PX = 65536
 _WALK = 24
 _NEWTON_STEPS = 20
 _ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
-_SMALLEST_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -89,9 +88,7 @@ class ForeignCamera:
 
     def distort(self, normalised: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
-        parameters = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
-        pixels, _ = projected(self.model, parameters, normalised.reshape(-1, 2))
-        return pixels.reshape(normalised.shape)
+        return self._seen(normalised.reshape(-1, 2)).pixels.reshape(normalised.shape)
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
@@ -103,12 +100,14 @@ class ForeignCamera:
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
                 for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
-                    error = centre + share * (pixels - centre) - self.distort(xy)
-                    xy = xy + (inverse_2x2(self._jacobian(xy)) @ error[..., None])[..., 0]
+                    seen = self._seen(xy)
+                    error = centre + share * (pixels - centre) - seen.pixels
+                    xy = xy + (inverse_2x2(seen.by_place) @ error[..., None])[..., 0]
                     if np.abs(error).max() < _ROUNDING_PX:
                         break
-            off = np.abs(self.distort(xy) - pixels).max(axis=-1)
-            determinant = np.linalg.det(self._jacobian(xy))
+            seen = self._seen(xy)
+            off = np.abs(seen.pixels - pixels).max(axis=-1)
+            determinant = np.linalg.det(seen.by_place)
         bad = ~(off < _CONVERGED_PX) | ~(determinant > 0.0)
         if bad.any():
             u, v = pixels[int(np.argmax(bad))]
@@ -119,32 +118,39 @@ class ForeignCamera:
             )
         return np.asarray(xy)
 
-    def _jacobian(self, xy: FloatArray) -> FloatArray:
-        """(N, 2, 2) d(u, v) / d(x, y), by central differences."""
-        step = _SMALLEST_STEP * (1.0 + np.linalg.norm(xy, axis=-1, keepdims=True))
-        differences = [
-            self.distort(xy + step * axis) - self.distort(xy - step * axis) for axis in np.eye(2)
-        ]
-        return np.stack([difference / (2.0 * step) for difference in differences], axis=-1)
+    def _seen(self, normalised: FloatArray) -> Projected:
+        parameters = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        return projected(self.model, parameters, normalised)
 
 
-def projected(
-    model: Model, parameters: FloatArray, normalised: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels of undistorted normalised coordinates (N, 2), by OpenCV.
+class Projected(NamedTuple):
+    """Where N places are seen."""
 
-    `parameters` (P,) are fx, fy, cx, cy and the coefficients. Returns (N, 2) pixels and their (N,
-    2, P) derivatives by the parameters.
+    pixels: FloatArray  # (N, 2)
+    by_parameters: FloatArray  # (N, 2, P) derivatives by fx, fy, cx, cy and the coefficients
+    by_place: FloatArray  # (N, 2, 2) derivatives by the normalised coordinates
+
+
+def projected(model: Model, parameters: FloatArray, normalised: FloatArray) -> Projected:
+    """Project undistorted normalised coordinates (N, 2), by OpenCV.
+
+    `parameters` (P,) are fx, fy, cx, cy and the coefficients of the model.
     """
     fx, fy, cx, cy = parameters[:4]
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     points = np.column_stack([normalised, np.ones(len(normalised))])[:, None]
     nowhere = np.zeros(3)
+    # Derivatives by the pose are before those by the parameters, of a fisheye behind them.
     if model == "fisheye":
         seen = cv2.fisheye.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
-        first = 0
+        own, translation = 0, 11
     else:
         seen = cv2.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
-        first = 6  # after those by the pose
-    by_parameters = seen[1].reshape(len(points), 2, -1)[:, :, first : first + len(parameters)]
-    return np.asarray(seen[0], np.float64).reshape(-1, 2), np.asarray(by_parameters)
+        own, translation = 6, 3
+    pixels, derivatives = (np.asarray(part, np.float64) for part in seen)
+    derivatives = derivatives.reshape(len(points), 2, -1)
+    return Projected(
+        pixels.reshape(-1, 2),
+        derivatives[..., own : own + len(parameters)],
+        derivatives[..., translation : translation + 2],
+    )
