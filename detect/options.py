@@ -54,8 +54,8 @@ class SourceOptions:
     """Options of a source besides its name."""
 
     #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), of image files
-    #: a file of STEP rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
+    #: rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
     wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
     metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.

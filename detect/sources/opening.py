@@ -18,6 +18,7 @@ from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
     FramesAlongPoses,
+    FramesAlongRows,
     PoseStream,
     tick_poses,
     tum_poses,
@@ -147,12 +148,10 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        if not isinstance(source, ImageFiles):
-            raise DetectError(
-                f"{source.name}: --odometry {named}: STEP rows name image files: expected a "
-                "trajectory (.tum), ticks of wheels (.ticks), a topic of a bag (/odom), or none"
-            )
-        return source.along(Path(named)), Path(named)
+        path = Path(named)
+        if isinstance(source, ImageFiles):
+            return source.along(path), path
+        return FramesAlongRows(source, path), path
     else:
         poses = None if named else source.poses(None)
     if poses is None:

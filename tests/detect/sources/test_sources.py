@@ -53,18 +53,34 @@ def expected_rows(small_run: Path, tmp_path: Path) -> list[str]:
 
 @pytest.mark.lowest
 def test_a_video_gives_the_rows_of_its_images(
-    video: Path, expected_rows: list[str], capsys: Captured
+    small_run: Path, video: Path, expected_rows: list[str], capsys: Captured
 ) -> None:
-    assert main(["circles", str(video)]) == 0
+    assert main(["circles", str(video), "--odometry", str(small_run / "s.txt")]) == 0
     output = video.parent / "s.detected.circles"
     assert f"{output}: 3 discs in 3 frames" in capsys.readouterr().out
-    found = list(read_frames(output))
+    assert rows(output) == expected_rows
+    times = read_times(f"{output}.times")
+    assert times == pytest.approx({p: 0.1 * k for k, p in enumerate(PREFIXES)}, abs=1e-6)
+
+
+def test_rows_and_images_of_a_video_without_each_other(small_run: Path, video: Path) -> None:
+    steps = (small_run / "s.txt").read_text().replace("s.0001", "t.0001")
+    (small_run / "other.txt").write_text(steps)
+    run = open_source(video, None, SourceOptions(odometry=str(small_run / "other.txt")))
+    frames = list(run.frames)
+    assert [frame.step.prefix for frame in frames] == ["s.0000", "s.0002", "t.0001"]
+    assert [frame.content is None for frame in frames] == [False, False, True]
+    assert run.frames.left_out == 1
+
+
+def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) -> None:
+    assert main(["circles", str(video)]) == 0
+    found = list(read_frames(video.parent / "s.detected.circles"))
     assert [frame.step.prefix for frame in found] == PREFIXES
     assert all(frame.step.dx == frame.step.cxx == 0.0 for frame in found)
     landmarks = [row for row in expected_rows if row.startswith("LANDMARK_C")]
-    assert [row for row in rows(output) if row.startswith("LANDMARK_C")] == landmarks
-    times = read_times(f"{output}.times")
-    assert times == pytest.approx({p: 0.1 * k for k, p in enumerate(PREFIXES)}, abs=1e-6)
+    written = rows(video.parent / "s.detected.circles")
+    assert [row for row in written if row.startswith("LANDMARK_C")] == landmarks
 
 
 def test_all_of_a_video_is_named_after_it(video: Path) -> None:
@@ -227,14 +243,6 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
     "odometry topic without a bag": (
         lambda tmp_path, run: [str(run), "--odometry", "/odom"],
         "holds no topic /odom: only bags do",
-    ),
-    "rows of a video": (
-        lambda tmp_path, run: [
-            str(write_video(tmp_path / "s.avi", images_of(run))),
-            "--odometry",
-            str(run / "s.txt"),
-        ],
-        "STEP rows name image files: expected a trajectory",
     ),
     "no odometry": (
         lambda tmp_path, run: [str(run), "--odometry", str(tmp_path / "gone.txt")],
