@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from redetect.storage.bounds import MaybePath
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
-Format = Literal["auto", "cam", "opencv", "ros", "kalibr", "colmap"]
+Format = Literal["cam", "opencv", "ros", "kalibr", "colmap"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,34 +34,15 @@ class BoardFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardOnFloor(BoardFlags):
-    """A board that lies on the floor."""
-
-    #: Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
-    floor_origin: tuple[float, float] = (0.0, 0.0)
-    #: By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
-    #: axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
-    #: back right, 180: at the front left. With 180 the board appears upright in the image.
-    floor_yaw: float = 0.0
-    #: Folder for pictures to check by: the corners found and projected in each photograph; of the
-    #: floor's photograph its grid and the horizon, and the floor from above.
-    pictures: MaybePath = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibrate(BoardOnFloor):
+class Calibrate(BoardFlags):
     """Calibrate a camera from photographs or a video of a board.
 
     Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam
 
-    With the pose from a photograph of the same board on the floor, its middle 1.5 m ahead of the
-    robot: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025
-    --floor floor.jpg --floor-origin 0 -1.5 --floor-yaw 180 -o my.cam
-
     Parameters
     ----------
     output : Path
-        The .cam file. Beside it: .json with everything, and pictures of residuals and coverage.
+        The .cam file. Beside it: pictures of residuals and coverage.
     """
 
     images: Positional[tuple[Path, ...]]  #: Photographs, folders of them, or a video.
@@ -82,12 +63,10 @@ class Calibrate(BoardOnFloor):
     polynomial: Literal["auto", "on", "off"] = "auto"
     #: Keep pictures whose residuals are far above the others'.
     keep_outliers: bool = False
-    every: int = 15  #: Use only every N-th frame of a video.
-    #: Use at most this many pictures, evenly spaced, and at most this many frames per video.
+    #: Use at most this many pictures, and at most this many frames per video, evenly spaced.
     max_images: int = 60
-    #: A picture of the board lying on the floor, or a .csv with the columns u,v,x,y of places on
-    #: it (pixels; metres, X left and Y backward of the robot): gives the camera's pose.
-    floor: MaybePath = None
+    #: Folder for pictures to check by: the corners found and projected in each photograph.
+    pictures: MaybePath = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,12 +91,10 @@ class Board(BoardFlags):
     columns: int = 1  #: As in `camera calibrate`; of discs, how many side by side.
     rows: int = 1  #: Likewise, of a column.
     square_m: float = 0.025  #: Side of a square, or the distance of rows of circles (m).
-    #: The paper, upright or not; `auto`: the smallest that it fits on.
-    page: Literal["auto", "A4", "A3", "A2", "A1", "A0"] = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Floor(BoardOnFloor):
+class Floor(BoardFlags):
     """Give a calibrated camera its pose, from a board or known places on the floor.
 
     Example: camera floor my.cam floor.jpg --columns 9 --rows 6 --square-m 0.025
@@ -134,6 +111,15 @@ class Floor(BoardOnFloor):
     columns: int = 0
     rows: int = 0  #: Likewise, of a column.
     square_m: float = 0.0  #: Side of a square, or the distance of rows of circles (m).
+    #: Where the middle of that board's points lies: X (left) and Y (backward) of the robot, m.
+    floor_origin: tuple[float, float] = (0.0, 0.0)
+    #: By how much that board is turned (degrees): from the robot's X axis (left) to the board's x
+    #: axis, counterclockwise seen from above. 0: a checkerboard's black corner square is at the
+    #: back right, 180: at the front left. With 180 the board appears upright in the image.
+    floor_yaw: float = 0.0
+    #: Folder for pictures to check by: the floor's grid and the horizon in the photograph, and the
+    #: floor from above.
+    pictures: MaybePath = None
 
 
 @dataclass(frozen=True)
@@ -149,12 +135,10 @@ class Convert:
     --limit-px nothing is written.
     """
 
-    source: Positional[Path]  #: The calibration to convert.
-    target: Positional[Path]  #: The file to write.
-    from_format: Format = "auto"  #: `auto`: from the file's ending and content.
-    #: `auto`: from the ending: .cam; cameras.txt; .opencv.yaml, .ros.yaml or .kalibr.yaml, and
-    #: camera_info.yaml, camchain.yaml.
-    to_format: Format = "auto"
+    source: Positional[Path]  #: The calibration to convert; its content says the format.
+    #: The file to write; its name says the format: .cam; cameras.txt; .opencv.yaml, .ros.yaml or
+    #: .kalibr.yaml, and camera_info.yaml, camchain.yaml.
+    target: Positional[Path]
     #: Distortion model of the target: `radtan` (k1 k2 p1 p2, with OpenCV and ROS also k3),
     #: `rational` (k1 to k6), `fisheye` (equidistant); `auto`: the first of them that is within the
     #: limit.
@@ -163,8 +147,7 @@ class Convert:
     #: lines (`half`); `double`: the other way (`nohalf`).
     rows: Literal["same", "halve", "double"] = "same"
     limit_px: float = 0.05  #: Largest deviation that is accepted, pixels.
-    #: Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP); the
-    #: target's camera is called so, too, where its format can have such a name.
+    #: Which camera of a file that holds several, such as cam0 (Kalibr) or its number (COLMAP).
     camera_name: str = ""
     #: A .cam file whose pose the .cam file gets; other formats have none, and without this it is
     #: the identity, until `camera floor` finds it.

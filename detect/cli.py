@@ -21,8 +21,8 @@ from detect.errors import DetectError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
-from detect.settings import MARKER_PRESETS, CircleSettings, MarkerSettings
 from detect.settings import PRESETS as CIRCLE_PRESETS
+from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import read_settings
 from detect.terminal import interrupts_noted, show_announcements
 from detect.viewing_options import (
@@ -32,7 +32,6 @@ from detect.viewing_options import (
     Draw,
     Explain,
     Export,
-    Gates,
     Grid,
     Report,
     RowFiles,
@@ -54,7 +53,7 @@ EXPERT: dict[type, frozenset[str]] = {
     LineSettings: all_but(LineSettings, "threshold", "join_px"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
     RowFiles: all_but(RowFiles, "rows", "reference"),
-    Gates: all_but(CompareOptions, "only_identified"),
+    CompareOptions: all_but(CompareOptions, "only_identified"),
     Grid: all_but(Grid, "threshold", "evidence", "noise_floor", "blur_px", "radius_m"),
 }  # fmt: skip
 
@@ -109,7 +108,7 @@ def parsed(arguments: Sequence[str]) -> Command:
     preset, file = _value_of("--preset", arguments), _value_of("--settings", arguments)
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
-    markers = MARKER_PRESETS.get(preset, MarkerSettings())
+    markers = MarkerSettings()
     if file and not {"-h", "--help", "--help-all"} & set(arguments):
         if preset:
             raise DetectError("--preset and --settings: expected one of them")

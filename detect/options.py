@@ -25,7 +25,7 @@ from redetect.storage.bounds import (
 )
 
 Preset = Literal["default", "published"]
-DiscPreset = Literal["default", "published", "report"]
+DetectorPreset = Literal["default", "published", "report"]
 LineEnds = Literal["lf", "crlf"]
 
 
@@ -45,13 +45,8 @@ class PickedFrames:
     """Selects the frames of a run."""
 
     every: int = 1  #: Only every n-th frame.
-    #: Only these frames: names of images, positions in the run, and ranges FROM:TO or FROM:TO:STEP
-    #: of positions without the last.
+    #: Only the frames of these images, by their names.
     frames: tuple[str, ...] = ()
-
-
-#: Axes of a robot's poses: X forward and Y left, or the data set's X left and Y backward.
-Axes = Literal["robotics", "dataset"]
 
 
 @dataclass(frozen=True)
@@ -59,12 +54,9 @@ class SourceOptions:
     """Options of a source besides its name."""
 
     #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-    #: z qx qy qz qw), counters of two wheels (.ticks; rows t left right), a file of STEP rows, a
-    #: nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
+    #: rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
-    #: Axes of the robot in a TUM trajectory: robotics (X forward, Y left) or dataset (X left, Y
-    #: backward).
-    odometry_axes: Axes = "robotics"
     wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
     metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
     #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
@@ -105,7 +97,6 @@ class DetectorFlags(RunFlags):
         named after the video or bag and beside it.
     """
 
-    preset: Preset = "default"  #: Values that the other flags start from.
     #: JSON file with the values that the other flags start from: that of `detect tune --serve`, or
     #: a result's .log.json, to detect with the same ones again.
     settings: MaybePath = None
@@ -154,7 +145,7 @@ class Circles(DetectorFlags):
         rows (all of them and only those), `report` what the report prints of it.
     """
 
-    preset: DiscPreset = "default"  # type: ignore[assignment]
+    preset: DetectorPreset = "default"
     #: Tilts of the frames (written by `detect lines`): positions are corrected for them.
     tilt: MaybePath = None
     #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
@@ -180,7 +171,7 @@ class Lines(DetectorFlags):
         they are known, `report` is what the report prints of their detector.
     """
 
-    preset: Literal["default", "published", "report"] = "default"  # type: ignore[assignment]
+    preset: DetectorPreset = "default"
     #: The tilt file to write; by default the output's name with the ending .tilt.
     tilt: MaybePath = None
     #: A .lines file whose IDs are carried over where the match is unambiguous.
@@ -207,8 +198,6 @@ class Markers(DetectorFlags):
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
         camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
         without one, edges are taken to be straight in the images.
-    preset : str
-        Values that the other flags start from: `published` is the report's detector.
     """
 
     #: Folder for images with the markers drawn in, and with what was rejected.
@@ -230,6 +219,7 @@ class All(DetectorFlags):
         named after the video or bag and beside it.
     """
 
+    preset: Preset = "default"  #: Values that the other flags start from.
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
     #: A .lines file whose IDs are carried over where the match is unambiguous.
     line_ids_from: MaybePath = None

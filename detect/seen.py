@@ -18,6 +18,8 @@ from redetect.landmarks import Frame, Step
 
 Tilt = tuple[float, float]
 
+#: Discs that differ by no more than this in the image are the same, however small they are (px).
+LEAST_GATE_PX = 3.0
 _POINTS = 64
 
 
@@ -115,10 +117,10 @@ class Sight:
         """(..., 2) pixels where positions (..., 2) of detected rows were seen."""
         return image_positions(self.camera, xy, self.detected_by)
 
-    def gates(self, reference_xy: FloatArray, least_px: float) -> FloatArray:
-        """(N, 2) half the width and height of discs' images, `least_px` at least, pixels."""
+    def gates(self, reference_xy: FloatArray) -> FloatArray:
+        """(N, 2) half the width and height of discs' images, at least `LEAST_GATE_PX`, pixels."""
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
         high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
-        return np.asarray(np.maximum(0.5 * (high - low), least_px))
+        return np.asarray(np.maximum(0.5 * (high - low), LEAST_GATE_PX))

@@ -169,7 +169,6 @@ class MarkerSettings:
     #: gives candidates of its own.
     thresholds: Annotated[tuple[float, ...], PROBABILITY] = (0.5, 0.25, 0.12, 0.06, 0.03)
     disc_widths: Positive = 0.5  #: Radius of the closing's disc in widths of the marker.
-    pyramid: bool = True  #: Search large markers in reduced images.
     #: Dark pixels are darker than the closing by at least this many standard deviations of the
     #: image's noise.
     dark_noise: NotNegative = 2.0
@@ -187,9 +186,6 @@ class MarkerSettings:
     least_white: NotNegative = 0.0
     most_white: NotNegative = 3.0  #: Greatest such area (3 of 1/8 in the report).
     least_square: Share = 0.75  #: Area of the rough quadrangle over that of the convex hull.
-    #: Fit the whole marker, cells included, to the grey values; its corners are more exact than
-    #: those of four separate edges, and its residuals reveal false markers.
-    joint: bool = True
     #: Least contrast of each edge, in standard deviations of the image's noise.
     least_contrast: NotNegative = 2.0
     edge_balance: Share = 0.3  #: Least contrast of an edge, in parts of the strongest edge's.
@@ -212,18 +208,3 @@ class MarkerSettings:
         most_white = Bounds(f"0 to most_white ({self.most_white})", 0.0, self.most_white)
         most_holes = whole(0, self.most_holes)
         demand(self, DetectError, least_holes=most_holes, least_white=most_white)
-
-
-#: The report's detector of markers; what it does not give a number for is set as by default.
-PUBLISHED_MARKERS = MarkerSettings(
-    thresholds=(0.5,),
-    pyramid=False,
-    dark_noise=0.0,
-    least_holes=1,
-    least_solidity=0.9,
-    least_white=0.25,
-    most_white=3.0,
-    joint=False,
-)
-
-MARKER_PRESETS = {"default": MarkerSettings(), "published": PUBLISHED_MARKERS}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import itertools
 import json
@@ -17,15 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from detect import __version__
-from detect.comparison.compare import compare_frames, compare_line_frames
-from detect.comparison.result import DiscComparison, LineComparison
+from detect.comparison.compare import compare_frames
+from detect.comparison.result import DiscComparison
 from detect.drawing.inputs import select_frames
 from detect.errors import DetectError
-from detect.line_settings import PRESETS, LineSettings
 from detect.report.figures import draw_rates, f1_score, knee, pareto_front
-from detect.runs.plan import ByPrefix, FramePlan, FramesByImage, FrameTask, Known
+from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
-from detect.settings import PUBLISHED, CircleSettings
+from detect.settings import CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
@@ -34,11 +32,9 @@ from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Frame,
-    FrameTilt,
     LandmarkFileError,
     frames_of_rows,
     parse_rows,
-    read_tilts,
 )
 from redetect.reporting.page import figure_file
 from redetect.storage import OutputExistsError, write_bytes
@@ -46,12 +42,10 @@ from redetect.storage import OutputExistsError, write_bytes
 
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
-    base = _base(options)
+    base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     varied = {name: text for name, text in vars(options.grid).items() if text is not None}
-    grid = () if options.serve else combinations(type(base), varied, options.most)
+    grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
-    if options.verticals and options.tilt is not None:
-        raise DetectError("--tilt and --verticals: verticals show the tilt themselves")
 
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
@@ -60,16 +54,14 @@ def perform(options: Tune) -> int:
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 
-        if not isinstance(base, CircleSettings):
-            raise DetectError("--serve and --verticals: the page is for discs")
         frames = [frame for _, frame in selection]
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
-    outputs = {name: output / name for name in ("table.csv", "table.json", "curve.png")}
+    outputs = {name: output / name for name in ("table.json", "curve.png")}
     for path in outputs.values():
         if path.exists() and not options.force:
             raise OutputExistsError(path)
-    path = options.reference or run.folder / ("map.lines" if options.verticals else "map.circles")
+    path = options.reference or run.folder / "map.circles"
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     reference = FramesByImage(path)
@@ -81,12 +73,10 @@ def perform(options: Tune) -> int:
     if not pairs:
         raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
 
-    gates = CompareOptions(**vars(options.gates), only_identified=options.only_identified)
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
-    tilts = None if options.tilt is None else read_tilts(options.tilt)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(run, pairs, settings, gates, workers, tilts=tilts, on_progress=advance)
+        tuned = tune_run(run, pairs, settings, options.matching, workers, advance)
         trials = list(tuned)
     records = trial_records(grid, trials)
     head = {
@@ -94,19 +84,14 @@ def perform(options: Tune) -> int:
         "run": run.name,
         "reference": path.name,
         "frames": [frame.step.prefix for frame, _ in pairs],
-        "gate": asdict(gates),
+        "gate": asdict(options.matching),
         "camera": run.camera.content_hash,
         "settings": {name: _plain(value) for name, value in asdict(base).items()},
         "varied": varied,
     }
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(records[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**r, "front": int(r["front"]), "knee": int(r["knee"])} for r in records)
     document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     contents = {
-        "table.csv": table.getvalue().encode(),
         "table.json": f"{document}\n".encode(),
         "curve.png": curve_picture(grid, trials, title),
     }
@@ -125,16 +110,6 @@ def perform(options: Tune) -> int:
     return report_failures(len(failures), failures)
 
 
-def _base(options: Tune) -> Settings:
-    """The values of what is not varied."""
-    if options.settings is not None:
-        read = read_settings(options.settings)
-        return read.lines if options.verticals else read.circles
-    if options.verticals:
-        return PRESETS[options.preset]
-    return PUBLISHED if options.preset == "published" else CircleSettings()
-
-
 def _plain(value: Any) -> Any:
     """A setting for JSON: what it does not have (infinity, tuples) as words."""
     plain = isinstance(value, bool | int | str) or (
@@ -147,7 +122,7 @@ def _plain(value: Any) -> Any:
 Combination = dict[str, Any]
 
 
-def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
+def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     """The values of a parameter that are to be tried, each once.
 
     `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
@@ -164,27 +139,22 @@ def parameter_values(kind: type, name: str, text: str) -> tuple[Any, ...]:
             words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
         except (InvalidOperation, ValueError):
             raise DetectError(expected) from None
-    return tuple(dict.fromkeys(word_value(kind, name, word.strip()) for word in words))
+    return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 
 
-def combinations(kind: type, varied: Mapping[str, str], most: int) -> tuple[Combination, ...]:
+def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises
-    DetectError if nothing is varied, there are more than `most`, or as `parameter_values` does.
+    DetectError if nothing is varied, or as `parameter_values` does.
     """
     if not varied:
         raise DetectError(
             "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
         )
-    values = {name: parameter_values(kind, name, text) for name, text in varied.items()}
-    count = math.prod(len(v) for v in values.values())
-    if count > most:
-        raise DetectError(f"the grid has {count} combinations: expected at most {most} (--most)")
+    values = {name: parameter_values(name, text) for name, text in varied.items()}
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
 
-
-Settings = CircleSettings | LineSettings
 
 # Largest number of points that are labelled.
 _MOST_NAMED = 12
@@ -203,23 +173,18 @@ class Trial(NamedTuple):
 def tune_run(
     run: Run,
     frames: Sequence[tuple[RunFrame, Frame]],
-    settings: Sequence[Settings],
+    settings: Sequence[CircleSettings],
     options: CompareOptions,
     workers: Workers,
-    *,
-    tilts: ByPrefix[FrameTilt] | None = None,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[Trial]:
-    """Detect in frames of a run with each setting, all of one kind; yields the trial of each.
+    """Detect discs in frames of a run with each setting; yields the trial of each.
 
-    `frames` come with their reference rows; `tilts`, by image prefix, correct positions of discs.
-    `on_progress` is called after every frame of every setting.
+    `frames` come with their reference rows; `on_progress` is called after every frame of every
+    setting.
     """
-    kind = "circles" if isinstance(settings[0], CircleSettings) else "lines"
-    changes: list[dict[str, Any]] = [{kind: each} for each in settings]
-    plans = [FramePlan(run.camera, **change) for change in changes]
-    known = Known(tilts=tilts)
-    tasks = [FrameTask(frame, known.of(frame.step.prefix)) for frame, _ in frames]
+    plans = [FramePlan(run.camera, circles=each) for each in settings]
+    tasks = [FrameTask(frame) for frame, _ in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(detect_chunks(work, plans[0], workers)) as chunks:
         done = chain.from_iterable(chunks)
@@ -228,21 +193,17 @@ def tune_run(
             failures: list[str] = []
             for _, each in islice(done, len(tasks)):
                 found += frames_of_rows(
-                    parse_rows(io.BytesIO(each.rows[kind].encode("utf-8", "surrogateescape")))
+                    parse_rows(io.BytesIO(each.rows["circles"].encode("utf-8", "surrogateescape")))
                 )
                 failures += [] if each.error is None else [each.error]
                 on_progress()
-            compare = compare_frames if kind == "circles" else compare_line_frames
-            result = compare([rows for _, rows in frames], found, options)
+            result = compare_frames([rows for _, rows in frames], found, options)
             yield Trial(figures_of(result), tuple(failures))
 
 
-def figures_of(result: DiscComparison | LineComparison) -> dict[str, Any]:
+def figures_of(result: DiscComparison) -> dict[str, Any]:
     """What a table has of a comparison; `matched` are the reference rows that were found."""
     recall, precision = result.recall, result.precision
-    median = (
-        result.error_median_m if isinstance(result, DiscComparison) else result.bearing_median_deg
-    )
     return {
         "reference": result.reference,
         "detected": result.detected,
@@ -250,7 +211,7 @@ def figures_of(result: DiscComparison | LineComparison) -> dict[str, Any]:
         "recall": recall,
         "precision": precision,
         "f1": None if recall is None or precision is None else float(f1_score(recall, precision)),
-        f"error_median_{result.unit}": median,
+        "error_median_m": result.error_median_m,
         "normalised_error": result.normalised_error.per_dof,
     }
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import CompareError
-from detect.line_settings import LineSettings
-from detect.options import PickedFrames, Preset, RunFlags, SourceOptions
+from detect.options import PickedFrames, RunFlags, SourceOptions
 from detect.settings import CircleSettings
 from redetect.storage.bounds import (
     ABOVE_0,
@@ -28,46 +27,22 @@ from redetect.storage.bounds import (
     whole,
 )
 
-ErrorCovariance = Literal["detected", "reference", "sum"]
-
 
 @dataclass(frozen=True, kw_only=True)
-class Gates:
-    """Which detected and reference rows are the same landmark."""
+class CompareOptions:
+    """Which detected and reference rows are the same landmark, and which rows count."""
 
     #: Compare discs on the floor: they are the same within this distance, metres. By default they
     #: are compared in the image where there is a calibration, and within 0.1 m where there is none.
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
     tolerance_deg: Positive = 0.5  #: Bearings of the same line differ by at most this,
     sigmas: NotNegative = 2.0  #: or by this many standard deviations of the detected one.
-
-    def __post_init__(self) -> None:
-        demand_fields(self, CompareError)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(Gates):
-    """Which rows are the same landmark, and which rows count."""
-
-    #: Compare discs on the floor: they are the same within this Mahalanobis distance under the
-    #: reference row's covariance (standard deviations).
-    sigma: Annotated[MaybeFloat, ABOVE_0] = None
-    #: In the image, discs are the same if they differ by at most half the width and height of the
-    #: disc's own image, or by this (px), whichever is more.
-    least_px: Positive = 3.0
     #: Count only reference rows that have an ID. Detected rows that fit a reference row without one
     #: are then neither right nor wrong: they are set aside.
     only_identified: bool = False
-    #: Count frames that only one file has, too: all their rows are missed, or extra.
-    all_frames: bool = False
-    #: Which covariance position errors of discs are measured in: the detected row's, the reference
-    #: row's, or, where both err independently, their sum.
-    error_covariance: ErrorCovariance = "detected"
 
-    @property
-    def on_floor(self) -> bool:
-        """Whether discs are to be compared on the floor even where there is a calibration."""
-        return self.gate_m is not None or self.sigma is not None
+    def __post_init__(self) -> None:
+        demand_fields(self, CompareError)
 
 
 @dataclass(frozen=True)
@@ -86,11 +61,8 @@ class Compare:
     #: Discs (lines) that may be detected but need not be: rows on them are neither right nor wrong;
     #: by default unlisted.circles (unlisted.lines) beside the reference, if it is there.
     unlisted: MaybePath = None
-    #: What looks like a disc: extra rows on it are counted apart; by default lookalikes.circles
-    #: beside the reference, if it is there.
-    lookalikes: MaybePath = None
     #: Calibration, by default the one in the run folder: discs are compared in the image, each row
-    #: where it was seen. Without one, or with --gate-m or --sigma, on the floor.
+    #: where it was seen. Without one, or with --gate-m, on the floor.
     camera: MaybePath = None
     min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
     min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
@@ -114,8 +86,6 @@ class RowFiles:
     reference: MaybePath = None
     #: Reference rows of verticals, by default map.lines in the run folder if it exists.
     reference_lines: MaybePath = None
-    #: Hold nothing against reference rows, not even where there are some.
-    no_reference: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +110,6 @@ class Draw(PickedFrames, RowsFlags):
     video: MaybePath = None  #: Write an MP4 file as well, or instead.
     fps: float = 10.0  #: Frames of the video per second.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +148,6 @@ class Report(RowsFlags):
 
     worst: int = 5  #: How many of the worst frames are shown.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +190,7 @@ class Demo:
 if TYPE_CHECKING:
 
     class Grid:
-        """One `str` or None for each field of `CircleSettings` and of `LineSettings`."""
+        """One `str` or None for each field of `CircleSettings`."""
 
 else:
 
@@ -230,12 +198,9 @@ else:
         def values_of(name: str) -> object:
             return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
 
-        names = {f.name: None for kind in (CircleSettings, LineSettings) for f in fields(kind)}
-        # Several numbers are no value of a grid.
-        del names["refine_steps_px"], names["blurred_widths"]
         return make_dataclass(
             "Grid",
-            [(name, values_of(name), field(default=None)) for name in names],
+            [(f.name, values_of(f.name), field(default=None)) for f in fields(CircleSettings)],
             namespace={"__doc__": "Parameters to be varied: FROM:TO:STEP, or values with commas."},
             frozen=True,
         )
@@ -249,33 +214,25 @@ class Tune(PickedFrames, RowsFlags):
 
     Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
 
-    Any parameter of `detect circles` (with --verticals: of `detect lines`) can be varied: by
-    FROM:TO:STEP, both ends included, or by values with commas between them. All combinations are
-    tried. With --serve, the settings of discs are turned by hand on a page instead, which needs no
-    reference rows, and labels discs.
+    Any parameter of `detect circles` can be varied: by FROM:TO:STEP, both ends included, or by
+    values with commas between them. All combinations are tried. With --serve, they are turned by
+    hand on a page instead, which needs no reference rows, and labels discs.
 
     Parameters
     ----------
     output : Path
-        Folder for table.csv, table.json and curve.png, or for what the page saves: tuned.json
+        Folder for table.json and curve.png, or for what the page saves: tuned.json
         (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
     serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
-    verticals: bool = False  #: Tune the detector of verticals instead of that of discs.
-    #: `default` or `published`: the values of all parameters that are not varied.
-    preset: Preset = "default"
-    #: Reference rows; by default map.circles (map.lines) in the run folder.
-    reference: MaybePath = None
-    tilt: MaybePath = None  #: Tilts of the frames: positions of discs are corrected for them.
-    only_identified: bool = False  #: Count only reference rows that have an ID.
-    most: int = 1000  #: Refuse grids of more combinations than this.
+    reference: MaybePath = None  #: Reference rows; by default map.circles in the run folder.
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
-    gates: OmitArgPrefixes[Gates] = field(default_factory=Gates)
+    matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
     grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 
 

@@ -67,7 +67,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("slam localize ids --map gone.csv", ["gone.csv: cannot be read", "`slam map`"]),
         ("slam localize ids --map empty", ["empty: cannot be read", "map.csv of `slam map`"]),
         ("camera floor gone.cam a.csv -o x.cam", ["gone.cam: no such calibration file"]),
-        ("camera convert calibrated/e.cam x.yaml", ["does not say which format", "--to-format"]),
+        ("camera convert calibrated/e.cam x.yaml", ["does not say which format", ".opencv.yaml"]),
         (
             "camera calibrate empty --columns 9 --rows 6 --square-m 0.02 -o x.cam",
             ["no pictures in empty", "expected files ending in"],

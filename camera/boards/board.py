@@ -143,17 +143,9 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
     return dictionary
 
 
-#: Sheets of paper, metres, the smallest first.
-PAGES = {
-    "A4": (0.210, 0.297),
-    "A3": (0.297, 0.420),
-    "A2": (0.420, 0.594),
-    "A1": (0.594, 0.841),
-    "A0": (0.841, 1.189),
-}
 #: Left blank by printers, and for the line of text at the bottom (m).
 _MARGIN_M, _TEXT_M = 0.004, 0.012
-_RULER_M = 0.1
+_RULER_M, _LEAST_WIDTH_M = 0.1, 0.2
 _M_PER_INCH = 0.0254
 _INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 
@@ -165,10 +157,8 @@ def perform(command: options.Board) -> int:
         sheet = sheet_of_discs(command.circle_m, command.columns, command.rows)
     else:
         sheet = sheet_of_board(board_of(command))
-    width, height = page_for(sheet, command.page)
-    write_bytes(command.output, pdf_of(sheet, (width, height)), overwrite=command.force)
-    name = next(name for name, sides in PAGES.items() if set(sides) == {width, height})
-    print(f"written: {command.output}: {sheet.text}, on {name}; print at 100 %, measure the bar")
+    write_bytes(command.output, pdf_of(sheet), overwrite=command.force)
+    print(f"written: {command.output}: {sheet.text}; print at 100 %, measure the bar")
     return 0
 
 
@@ -254,27 +244,10 @@ def sheet_of_discs(diameter_m: float, columns: int, rows: int) -> Sheet:
     return Sheet(discs, width, height, f"discs of radius {radius:g} m")
 
 
-def page_for(sheet: Sheet, page: str) -> tuple[float, float]:
-    """Width and height of a page (m) that a sheet fits on, upright or not; `auto`: the smallest."""
-    names = list(PAGES) if page == "auto" else [page]
-    for name in names:
-        short, long = PAGES[name]
-        for width, height in ((short, long), (long, short)):
-            if (
-                sheet.width <= width - 2.0 * _MARGIN_M
-                and sheet.height <= height - 2.0 * _MARGIN_M - 2.0 * _TEXT_M
-            ):
-                return width, height
-    raise CalibrationError(
-        f"{1e3 * sheet.width:g} x {1e3 * sheet.height:g} mm do not fit on {names[-1]} "
-        f"({' x '.join(f'{1e3 * side:g}' for side in PAGES[names[-1]])} mm) with a line of text: "
-        "take fewer or smaller squares, or a larger --page"
-    )
-
-
-def pdf_of(sheet: Sheet, page_m: tuple[float, float]) -> bytes:
+def pdf_of(sheet: Sheet) -> bytes:
     """A PDF of one page at true scale, with a line of text and a ruler to check it by."""
-    width, height = page_m
+    width = max(sheet.width, _LEAST_WIDTH_M) + 2.0 * _MARGIN_M
+    height = sheet.height + 2.0 * (_MARGIN_M + _TEXT_M)
     figure = Figure(figsize=(width / _M_PER_INCH, height / _M_PER_INCH))
     figure.patch.set_visible(False)
     FigureCanvasPdf(figure)

@@ -22,8 +22,6 @@ from camera.calibration.consensus import (
     demand_different_views,
     find_consensus,
     listed,
-    scale_warnings,
-    view_rms,
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
@@ -131,18 +129,12 @@ class Calibration:
     #: RMS reprojection error (u and v together) in views that the intrinsics were not fitted to, by
     #: what was free; all that was tried
     holdout_px: dict[FreeLens, float]
-    spread_deg: float  #: Largest angle between two boards' normals
     warnings: tuple[str, ...] = field(default=())
 
     @property
     def intrinsics(self) -> FloatArray:
         """(14,) `camera.calibration.model.INTRINSICS`."""
         return self.adjusted.estimate.intrinsics
-
-    @property
-    def view_rms_px(self) -> FloatArray:
-        """(V,) RMS residual of each view."""
-        return view_rms(self.adjusted.residuals, self.points)
 
 
 def calibrate(
@@ -191,13 +183,12 @@ def calibrate(
         raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
     names = tuple(names[v] for v in used)
     adjusted, points = tried[lens].adjusted, tried[lens].points
-    spread = normals_spread_deg(adjusted.estimate.rotations)
     demand_different_views(adjusted)
-    warnings = warnings_of(adjusted, points, spread) + scale_warnings(adjusted, points, names)
+    warnings = warnings_of(adjusted, points, normals_spread_deg(adjusted.estimate.rotations))
     if wrong:
         warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
-    return Calibration(adjusted, points, names, outliers, lens, holdout, spread, tuple(warnings))
+    return Calibration(adjusted, points, names, outliers, lens, holdout, tuple(warnings))
 
 
 class Aspect(NamedTuple):

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,18 +18,8 @@ from camera.calibration.calibrate import (
     aspect_of,
     calibrate,
     calibrate_freely,
-    coverage,
 )
-from camera.calibration.floor import (
-    FloorPose,
-    describe_pose,
-    file_name,
-    floor_points,
-    place_on_floor,
-    placed_camera,
-    write_floor_pictures,
-    write_picture,
-)
+from camera.calibration.floor import file_name, write_picture
 from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
@@ -57,16 +44,11 @@ _WHETHER = {"auto": None, "on": True, "off": False}
 def perform(options: Calibrate) -> int:
     """Carry the command out; returns the exit code."""
     output = options.output
-    kinds = ("residuals", "views", "coverage")
+    kinds = ("residuals", "coverage")
     names = {kind: output.with_name(f"{output.stem}.{kind}.png") for kind in kinds}
-    report = output.with_suffix(".json")
     # Checked first, not after minutes of work.
-    for path in (output, report, *names.values()):
+    for path in (output, *names.values()):
         demand_place(path, overwrite=options.force)
-    if report == output:
-        raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
-    if options.floor is not None and not options.floor.exists():
-        raise CalibrationError(f"{options.floor}: no such picture or .csv of the floor")
     board = board_of(options)
     settings = CalibrationSettings(
         aspect=0.5 if options.half else 1.0,
@@ -77,45 +59,31 @@ def perform(options: Calibrate) -> int:
     )
 
     def images() -> Iterator[tuple[str, GreyImage]]:
-        return calibration_images(options.images, options.every, options.max_images)
+        return calibration_images(options.images, options.max_images)
 
     if board.kind == "checkerboard":
         board = true_board(images(), board)
     views, size = find_views(images(), board)
-    # Found before the calibration, which takes minutes.
-    floor = None if options.floor is None else floor_points(options, board, options.floor, size)
     calibrated = calibrate_freely if options.free_aspect else calibrate
     calibration = calibrated(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
-    placed: FloorPose | None = None
-    if floor is not None:
-        covariance = calibration.adjusted.covariance
-        placed = place_on_floor(camera, floor.pixels, floor.xy, covariance, floor.radius_m)
-        camera = placed_camera(camera, placed, covariance)
-        print(describe_pose(placed))
-    else:
-        print(
-            "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
-            "board on the floor"
-        )
+    print(
+        "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
+        "board on the floor"
+    )
     if options.pictures is not None:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
                 place = options.pictures / f"{file_name(name)}.corners.png"
                 write_picture(picture, place, force=options.force)
-        if options.floor is not None:
-            write_floor_pictures(options, options.floor, camera)
     drawn = pictures(calibration, camera)
     for name, path in names.items():
         write_bytes(path, drawn[name], overwrite=options.force)
-    write_bytes(
-        report, report_text(options, calibration, camera, placed).encode(), overwrite=options.force
-    )
     write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
-    print(f"written: {output}, {report.name}, {', '.join(p.name for p in names.values())}")
+    print(f"written: {output}, {', '.join(path.name for path in names.values())}")
     return 0
 
 
@@ -240,64 +208,3 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
-
-
-def report_text(
-    options: Calibrate, calibration: Calibration, camera: Camera, placed: FloorPose | None
-) -> str:
-    """The report as JSON."""
-    adjusted = calibration.adjusted
-    view_rms = calibration.view_rms_px
-    content: dict[str, Any] = {
-        "options": {name: _plain(value) for name, value in vars(options).items()},
-        "image_size": [camera.width, camera.height],
-        "intrinsics": dict(zip(INTRINSICS, calibration.intrinsics.tolist())),
-        "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
-        "covariance": adjusted.covariance.tolist(),
-        "coefficients": calibration.lens.coefficients,
-        "tangential": calibration.lens.tangential,
-        "polynomial": calibration.lens.polynomial,
-        "points": len(calibration.points.board),
-        "rms_px": adjusted.rms_px,
-        "sigma_px": adjusted.sigma_px,
-        "holdout_rms_px": {
-            lens.label: error if np.isfinite(error) else None
-            for lens, error in calibration.holdout_px.items()
-        },
-        "views": [
-            {
-                "name": name,
-                "points": int(count),
-                "rms_px": float(rms),
-                "camera_from_board": np.column_stack([R, t]).tolist(),
-            }
-            for name, count, rms, R, t in zip(
-                calibration.names,
-                calibration.points.counts,
-                view_rms,
-                adjusted.estimate.rotations,
-                adjusted.estimate.translations,
-            )
-        ],
-        "left_out": [
-            {"name": name, "rms_px": rms if np.isfinite(rms) else None}
-            for name, rms in calibration.outliers
-        ],
-        "points_per_cell": coverage(calibration.points).tolist(),
-        "normals_spread_deg": calibration.spread_deg,
-        "projection_sigma_px": projection_sigma(camera, adjusted.covariance).round(6).tolist(),
-        "warnings": list(calibration.warnings),
-    }
-    if placed is not None:
-        content["pose"] = {
-            "robot_from_camera": placed.robot_from_camera.tolist(),
-            "covariance": placed.covariance.tolist(),
-            "rms_px": placed.rms_px,
-        }
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value

@@ -17,7 +17,6 @@ from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray
-from redetect.least_squares.solver import scaled_inverse
 
 # A view contradicts the others by so many times their median residual: with one coefficient of the
 # lens, which leaves residuals of its own in the image's corners, and with all of them.
@@ -29,9 +28,6 @@ ALL_THE_SAME = (
     "are --columns, --rows and the kind of --board right, and do all pictures show the same board "
     "by the same camera at the same zoom?"
 )
-# Views differ in scale if that is so much, relatively, and its variance so many times that of
-# noise: boards that are not flat, and a lens that is not quite the model's, ask for some, too.
-_SCALE_CHANGE, _SCALE_VARIANCES = 0.01, 20.0
 # Below this the focal length hangs on the perspective of single views alone.
 _SMALLEST_SPREAD_DEG = 3.0
 _LARGEST_SCALE_SIGMA = 0.03
@@ -175,40 +171,3 @@ def demand_different_views(fit: Adjusted) -> None:
         f"at {u:.0f}, {v:.0f}; {tilt}, hold it nearer, and measure it: it may be longer than "
         "--square-m one way only"
     )
-
-
-def scale_warnings(fit: Adjusted, points: Points, names: Sequence[str]) -> list[str]:
-    """Whether views contradict each other in scale, which a pose takes up all but a little of."""
-    change, variance = scale_changes(fit, points)
-    weight = 1.0 / variance
-    change = change - np.average(change, weights=weight)
-    ratio = float(np.sum(weight * change**2)) / (len(change) - 1)
-    # The variance between views beyond that of noise (DerSimonian and Laird, Controlled Clinical
-    # Trials 7, 1986).
-    total = weight.sum()
-    spread = np.sqrt(
-        max(ratio - 1.0, 0.0) * (len(change) - 1) / (total - (weight @ weight) / total)
-    )
-    if ratio < _SCALE_VARIANCES or spread < _SCALE_CHANGE:
-        return []
-    return [
-        f"the pictures contradict each other in scale by {100.0 * spread:.1f} %: did zoom or "
-        f"autofocus change? It is larger in {listed(names, change > 0.0)} than in "
-        f"{listed(names, change <= 0.0)}"
-    ]
-
-
-def scale_changes(fit: Adjusted, points: Points) -> tuple[FloatArray, FloatArray]:
-    """(V,) relative changes of both scales that each view asks for by itself, and variances."""
-    _, by_intrinsics, by_pose = project_estimate(fit.estimate, points)
-    by_scale = by_intrinsics[:, :, :2] @ fit.estimate.intrinsics[:2]
-    root = np.sqrt(fit.weights)
-    by = root[..., None] * np.concatenate([by_scale[..., None], by_pose], axis=-1)
-    changes, variances = [], []
-    for view in range(len(points.counts)):
-        rows = points.views == view
-        jacobian, residuals = by[rows].reshape(-1, 7), (root * fit.residuals)[rows].ravel()
-        inverse = scaled_inverse(jacobian.T @ jacobian)
-        changes.append((inverse @ jacobian.T @ residuals)[0])
-        variances.append(fit.sigma_px**2 * inverse[0, 0])
-    return np.array(changes), np.array(variances)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.boards.board import Board, board_of
+from camera.boards.board import board_of
 from camera.boards.points import find_board
 from camera.calibration.adjustment import (
     Adjusted,
@@ -35,7 +35,7 @@ from camera.calibration.start import best_poses, board_poses
 from camera.camfile import read_camera, write_camera
 from camera.errors import CalibrationError
 from camera.model import Camera
-from camera.options import Calibrate, Floor
+from camera.options import Floor
 from camera.rotations import cross_matrices
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
@@ -54,13 +54,7 @@ def perform(options: Floor) -> int:
     """Carry the command out; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     camera = read_camera(options.camera)
-    is_picture = options.floor.suffix.lower() != ".csv"
-    if is_picture and 0 in (options.columns, options.rows, options.square_m):
-        raise CalibrationError(
-            "a picture of a board needs --columns, --rows and --square-m of the board; a .csv "
-            "of places on the floor (u,v,x,y) needs none"
-        )
-    seen = floor_points(options, None, options.floor, (camera.width, camera.height))
+    seen = floor_points(options, (camera.width, camera.height))
     known = covariance_of(camera)
     lens = None if known is None else known[:COUNT, :COUNT]
     placed = place_on_floor(camera, seen.pixels, seen.xy, lens, seen.radius_m)
@@ -68,7 +62,7 @@ def perform(options: Floor) -> int:
     if lens is None:
         print("the lens's covariance is not in the .cam file: neither will the pose's be")
     camera = placed_camera(camera, placed, lens)
-    write_floor_pictures(options, options.floor, camera)
+    write_floor_pictures(options, camera)
     write_camera(camera, options.output, overwrite=options.force)
     print(f"written: {options.output}")
     return 0
@@ -192,13 +186,17 @@ class FloorPoints(NamedTuple):
     radius_m: float = 0.0
 
 
-def floor_points(
-    options: Calibrate | Floor, board: Board | None, path: Path, size: tuple[int, int]
-) -> FloorPoints:
+def floor_points(options: Floor, size: tuple[int, int]) -> FloorPoints:
     """Points on the floor of a .csv file, or of a picture of the board."""
+    path = options.floor
     if path.suffix.lower() == ".csv":
         return FloorPoints(*read_floor_points(path))
-    board = board or board_of(options)
+    if 0 in (options.columns, options.rows, options.square_m):
+        raise CalibrationError(
+            "a picture of a board needs --columns, --rows and --square-m of the board; a .csv "
+            "of places on the floor (u,v,x,y) needs none"
+        )
+    board = board_of(options)
     if board.looks_turned:
         raise CalibrationError(
             f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
@@ -297,8 +295,9 @@ def describe_pose(pose: FloorPose) -> str:
     )
 
 
-def write_floor_pictures(options: Calibrate | Floor, floor: Path, camera: Camera) -> None:
+def write_floor_pictures(options: Floor, camera: Camera) -> None:
     """The floor's grid in its photograph, and the floor from above; of a table, nothing."""
+    floor = options.floor
     if options.pictures is None:
         return
     if floor.suffix.lower() == ".csv":

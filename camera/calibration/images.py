@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from camera.errors import CalibrationError
 from redetect.array_types import GreyImage
@@ -20,16 +21,14 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tif
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
 
-def calibration_images(
-    inputs: Sequence[Path], every: int, most: int
-) -> Iterator[tuple[str, GreyImage]]:
+def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
     """Names and grey images of photographs, folders of them, and videos, one after the other.
 
-    At most `most` images are used, evenly spaced, and at most `most` of every `every`-th frame of
-    each video. A file that is named twice is used once.
+    At most `most` images are used, and at most `most` frames of each video, evenly spaced. A file
+    that is named twice is used once.
     """
-    if every < 1 or most < 1:
-        raise CalibrationError(f"--every {every} and --max-images {most}: expected 1 or more")
+    if most < 1:
+        raise CalibrationError(f"--max-images {most}: expected 1 or more")
     images: list[Path] = []
     videos: list[Path] = []
     for path in inputs:
@@ -49,15 +48,11 @@ def calibration_images(
     for path in _evenly(_each_once(images), most):
         yield path.name, read_grey(path)
     for path in _each_once(videos):
-        yield from _frames(path, every, most)
+        yield from _frames(path, most)
 
 
 def read_grey(path: Path) -> GreyImage:
-    """Read an image as grey values of 8 bits, as the sensor saw it.
-
-    How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
-    calibration is of the sensor's pixels, whichever way up they are shown.
-    """
+    """Read an image as grey values of 8 bits, as the sensor saw it."""
     try:
         content = read_bounded(path, _LARGEST_FILE_BYTES)
     except OSError as error:
@@ -67,26 +62,13 @@ def read_grey(path: Path) -> GreyImage:
         raise CalibrationError(
             f"{path}: claims {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels"
         )
-    if size is None:
-        raise _not_an_image(path)
-    return grey_of_content(content, path)
-
-
-def grey_of_content(content: bytes, name: object) -> GreyImage:
-    """Decode the content of an image file as `read_grey` does; messages name it `name`.
-
-    The memory that the image takes is not checked here: see `redetect.storage.bounded`.
-    """
-    image = None
-    with suppress(cv2.error):
-        image = cv2.imdecode(
-            np.frombuffer(without_orientation(content), np.uint8),
-            cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION,
-        )
+    image = None if size is None else decoded_image(content)
     if image is None:
-        raise _not_an_image(name)
+        raise CalibrationError(
+            f"{path}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
+        )
     if image.dtype not in (np.uint8, np.uint16):
-        raise CalibrationError(f"{name}: holds {image.dtype}: expected images of 8 or 16 bits")
+        raise CalibrationError(f"{path}: holds {image.dtype}: expected images of 8 or 16 bits")
     if image.dtype == np.uint8:
         return np.asarray(image)
     # Cameras of 10 to 16 bits leave the upper part of the range unused: by the brightest pixel.
@@ -94,10 +76,18 @@ def grey_of_content(content: bytes, name: object) -> GreyImage:
     return np.asarray(np.rint(image.astype(np.float64) * (255.0 / brightest)), dtype=np.uint8)
 
 
-def _not_an_image(name: object) -> CalibrationError:
-    return CalibrationError(
-        f"{name}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
-    )
+def decoded_image(content: bytes) -> NDArray[Any] | None:
+    """(H, W) grey values of an image file's content, of any depth; None if they cannot be decoded.
+
+    How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
+    calibration is of the sensor's pixels, whichever way up they are shown. The memory that the
+    image takes is not checked here: see `redetect.storage.bounded`.
+    """
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        return cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
+    except cv2.error:  # sizes beyond OpenCV's bounds
+        return None
 
 
 def _is_image(path: Path) -> bool:
@@ -115,7 +105,7 @@ def _evenly(paths: list[Path], most: int) -> list[Path]:
     return [paths[i] for i in np.linspace(0, len(paths) - 1, most).round().astype(int)]
 
 
-def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]]:
+def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
     video = cv2.VideoCapture(str(path))
     try:
         if not video.isOpened():
@@ -124,7 +114,7 @@ def _frames(path: Path, every: int, most: int) -> Iterator[tuple[str, GreyImage]
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         # The frames are spread over the whole video.
-        step = max(every, -(-count // most)) if count > 0 else every
+        step = max(1, -(-count // most))
         number = taken = 0
         while taken < most and video.grab():
             if number % step == 0:

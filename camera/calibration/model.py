@@ -175,13 +175,6 @@ class FreeLens(NamedTuple):
         )  # fmt: skip
         return " ".join(names) or "none"
 
-    @property
-    def label(self) -> str:
-        """How many radial coefficients are free, and which kinds there are."""
-        kinds = [str(self.polynomial or self.coefficients)]
-        kinds += ["polynomial"] if self.polynomial else []
-        return " ".join([*kinds, "tangential"] if self.tangential else kinds)
-
 
 @dataclass(frozen=True)
 class CalibrationSettings:

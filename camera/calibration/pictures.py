@@ -21,17 +21,13 @@ if TYPE_CHECKING:
 
 
 _ARROW_SHARE = 0.05
-#: Height of the bars' axis, in the largest residual of a picture that is used.
-_VIEWS_TOP = 4.0
 
 
 def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
-    """PNG files by name: `residuals`, `views`, `coverage`."""
-    shown = len(calibration.names) + len(calibration.outliers)
+    """PNG files by name: `residuals`, `coverage`."""
     contents = {}
     for name, size, draw in (
         ("residuals", (13.0, 5.0), _draw_residuals),
-        ("views", (max(6.0, 0.22 * shown + 2.0), 4.2), _draw_views),
         ("coverage", (13.0, 4.6), partial(_draw_coverage, camera)),
     ):
         with figure_file(size, "png") as (figure, content):
@@ -75,27 +71,6 @@ def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
         f"RMS {calibration.adjusted.rms_px:.3f} px; rings: 1 and 2 times "
         f"{calibration.adjusted.sigma_px:.3f} px"
     )
-
-
-def _draw_views(calibration: Calibration, figure: Figure) -> None:
-    used, outliers = len(calibration.names), len(calibration.outliers)
-    names = [*calibration.names, *(name for name, _ in calibration.outliers)]
-    values = np.array([*calibration.view_rms_px, *(value for _, value in calibration.outliers)])
-    # Those far above, or without a residual, are cut off and labelled: the others stay readable.
-    highest = 1.05 * float(values[np.isfinite(values)].max())
-    top = min(highest, _VIEWS_TOP * float(values[:used].max()))
-    colours = ["tab:blue"] * used + ["tab:red"] * outliers
-    axes = figure.add_subplot()
-    axes.bar(np.arange(len(names)), np.minimum(values, top), color=colours)
-    axes.axhline(calibration.adjusted.rms_px, color="0.3", lw=0.8)
-    axes.set_ylim(0.0, top)
-    for place, value in enumerate(values.tolist()):
-        if value > top:
-            label = f"{value:.1f}" if np.isfinite(value) else "none"
-            axes.text(place, top, label, ha="center", va="bottom", fontsize=6)
-    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=6)
-    axes.set_ylabel("RMS residual (px)")
-    axes.set_title("Each picture; red: left out" if outliers else "Each picture", pad=12)
 
 
 def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> None:

@@ -1,4 +1,4 @@
-"""COLMAP's cameras.txt and cameras.bin, and ``pycolmap.Camera``.
+"""COLMAP's cameras.txt, and ``pycolmap.Camera``.
 
 COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
 principal point is moved by half a pixel on the way in and out. For programs that use pycolmap,
@@ -7,18 +7,15 @@ principal point is moved by half a pixel on the way in and out. For programs tha
 
 from __future__ import annotations
 
-import struct
-
 import pycolmap
 
 from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.yaml_files import foreign, name_of_one, shortest
+from camera.formats.yaml_files import foreign, name_of_one
 from redetect.storage.messages import excerpt, one_line
 
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
-_DIGITS = frozenset("0123456789")
 
 #: COLMAP's models that have one of ours, and their numbers of focal lengths. Then come two numbers
 #: of the principal point, and the first coefficients of ours.
@@ -66,41 +63,6 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     return _from_parameters(where, fields[1], width, height, parameters)
 
 
-def text_of_binary(content: bytes, name: str = "<bytes>") -> str:
-    """The lines of a cameras.txt of the content of a cameras.bin.
-
-    References
-    ----------
-    COLMAP, src/colmap/scene/reconstruction_io_binary.cc.
-    """
-    lines = []
-    try:
-        (count,) = struct.unpack_from("<Q", content)
-        place = 8
-        for camera in range(1, count + 1):
-            number, model, width, height = struct.unpack_from("<IiQQ", content, place)
-            try:
-                kind = pycolmap.CameraModelId(model)
-                length = _parameter_count(kind)
-            except ValueError:
-                raise ConversionError(
-                    f"{name}: camera {camera} has COLMAP's model {model}, which is unknown here: "
-                    "write it as text (colmap model_converter --output_type TXT)"
-                ) from None
-            parameters = struct.unpack_from(f"<{length}d", content, place + 24)
-            place += 24 + 8 * length
-            values = " ".join(repr(value) for value in parameters)
-            lines.append(f"{number} {kind.name} {width} {height} {values}")
-    except struct.error:
-        raise ConversionError(f"{name}: ends early: expected COLMAP's cameras.bin") from None
-    if place != len(content):
-        raise ConversionError(
-            f"{name}: {len(content) - place} bytes behind its {count} cameras: expected COLMAP's "
-            "cameras.bin"
-        )
-    return "\n".join([*lines, ""])
-
-
 def camera_from_pycolmap(camera: pycolmap.Camera) -> ForeignCamera:
     """A camera of a ``pycolmap.Camera``."""
     parameters = [float(value) for value in camera.params]
@@ -127,8 +89,8 @@ def _from_parameters(
     return foreign(where, model, width, height, (fx, fy, cx, cy), coefficients)
 
 
-def _parameter_count(model: pycolmap.CameraModelId | str) -> int:
-    """How many parameters a model has; a ValueError if COLMAP has none of that name or number."""
+def _parameter_count(model: str) -> int:
+    """How many parameters a model has."""
     return len(pycolmap.Camera(model=model).params_info.split(","))
 
 
@@ -136,24 +98,21 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
     """COLMAP's name of the model, and its parameters."""
     model, d = camera.model, camera.distortion
     if model == "radtan" and d[4] != 0.0:
-        model, d = "rational", (*d, *(0.0,) * 7)
-    if model == "rational" and any(d[8:]):
-        raise ConversionError("COLMAP has no thin prism with the rational model")
+        model, d = "rational", (*d, *(0.0,) * 3)
     name = _WRITTEN[model]
     pinhole = [camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
     return name, [*pinhole, *d[: _parameter_count(name) - 4]]
 
 
-def format_colmap(camera: ForeignCamera, camera_name: str = "1") -> str:
-    """The text of a cameras.txt of one camera; its number is 1 unless `camera_name` is one."""
+def format_colmap(camera: ForeignCamera) -> str:
+    """The text of a cameras.txt of one camera, number 1."""
     name, parameters = colmap_parameters(camera)
-    number = camera_name if camera_name and _DIGITS.issuperset(camera_name) else "1"
-    values = " ".join(shortest(value) for value in parameters)
+    values = " ".join(map(repr, parameters))
     return (
         "# Camera list with one line of data per camera:\n"
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
         "# Number of cameras: 1\n"
-        f"{number} {name} {camera.width} {camera.height} {values}\n"
+        f"1 {name} {camera.width} {camera.height} {values}\n"
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
-from camera.formats.colmap import format_colmap, parse_colmap, text_of_binary
+from camera.formats.colmap import format_colmap, parse_colmap
 from camera.formats.conversion import (
     AnyCamera,
     Converted,
@@ -30,10 +30,10 @@ from camera.options import Convert, Format
 from redetect.storage import bounded, demand_place, write_bytes
 
 #: The models that each format has, the simplest first, and how many of their coefficients: some
-#: formats lack k3, or the rational model's thin prism.
+#: formats lack k3.
 MODELS: dict[str, dict[Model, int]] = {
-    "opencv": {"radtan": 5, "rational": 12, "fisheye": 4},
-    "ros": {"radtan": 5, "rational": 12, "fisheye": 4},
+    "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
+    "ros": {"radtan": 5, "rational": 8, "fisheye": 4},
     "kalibr": {"radtan": 4, "fisheye": 4},
     "colmap": {"radtan": 4, "rational": 8, "fisheye": 4},
 }
@@ -43,12 +43,8 @@ def perform(options: Convert) -> int:
     """Carry the command out; returns the exit code."""
     demand_place(options.target, overwrite=options.force)
     text = read_text(options.source)
-    from_format = options.from_format
-    if from_format == "auto":
-        from_format = format_of_text(options.source, text)
-    to_format = options.to_format
-    if to_format == "auto":
-        to_format = format_of_name(options.target)
+    from_format = format_of_text(options.source, text)
+    to_format = format_of_name(options.target)
     source = parse(text, from_format, str(options.source), options.camera_name)
     try:
         converted = convert(source, to_format, options)
@@ -73,19 +69,15 @@ def perform(options: Convert) -> int:
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose stays behind: the format has none (--pose-from brings it back)")
-    written = format_of(camera, to_format, options.camera_name)
+    written = format_of(camera, to_format)
     write_bytes(options.target, written.encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 
 
 def read_text(path: Path) -> str:
-    """The text of a calibration file; of COLMAP's cameras.bin, that of its cameras.txt."""
-    kind = "calibration file"
-    if path.suffix.lower() == ".bin":
-        content = bounded.read_content(path, LARGEST_FILE_BYTES, kind, ConversionError)
-        return text_of_binary(content, str(path))
-    return bounded.read_text(path, LARGEST_FILE_BYTES, kind, ConversionError)
+    """The text of a calibration file."""
+    return bounded.read_text(path, LARGEST_FILE_BYTES, "calibration file", ConversionError)
 
 
 def _label(camera: Camera) -> str:
@@ -112,8 +104,8 @@ def format_of_name(path: Path) -> Format:
             if part in name:
                 return found
     raise ConversionError(
-        f"{path}: the name does not say which format: give --to-format opencv, ros, kalibr or "
-        "colmap, or end it in .cam, .opencv.yaml, .ros.yaml, .kalibr.yaml or cameras.txt"
+        f"{path}: the name does not say which format: end it in .cam, .opencv.yaml, .ros.yaml, "
+        ".kalibr.yaml or cameras.txt"
     )
 
 
@@ -130,7 +122,7 @@ def format_of_text(path: Path, text: str) -> Format:
     """The format of a file, by its content."""
     if text.lstrip().startswith("{ SmRadial") or path.suffix.lower() == ".cam":
         return "cam"
-    if path.suffix.lower() in (".txt", ".bin"):
+    if path.suffix.lower() == ".txt":
         return "colmap"
     if text.lstrip().startswith("<"):
         raise ConversionError(
@@ -148,7 +140,7 @@ def format_of_text(path: Path, text: str) -> Format:
     raise ConversionError(
         f"{path}: neither a .cam file nor a camera in OpenCV's, ROS's, Kalibr's or COLMAP's format "
         "that is recognised (they have image_width, distortion_model, cam0 with intrinsics, or are "
-        "a cameras.txt): give --from-format"
+        "a cameras.txt)"
     )
 
 
@@ -165,17 +157,17 @@ def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> A
     return parse_colmap(text, name, camera_name)
 
 
-def format_of(camera: AnyCamera, to_format: Format, camera_name: str = "") -> str:
+def format_of(camera: AnyCamera, to_format: Format) -> str:
     """The text of a file of a camera."""
     if isinstance(camera, Camera):
         return format_camera(camera)
     if to_format == "opencv":
         return format_opencv(camera)
     if to_format == "ros":
-        return format_ros(camera, camera_name or "camera")
+        return format_ros(camera)
     if to_format == "kalibr":
-        return format_kalibr(camera, camera_name)
-    return format_colmap(camera, camera_name)
+        return format_kalibr(camera)
+    return format_colmap(camera)
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:

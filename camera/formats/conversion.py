@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from camera.calibration.model import free_span, is_possible, project_points
 from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import CameraError, ConversionError
-from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, distorted
+from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
 from camera.uncertainty import UNPOSED, intrinsics_of, with_intrinsics
 from redetect.array_types import FloatArray
@@ -38,8 +38,6 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-# The rational model's coefficients before those of the thin prism.
-_WITHOUT_PRISM = 8
 # A largest deviation after least squares from which on a fuller model is tried.
 _NEAR_PX = 0.02
 
@@ -166,8 +164,7 @@ def convert_to_foreign(
     rows : str
         `same`, `halve` or `double`.
     free : int, optional
-        Number of the model's first coefficients that may differ from 0; by default all. A thin
-        prism's are taken over, but never fitted.
+        Number of the model's first coefficients that may differ from 0; by default all.
 
     Returns
     -------
@@ -192,15 +189,8 @@ def convert_to_foreign(
     if model != "fisheye":
         start[4 + P1 : 4 + P1 + 2] = _tangential(source)
 
-    def seen(parameters: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):
-            moved = distorted(model, parameters[4:], rays)
-            return np.asarray(moved * parameters[:2] + parameters[2:4])
-
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        steps = np.diag(1e-6 * np.maximum(np.abs(parameters), 1.0))
-        differences = [seen(parameters + step) - seen(parameters - step) for step in steps]
-        return seen(parameters), np.stack(differences, axis=-1) / (2.0 * np.diag(steps))
+        return projected(model, parameters, rays)[:2]
 
     def possible(parameters: FloatArray) -> bool:
         return bool(min(parameters[:2]) > 0.0)
@@ -211,7 +201,6 @@ def convert_to_foreign(
         return _measured(camera, check)
 
     # From few coefficients to all: so a fit does not start in a wrong valley.
-    number = min(number, _WITHOUT_PRISM)
     counts = sorted({min(count, number) for count in (1, 2, 4, 5, 6, 7, 8)})
     spans = [np.eye(len(start))[:, : 4 + count] for count in counts]
     return _nearest(CameraFit(pixels, project, possible, measured), start, spans)

@@ -6,8 +6,7 @@ where its files are read) and a distortion of normalised coordinates x = X/Z, y 
 radtan
     k1 k2 p1 p2 k3: polynomial in r^2, with Brown's tangential terms.
 rational
-    k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4: the same over 1 + k4 r^2 + k5 r^4 + k6 r^6, and OpenCV's
-    thin prism.
+    k1 k2 p1 p2 k3 k4 k5 k6: the same over 1 + k4 r^2 + k5 r^4 + k6 r^6.
 fisheye
     k1 k2 k3 k4: polynomial in the angle (Kannala and Brandt; OpenCV's fisheye, ROS's and Kalibr's
     equidistant).
@@ -20,8 +19,9 @@ OpenCV, Camera Calibration and 3D Reconstruction; COLMAP, src/colmap/sensor/mode
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 
 from camera.errors import ConversionError
@@ -32,7 +32,7 @@ from redetect.storage.messages import excerpt
 Model = Literal["radtan", "rational", "fisheye"]
 
 #: Number of coefficients that `ForeignCamera.distortion` holds for each model.
-COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 12, "fisheye": 4}
+COEFFICIENTS: dict[Model, int] = {"radtan": 5, "rational": 8, "fisheye": 4}
 
 #: Place of p1, before p2, in those of `radtan` and `rational`.
 P1 = 2
@@ -41,8 +41,7 @@ _LARGEST_SIDE_PX = 65536
 # Number of steps from the image's centre in which the inverse is found.
 _WALK = 24
 _NEWTON_STEPS = 20
-_CONVERGED_PX = 1e-7
-_SMALLEST_STEP = 1e-6
+_ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
 
 
 @dataclass(frozen=True)
@@ -87,33 +86,28 @@ class ForeignCamera:
         """The 9 numbers of the camera matrix, row by row."""
         return [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
 
-    @property
-    def printed_distortion(self) -> tuple[float, ...]:
-        """The coefficients without a thin prism that is 0."""
-        d = self.distortion
-        return d[:8] if self.model == "rational" and not any(d[8:]) else d
-
     def distort(self, normalised: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates."""
-        moved = distorted(self.model, self.distortion, normalised)
-        return np.asarray(moved * [self.fx, self.fy] + [self.cx, self.cy], dtype=np.float64)
+        return self._seen(normalised.reshape(-1, 2)).pixels.reshape(normalised.shape)
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
 
         Newton's method, continued outwards from the centre to avoid branches past a fold.
         """
-        target = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
-        xy = np.zeros_like(target)
+        centre = np.array([self.cx, self.cy])
+        xy = np.zeros_like(pixels)
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
                 for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
-                    error = share * target - distorted(self.model, self.distortion, xy)
-                    xy = xy + (inverse_2x2(self._jacobian(xy)) @ error[..., None])[..., 0]
-                    if np.abs(error).max() < 1e-15:
+                    seen = self._seen(xy)
+                    error = centre + share * (pixels - centre) - seen.pixels
+                    xy = xy + (inverse_2x2(seen.by_place) @ error[..., None])[..., 0]
+                    if np.abs(error).max() < _ROUNDING_PX:
                         break
-            off = np.abs(self.distort(xy) - pixels).max(axis=-1)
-            determinant = np.linalg.det(self._jacobian(xy))
+            seen = self._seen(xy)
+            off = np.abs(seen.pixels - pixels).max(axis=-1)
+            determinant = np.linalg.det(seen.by_place)
         bad = ~(off < _CONVERGED_PX) | ~(determinant > 0.0)
         if bad.any():
             u, v = pixels[int(np.argmax(bad))]
@@ -124,40 +118,39 @@ class ForeignCamera:
             )
         return np.asarray(xy)
 
-    def _jacobian(self, xy: FloatArray) -> FloatArray:
-        """(..., 2, 2) d(distorted) / d(x, y), by central differences."""
-        model, d = self.model, self.distortion
-        step = _SMALLEST_STEP * (1.0 + np.linalg.norm(xy, axis=-1, keepdims=True))
-        differences = [
-            distorted(model, d, xy + step * axis) - distorted(model, d, xy - step * axis)
-            for axis in np.eye(2)
-        ]
-        return np.stack([difference / (2.0 * step) for difference in differences], axis=-1)
+    def _seen(self, normalised: FloatArray) -> Projected:
+        parameters = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        return projected(self.model, parameters, normalised)
 
 
-def distorted(
-    model: Model, coefficients: tuple[float, ...] | FloatArray, normalised: FloatArray
-) -> FloatArray:
-    """(..., 2) distorted normalised coordinates of (..., 2) undistorted ones."""
-    x, y = normalised[..., 0], normalised[..., 1]
-    q = x * x + y * y
+class Projected(NamedTuple):
+    """Where N places are seen."""
+
+    pixels: FloatArray  # (N, 2)
+    by_parameters: FloatArray  # (N, 2, P) derivatives by fx, fy, cx, cy and the coefficients
+    by_place: FloatArray  # (N, 2, 2) derivatives by the normalised coordinates
+
+
+def projected(model: Model, parameters: FloatArray, normalised: FloatArray) -> Projected:
+    """Project undistorted normalised coordinates (N, 2), by OpenCV.
+
+    `parameters` (P,) are fx, fy, cx, cy and the coefficients of the model.
+    """
+    fx, fy, cx, cy = parameters[:4]
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    points = np.column_stack([normalised, np.ones(len(normalised))])[:, None]
+    nowhere = np.zeros(3)
+    # Derivatives by the pose are before those by the parameters, of a fisheye behind them.
     if model == "fisheye":
-        r = np.sqrt(q)
-        angle = np.arctan(r)
-        a = angle * angle
-        k1, k2, k3, k4 = coefficients
-        bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-        factor = np.where(r > 1e-12, bent / np.where(r > 1e-12, r, 1.0), 1.0)
-        return np.asarray(normalised * factor[..., None])
-    k1, k2, p1, p2, k3 = coefficients[:5]
-    factor = 1.0 + q * (k1 + q * (k2 + q * k3))
-    if model == "rational":
-        k4, k5, k6 = coefficients[5:8]
-        factor = factor / (1.0 + q * (k4 + q * (k5 + q * k6)))
-    u = x * factor + 2.0 * p1 * x * y + p2 * (q + 2.0 * x * x)
-    v = y * factor + p1 * (q + 2.0 * y * y) + 2.0 * p2 * x * y
-    if model == "rational":
-        s1, s2, s3, s4 = coefficients[8:12]
-        u = u + q * (s1 + s2 * q)
-        v = v + q * (s3 + s4 * q)
-    return np.stack([u, v], axis=-1)
+        seen = cv2.fisheye.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
+        own, translation = 0, 11
+    else:
+        seen = cv2.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
+        own, translation = 6, 3
+    pixels, derivatives = (np.asarray(part, np.float64) for part in seen)
+    derivatives = derivatives.reshape(len(points), 2, -1)
+    return Projected(
+        pixels.reshape(-1, 2),
+        derivatives[..., own : own + len(parameters)],
+        derivatives[..., translation : translation + 2],
+    )

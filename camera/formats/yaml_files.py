@@ -6,7 +6,7 @@ YAML is read safely: plain values only, bounded, without aliases. OpenCV's own d
 
 from __future__ import annotations
 
-import re
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -121,14 +121,6 @@ def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float
     return m[0], m[4], m[2], m[5]
 
 
-def shortest(value: float) -> str:
-    """The shortest text that reads back as the same float, with the dot that YAML 1.1 wants."""
-    text = repr(float(value) + 0.0)
-    if "e" in text and "." not in text:
-        return text.replace("e", ".0e")
-    return text
-
-
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _DISTORTION = (
     "distortion_coefficients",
@@ -137,7 +129,6 @@ _DISTORTION = (
     "Distortion_Coefficients",
     "D",
 )
-_TILT = 12
 _FISHEYE = ("1", "true", "fisheye", "equidistant")
 
 
@@ -166,9 +157,9 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
         raise ConversionError(
             f"{name}: {count} distortion coefficients: expected 4, 5, 8, 12 or 14"
         )
-    if any(coefficients[_TILT:]):
+    if any(beyond := coefficients[COEFFICIENTS["rational"] :]):
         raise ConversionError(
-            f"{name}: a tilted sensor (tau {excerpt(coefficients[_TILT:])}) can't be converted"
+            f"{name}: a thin prism or a tilted sensor ({excerpt(beyond)}) can't be converted"
         )
     return "radtan" if count <= 5 else "rational"
 
@@ -203,7 +194,7 @@ def foreign(
 
 def format_opencv(camera: ForeignCamera) -> str:
     """The text of an OpenCV YAML file; OpenCV's FileStorage reads it."""
-    d = camera.printed_distortion
+    d = camera.distortion
     lines = ["%YAML:1.0", "---", f"image_width: {camera.width}", f"image_height: {camera.height}"]
     lines += _opencv_matrix("camera_matrix", 3, 3, camera.matrix)
     lines += _opencv_matrix("distortion_coefficients", len(d), 1, d)
@@ -212,14 +203,19 @@ def format_opencv(camera: ForeignCamera) -> str:
 
 
 def _opencv_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
-    data = ", ".join(shortest(value) for value in values)
     return [
         f"{key}: !!opencv-matrix",
         f"   rows: {rows}",
         f"   cols: {columns}",
         "   dt: d",
-        f"   data: [ {data} ]",
+        f"   data: {_yaml_of(list(values)).strip()}",
     ]
+
+
+def _yaml_of(content: object) -> str:
+    """YAML with keys in their order and lists of numbers on one line."""
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=math.inf)
+    return text
 
 
 #: Names of the models in ROS (sensor_msgs/distortion_models.h).
@@ -231,7 +227,6 @@ ROS_NAMES: dict[Model, str] = {
 _ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
     "fisheye": "fisheye"
 }
-_ROS_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
@@ -278,36 +273,30 @@ def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None
         )
 
 
-def format_ros(camera: ForeignCamera, camera_name: str = "camera") -> str:
-    """The text of a camera_info YAML file, as camera_calibration writes it.
+def format_ros(camera: ForeignCamera) -> str:
+    """The text of a camera_info YAML file, as camera_calibration writes it."""
 
-    A name that is no word, such as a number, is left out for ``camera``.
-    """
-    d, matrix = camera.printed_distortion, camera.matrix
-    projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
-    identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    lines = [
-        f"image_width: {camera.width}",
-        f"image_height: {camera.height}",
-        f"camera_name: {camera_name if _ROS_NAME.fullmatch(camera_name) else 'camera'}",
-        *_ros_matrix("camera_matrix", 3, 3, matrix),
-        f"distortion_model: {ROS_NAMES[camera.model]}",
-        *_ros_matrix("distortion_coefficients", 1, len(d), d),
-        *_ros_matrix("rectification_matrix", 3, 3, identity),
-        *_ros_matrix("projection_matrix", 3, 4, projection),
-    ]
-    return "\n".join([*lines, ""])
+    def matrix(rows: int, *values: float) -> dict[str, Any]:
+        return {"rows": rows, "cols": len(values) // rows, "data": list(values)}
 
-
-def _ros_matrix(key: str, rows: int, columns: int, values: Sequence[float]) -> list[str]:
-    data = ", ".join(shortest(value) for value in values)
-    return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+    m = camera.matrix
+    return _yaml_of(
+        {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_name": "camera",
+            "camera_matrix": matrix(3, *m),
+            "distortion_model": ROS_NAMES[camera.model],
+            "distortion_coefficients": matrix(1, *camera.distortion),
+            "rectification_matrix": matrix(3, *np.eye(3).ravel().tolist()),
+            "projection_matrix": matrix(3, *m[:3], 0.0, *m[3:6], 0.0, *m[6:], 0.0),
+        }
+    )
 
 
 _KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
 _KALIBR_COEFFICIENTS = 4
 _LONGEST_LIST = 100
-_KALIBR_NAME = re.compile(r"cam\d+", re.ASCII)
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
@@ -351,18 +340,18 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     return foreign(where, _KALIBR_MODELS[label], width, height, (fx, fy, cx, cy), d)
 
 
-def format_kalibr(camera: ForeignCamera, camera_name: str = "cam0") -> str:
-    """The text of a camchain of one camera: ``cam0``, unless `camera_name` is such a name."""
+def format_kalibr(camera: ForeignCamera) -> str:
+    """The text of a camchain of one camera, ``cam0``."""
     if camera.model == "rational" or any(camera.distortion[_KALIBR_COEFFICIENTS:]):
         raise ConversionError("Kalibr has no rational model and no k3: expected radtan or fisheye")
-    d = ", ".join(shortest(value) for value in camera.distortion[:_KALIBR_COEFFICIENTS])
-    pinhole = ", ".join(shortest(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
-    lines = [
-        f"{camera_name if _KALIBR_NAME.fullmatch(camera_name) else 'cam0'}:",
-        "  camera_model: pinhole",
-        f"  intrinsics: [{pinhole}]",
-        f"  distortion_model: {'equi' if camera.model == 'fisheye' else 'radtan'}",
-        f"  distortion_coeffs: [{d}]",
-        f"  resolution: [{camera.width}, {camera.height}]",
-    ]
-    return "\n".join([*lines, ""])
+    return _yaml_of(
+        {
+            "cam0": {
+                "camera_model": "pinhole",
+                "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+                "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
+                "distortion_coeffs": list(camera.distortion[:_KALIBR_COEFFICIENTS]),
+                "resolution": [camera.width, camera.height],
+            }
+        }
+    )

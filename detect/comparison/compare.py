@@ -20,16 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from detect.comparison.floor import floor_bin, floor_pairs, normalised_error, quantile
+from detect.comparison.floor import floor_difference, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
+    DiscPairs,
     DistanceBin,
     ForwardRange,
     FrameMatch,
     FramePair,
     Kind,
-    Levelling,
     LineComparison,
     LinePairs,
 )
@@ -46,9 +46,7 @@ from redetect.landmarks import (
     LineLandmark,
     associate,
     associate_positions,
-    associate_within_covariance,
     circle_arrays,
-    is_positive_definite,
     read_frames,
     wrap_angle,
 )
@@ -68,12 +66,11 @@ def compare_with_file(
     *,
     sight: Sight | None = None,
     unlisted: Path | None = None,
-    lookalikes: Path | None = None,
     names: tuple[str, str] | None = None,
 ) -> Comparison:
     """Compare discs, or lines, with those of a reference file.
 
-    The rest as in `compare_frames`; unlisted ones and look-alikes are by default those in the
+    The rest as in `compare_frames`; look-alikes, and by default unlisted ones, are those in the
     reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
     names = names or (str(reference), "detected")
@@ -86,7 +83,7 @@ def compare_with_file(
     uncounted = rows("unlisted", unlisted)
     if kind == "lines":
         return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
-    alike = rows("lookalikes", lookalikes)
+    alike = rows("lookalikes", None)
     return compare_frames(
         wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
@@ -120,10 +117,10 @@ def compare_frames(
     Raises
     ------
     CompareError
-        If an image has two frames, or a covariance is needed and not positive definite.
+        If an image has two frames.
     """
     options = options or CompareOptions()
-    in_image = sight is not None and not options.on_floor
+    in_image = sight is not None and options.gate_m is None
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
@@ -135,41 +132,33 @@ def compare_frames(
         circle_arrays([row for m in matches for row in m.missed]),
         circle_arrays([row for m in matches for row in m.extra]),
     )
-    covariance = {
-        "detected": second.covariance,
-        "reference": first.covariance,
-        "sum": first.covariance + second.covariance,
-    }[options.error_covariance]
     lean, pairs = floor_pairs(
         None if sight is None else sight.camera,
         first.xy,
         second.xy,
-        covariance,
+        second.covariance,
         np.repeat(np.arange(len(matches)), [len(match.matched) for match in matches]),
     )
     apart = [] if sight is None else [apart_px(match) for match in matches]
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
-    true = sight is not None and sight.reference_level
     ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
     return DiscComparison(
-        **common,
-        on_lookalikes=_on_lookalikes(matches, lookalikes, options),
+        **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
-        normalised_error=normalised_error(pairs.offset, covariance),
+        normalised_error=normalised_error(pairs.offset, second.covariance),
         reference_quality_matched=quantile(first.quality),
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
-        bins=tuple(_distance_bin(part, sides, error_m) for part in ranges),
+        bins=tuple(_distance_bin(part, sides, pairs, lean is not None) for part in ranges),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
-        reference_levelling=_levelling(matches, wanted, true=true),
-        detected_levelling=_levelling(matches, found),
-        floor=tuple(floor_bin(pairs, lean, part) for part in ranges),
+        reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
+        detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
         lean=lean,
         pairs=pairs,
     )
@@ -212,7 +201,7 @@ def compare_line_frames(
 
 
 def _distance_bin(
-    part: ForwardRange, sides: tuple[CircleArrays, ...], error_m: FloatArray
+    part: ForwardRange, sides: tuple[CircleArrays, ...], pairs: DiscPairs, has_lean: bool
 ) -> DistanceBin:
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
     inside = [part.holds(side.xy) for side in sides]
@@ -231,8 +220,10 @@ def _distance_bin(
         precision=second / (second + extra) if second + extra else None,
         reference_quality_median=wanted,
         detected_quality_median=found,
-        error_median_m=quantile(error_m[inside[0]]),
+        error_median_m=quantile(np.linalg.norm(pairs.offset[inside[0]], axis=1)),
         quality_difference=None if wanted is None or found is None else found - wanted,
+        before=floor_difference(pairs.offset[inside[0]], pairs.away[inside[0]]),
+        after=floor_difference(pairs.left[inside[0]], pairs.away[inside[0]]) if has_lean else None,
     )
 
 
@@ -248,15 +239,6 @@ def _on_lookalikes(
         for m in matches
         if m.frame.name in known
     )
-
-
-def _levelling(
-    matches: Sequence[FrameMatch], frames: Mapping[str, Frame], *, true: bool = False
-) -> Levelling:
-    by = [frames[m.frame.name].levelled_by for m in matches if m.frame.name in frames]
-    tilts = np.degrees([tilt for tilt in by if tilt is not None]).reshape(-1, 2)
-    medians = (quantile(tilts[:, 0]), quantile(tilts[:, 1]))
-    return Levelling(len(matches), len(tilts), true and not len(tilts), *medians)
 
 
 #: Of discs that are compared on the floor, where nothing else is said (m).
@@ -287,15 +269,13 @@ def match_runs(
 ) -> dict[str, Any]:
     """Match the rows of two runs, image by image: the fields of a `Comparison`.
 
-    Images are in the order of the reference, then those of `detected` alone, if they count.
+    Images are in the order of the reference; those that only one run has do not count.
     """
-    images = [name for name in reference if options.all_frames or name in detected]
-    if options.all_frames:
-        images += [name for name in detected if name not in reference]
+    images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
     for name in images:
-        frames = reference.get(name), detected.get(name)
+        frames = reference[name], detected[name]
         view = None if sight is None else sight.of(*frames)
         pair = pair_of(kind, name, *frames, known.get(name), view)
         matches.append(match_frame(pair, options))
@@ -313,6 +293,7 @@ def match_runs(
         "detected": detected_rows,
         "found": found,
         **counts,
+        "on_lookalikes": None,
         "recall": found / wanted if wanted else None,
         "precision": counts["matched"] / detected_rows if detected_rows else None,
         "frames": tuple(matches),
@@ -342,12 +323,10 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
     """Match the rows of one frame one to one.
 
     Detected rows that fit an unlisted disc or line (or a reference row without ID, if these do not
-    count), and no reference row that counts, are set aside. Raises CompareError if the gate needs a
-    reference disc's covariance and that is not positive definite.
+    count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if frame.kind == "circles":
-        _demand_measurable(frame, options)
         pair_up = partial(pair_discs, options=options, view=frame.view)
     counted, uncounted = frame.reference, list(frame.unlisted)
     if options.only_identified:
@@ -387,18 +366,14 @@ def pair_discs(
     In the image where there is a view, unless the options ask for the floor.
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
-    if view is not None and not options.on_floor:
+    if view is not None and options.gate_m is None:
         seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
-        gate = view.gates(first.xy, options.least_px)
+        gate = view.gates(first.xy)
         apart = (again[None] - seen[:, None]) / gate[:, None]
         cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
         return associate(np.minimum(cost, 2.0), cost <= 1.0)
-    if options.sigma is None:
-        gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
-        return associate_positions(first.xy, second.xy, gate_m=gate_m)
-    return associate_within_covariance(
-        first.xy, second.xy, first.covariance, gate_sigma=options.sigma
-    )
+    gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
+    return associate_positions(first.xy, second.xy, gate_m=gate_m)
 
 
 def pair_lines(
@@ -431,12 +406,3 @@ def numbers(rows: Sequence[Any], name: str) -> FloatArray:
 def _turns(reference: Sequence[LineLandmark], detected: Sequence[LineLandmark]) -> FloatArray:
     """(N, M) bearings of detected lines less those of reference lines (rad)."""
     return wrap_angle(numbers(detected, "alpha") - numbers(reference, "alpha")[:, np.newaxis])
-
-
-def _demand_measurable(frame: FramePair, options: CompareOptions) -> None:
-    covariance = circle_arrays(frame.reference).covariance
-    if options.sigma is not None and not is_positive_definite(covariance).all():
-        raise CompareError(
-            f"frame {excerpt(frame.name)}: a reference row's covariance is not positive definite: "
-            "expected one to measure sigmas in; a gate in metres needs none"
-        )

@@ -14,9 +14,7 @@ from camera import Camera
 from detect.comparison.result import (
     CommonLean,
     DiscPairs,
-    FloorBin,
     FloorDifference,
-    ForwardRange,
     NormalisedError,
 )
 from detect.seen import image_positions, level_seen
@@ -124,21 +122,14 @@ def floor_pairs(
         roll_sigma_deg=float(np.degrees(sigma[1])),
         raised_m=float(value[2]),
         raised_sigma_m=float(sigma[2]),
-        left=_difference(left, away),
+        left=floor_difference(left, away),
         normalised_error=normalised_error(left[seen], covariance[seen]),
     )
     return common, DiscPairs(reference_xy, offset, left, covariance, away)
 
 
-def floor_bin(pairs: DiscPairs, lean: CommonLean | None, part: ForwardRange) -> FloorBin:
-    """Differences at a range of forward distances, before and after the lean."""
-    here = part.holds(pairs.reference_xy)
-    before = _difference(pairs.offset[here], pairs.away[here])
-    after = None if lean is None else _difference(pairs.left[here], pairs.away[here])
-    return FloorBin(part.from_m, part.to_m, before, after)
-
-
-def _difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+def floor_difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+    """Figures of differences (N, 2) on the floor (m), seen along unit vectors `away` (N, 2)."""
     seen = np.isfinite(offset).all(axis=1)
     offset, away = offset[seen], away[seen]
     size = np.asarray(np.linalg.norm(offset, axis=1))

@@ -19,7 +19,6 @@ from detect.comparison.result import (
     Comparison,
     DiscComparison,
     Kind,
-    Levelling,
     LineComparison,
     NormalisedError,
     number,
@@ -27,7 +26,7 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.seen import Sight
+from detect.seen import LEAST_GATE_PX, Sight
 from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
@@ -38,7 +37,7 @@ from redetect.storage.messages import one_line
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     result = comparison_of(command)
-    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.on_floor):
+    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.gate_m):
         print("no calibration: positions are compared on the floor; --camera names one")
     Console().print(comparison_tables(result))
     if command.json is not None:
@@ -53,8 +52,6 @@ def perform(command: Compare) -> int:
 
 def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     """The comparison that a command asks for; with a camera, if it isn't named by its file."""
-    if command.lines and command.lookalikes:
-        raise DetectError("--lookalikes are of discs: expected none with --lines")
     kind: Kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
@@ -78,7 +75,6 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
         command.matching,
         sight=sight,
         unlisted=command.unlisted,
-        lookalikes=command.lookalikes,
         names=(str(reference), str(detected)),
     )
 
@@ -114,8 +110,8 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 def summary_rows(c: Comparison) -> dict[str, str]:
     """Names and words: what was found first, then how it was compared and how large errors are."""
-    only, counted = c.options.only_identified, "counted" if c.options.all_frames else "not counted"
-    on_lookalikes = c.lookalikes_found
+    only = c.options.only_identified
+    on_lookalikes = c.on_lookalikes
     joined = f", {c.joined} of them by a row that represents several" if c.joined else ""
     rows = {
         "found": f"{c.found} of {c.reference} reference rows{joined}",
@@ -139,12 +135,12 @@ def summary_rows(c: Comparison) -> dict[str, str]:
         "reference": one_line(c.reference_name) + (", rows with an ID only" if only else ""),
         "detected": one_line(c.detected_name),
         "frames": f"{len(c.frames)} compared; {len(c.frames_only_in_reference)} only in the "
-        f"reference, {len(c.frames_only_in_detected)} only detected ({counted})",
+        f"reference, {len(c.frames_only_in_detected)} only detected (not counted)",
     }
     if isinstance(c, DiscComparison):
         rows |= _disc_rows(c)
     elif isinstance(c, LineComparison):
-        error = _normalised_error(c.normalised_error, "", "without a positive sigma")
+        error = _normalised_error(c.normalised_error, "without a positive sigma")
         rows |= {
             "same line": f"within {c.options.tolerance_deg:g} deg or {c.options.sigmas:g} sigma",
             "bearing error": _median_and_most(c.bearing_median_deg, c.bearing_95_deg, 4, "deg"),
@@ -157,24 +153,20 @@ def summary_rows(c: Comparison) -> dict[str, str]:
 
 def _disc_rows(c: DiscComparison) -> dict[str, str]:
     rows = {}
-    if any(s.levelled or s.true for s in (c.reference_levelling, c.detected_levelling)):
-        sides = ("reference", c.reference_levelling), ("detected", c.detected_levelling)
+    if c.reference_levelled or c.detected_levelled:
         how = "at the pixels where they were seen" if c.in_image else "on the floor"
-        rows["levelled"] = f"{'; '.join(_levelled_side(*s) for s in sides)}: compared {how}"
+        rows["levelled"] = (
+            f"{c.reference_levelled} frames of the reference, {c.detected_levelled} detected ones: "
+            f"compared {how}"
+        )
     if c.in_image:
-        same = f"in the image, within half the disc's image or {c.options.least_px:g} px"
+        same = f"in the image, within half the disc's image or {LEAST_GATE_PX:g} px"
         apart = _median_and_most(c.image_median_px, c.image_95_px, 2, "px")
         rows |= {"same disc": same, "image difference": apart}
-    elif c.options.sigma is None:
-        rows["same disc"] = f"on the floor, within {c.options.gate_m:g} m"
     else:
-        rows["same disc"] = f"on the floor, within {c.options.sigma:g} sigma"
-    covariance = c.options.error_covariance
-    source = ", covariance: " + ("detected plus reference" if covariance == "sum" else covariance)
+        rows["same disc"] = f"on the floor, within {c.options.gate_m:g} m"
     rows["position error"] = _median_and_most(c.error_median_m, c.error_95_m, 4, "m")
-    rows["normalised error"] = _normalised_error(
-        c.normalised_error, source, "not positive definite"
-    )
+    rows["normalised error"] = _normalised_error(c.normalised_error, "not positive definite")
     if c.lean is not None:
         rows["common lean"] = _lean_text(c.lean)
     for side, matched, fate, alone in (
@@ -184,18 +176,6 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
         text = f"median {number(matched, 3)} matched, {number(alone, 3)} {fate}"
         rows[f"{side} quality"] = text
     return rows
-
-
-def _levelled_side(name: str, side: Levelling) -> str:
-    if side.pitch_deg is None or side.roll_deg is None:
-        if side.true:
-            return f"{name} rows are level"
-        return f"{name} rows are where the camera as calibrated saw them"
-    which = "all" if side.levelled == side.frames else f"{side.levelled} of {side.frames}"
-    return (
-        f"{name} rows are levelled in {which} frames "
-        f"(medians: pitch {side.pitch_deg:.2f}, roll {side.roll_deg:.2f} deg)"
-    )
 
 
 def _lean_text(lean: CommonLean) -> str:
@@ -214,14 +194,14 @@ def _median_and_most(median: float | None, most: float | None, decimals: int, un
     return f"median {number(median, decimals)} {unit}, 95 % {number(most, decimals)} {unit}"
 
 
-def _normalised_error(error: NormalisedError, covariance: str, unusable: str) -> str:
+def _normalised_error(error: NormalisedError, unusable: str) -> str:
     """How large normalised errors are, and how large they should be."""
     text = number(error.per_dof, 3)
     if error.band is not None:
         low, high = error.band
         text += f" squared per degree of freedom (95 % band {low:.3f} to {high:.3f})"
     left_out = f"; {error.left_out} {unusable} left out" if error.left_out else ""
-    return text + covariance + left_out
+    return text + left_out
 
 
 def _over_distance(c: DiscComparison) -> FigureTable:
@@ -247,7 +227,7 @@ def _over_distance(c: DiscComparison) -> FigureTable:
 def floor_table(c: DiscComparison) -> FigureTable:
     """Differences on the floor by forward distance, before and after the common lean."""
     rows = []
-    for part in c.floor:
+    for part in c.bins:
         if part.before.pairs and part.after is not None:
             figures = [*astuple(part.before)[1:], *astuple(part.after)[1:]]
             shown = (number(value, 3) for value in figures)

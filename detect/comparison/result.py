@@ -91,33 +91,6 @@ class ForwardRange:
 
 
 @dataclass(frozen=True)
-class DistanceBin(ForwardRange):
-    """Discs at a range of forward distances; qualities and errors are medians."""
-
-    reference: int
-    missed: int
-    detected: int
-    extra: int
-    recall: float | None
-    precision: float | None
-    reference_quality_median: float | None
-    detected_quality_median: float | None
-    error_median_m: float | None
-    quality_difference: float | None
-
-
-@dataclass(frozen=True)
-class Levelling:
-    """How many frames' rows are levelled, and by what (medians)."""
-
-    frames: int
-    levelled: int
-    true: bool  # rows are level positions that no tilt was applied to
-    pitch_deg: float | None
-    roll_deg: float | None
-
-
-@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
@@ -129,9 +102,22 @@ class FloorDifference:
 
 
 @dataclass(frozen=True)
-class FloorBin(ForwardRange):
-    """Floor differences at a range of forward distances, before and after the common lean."""
+class DistanceBin(ForwardRange):
+    """Discs at a range of forward distances; qualities and errors are medians.
 
+    Differences are of matched discs on the floor, before and after the common lean.
+    """
+
+    reference: int
+    missed: int
+    detected: int
+    extra: int
+    recall: float | None
+    precision: float | None
+    reference_quality_median: float | None
+    detected_quality_median: float | None
+    error_median_m: float | None
+    quality_difference: float | None
     before: FloorDifference
     after: FloorDifference | None
 
@@ -194,6 +180,7 @@ class Comparison(ABC):
     missed: int
     extra: int
     set_aside: int
+    on_lookalikes: int | None  # extra rows on what resembles a disc, where that is known
     recall: float | None
     precision: float | None
     frames: tuple[FrameMatch, ...] = field(repr=False)
@@ -207,7 +194,7 @@ class Comparison(ABC):
             f"{self.missed} missed, in {len(self.frames)} frames."
         )
         extra = f"{self.matched} of {self.detected} detected rows are {self.what} of the reference;"
-        alike = self.lookalikes_found
+        alike = self.on_lookalikes
         if alike is None:
             extra += f" {self.extra} are on nothing that it has (look-alikes are not known)."
         else:
@@ -216,11 +203,6 @@ class Comparison(ABC):
                 f"{self.extra - alike or 'none'} on nothing known."
             )
         return found, extra, *self._error_sentences()
-
-    @property
-    def lookalikes_found(self) -> int | None:
-        """Extra rows on known look-alikes; None where no look-alikes are listed."""
-        return None
 
     @abstractmethod
     def _error_sentences(self) -> tuple[str, str]:
@@ -266,7 +248,6 @@ class DiscComparison(Comparison):
 
     what, unit = "discs", "m"
 
-    on_lookalikes: int | None  # extra rows on what resembles a disc
     error_median_m: float | None
     error_95_m: float | None
     normalised_error: NormalisedError
@@ -278,16 +259,10 @@ class DiscComparison(Comparison):
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
-    reference_levelling: Levelling
-    detected_levelling: Levelling
-    floor: tuple[FloorBin, ...]
+    reference_levelled: int  # frames whose rows are levelled by a tilt
+    detected_levelled: int
     lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
-
-    @property
-    def lookalikes_found(self) -> int | None:
-        """As `on_lookalikes`."""
-        return self.on_lookalikes
 
     def _error_sentences(self) -> tuple[str, str]:
         median, most = (

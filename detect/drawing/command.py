@@ -17,7 +17,7 @@ from detect.errors import DetectError, FrameError
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import CompareOptions, Draw
+from detect.viewing_options import Draw
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
 
@@ -40,7 +40,6 @@ def perform(options: Draw) -> int:
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
     expected, selection = select_frames(run.frames, options.frames, options.every)
-    gates = CompareOptions(**vars(options.gates))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 
@@ -59,7 +58,7 @@ def perform(options: Draw) -> int:
                 continue
             prefix = frame.step.prefix
             name = picture_name(prefix)
-            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, gates, name)
+            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
             if options.output is not None:
                 path = options.output / f"{name}.png"
                 write_bytes(path, png_of(picture), overwrite=options.force)

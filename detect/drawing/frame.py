@@ -50,17 +50,17 @@ def draw_rows(
     sight: Sight | None,
     rows: SeenRows,
     settings: CircleSettings,
-    options: CompareOptions,
     title: str = "",
 ) -> ByteArray:
     """Draw rows of a frame into its image (H, W), and words below it.
 
     Without a calibrated camera only markers are drawn. The settings have the radii of the discs'
-    outlines, the options say what fits a reference row. The picture (H + h, W, 3) is in OpenCV's
+    outlines. The picture (H + h, W, 3) is in OpenCV's
     order blue, green, red.
     """
     canvas = canvas_of(image, None if sight is None else sight.camera)
     words = [title] if title else []
+    options = CompareOptions()
     if sight is not None and rows.lines is not None:
         match = match_frame(pair_of("lines", title, rows.reference_lines, rows.lines), options)
         compared = rows.reference_lines is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -24,7 +23,6 @@ from redetect.landmarks import Frame, FrameTilt, read_tilts
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is what precedes the first row; real ones are much shorter.
 _LONGEST_BYTES = 1 << 16
-_RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?")
 
 
 # -- heads ------------------------------------------------------------------------------------
@@ -153,9 +151,9 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     reference: dict[str, Path] = {}
     for kind, named in (("circles", options.reference), ("lines", options.reference_lines)):
         path = named or run.folder / f"map.{kind}"
-        if named is not None and not named.is_file() and not options.no_reference:
+        if named is not None and not named.is_file():
             raise DetectError(f"{named}: no such file: expected reference rows")
-        if kind in detected and path.is_file() and not options.no_reference:
+        if kind in detected and path.is_file():
             reference[kind] = path
     return RunRows(detected, reference)
 
@@ -173,9 +171,8 @@ def select_frames(
 ) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
     """Their number, if it is known, and the selected frames with their positions in the run.
 
-    Every n-th of those that are `wanted` by names of images, positions, or ranges FROM:TO[:STEP] of
-    positions without the last; what is both a name and a position is a name. Raises DetectError if
-    a name is no image's, a position is beyond the run, or no frame is left.
+    Every n-th of those that are `wanted` by names of images, or of all. Raises DetectError if a
+    name is no image's.
     """
     if every < 1:
         raise DetectError(f"every is {every}: expected 1 or more")
@@ -184,27 +181,7 @@ def select_frames(
         return expected, islice(enumerate(frames), 0, None, every)
     names = [image_name(frame.step.prefix) for frame in frames]
     asked = {image_name(word): word for word in wanted}
-    positions = {k for k, name in enumerate(names) if name in asked}
     for name in asked.keys() - set(names):
-        positions.update(_positions(asked[name], len(names)))
-    kept = frozenset(sorted(positions)[::every])
+        raise DetectError(f"frame {asked[name]!r}: expected the name of an image of the run")
+    kept = frozenset([k for k, name in enumerate(names) if name in asked][::every])
     return len(kept), ((k, frame) for k, frame in enumerate(frames) if k in kept)
-
-
-def _positions(word: str, count: int) -> range:
-    if word.isdecimal():
-        if int(word) >= count:
-            raise DetectError(f"frame {word}: expected a position from 0 to {count - 1}")
-        return range(int(word), int(word) + 1)
-    matched = _RANGE.fullmatch(word)
-    if matched is None:
-        raise DetectError(
-            f"frame {word!r}: expected the name of an image of the run, a position or FROM:TO"
-        )
-    first, last, step = matched.groups()
-    if step is not None and int(step) == 0:
-        raise DetectError(f"frames {word}: the step is 0: expected 1 or more")
-    positions = range(int(first or 0), min(int(last or count), count), int(step or 1))
-    if not positions:
-        raise DetectError(f"frames {word}: none of the run's {count} frames")
-    return positions

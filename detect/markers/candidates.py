@@ -30,8 +30,6 @@ _SQUARE_SHARE = math.sqrt(2.0) - 1.0
 _LEVEL_RADIUS_PX = 12
 #: Levels smaller than this hold no marker.
 _LEAST_LEVEL_PX = 16
-#: Without a pyramid: radii tried where no width is given.
-_PLAIN_RADII_PX = (8, 20, 50)
 #: Thresholds below this are applied to a smoothed image.
 _SMOOTH_BELOW = 0.2
 #: With more noise than this it is smoothed more, grey levels.
@@ -107,10 +105,7 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
     """The image at the scales to be searched, from fine to coarse, with its closings."""
     expected = settings.disc_widths * settings.width_px
     scale = 1
-    if not settings.pyramid:
-        radii = (max(2, round(expected)),) if expected else _PLAIN_RADII_PX
-        levels = [(1, radius) for radius in radii]
-    elif expected:
+    if expected:
         while expected / scale > _LEVEL_RADIUS_PX:
             scale *= 2
         levels = [(scale, max(4, math.ceil(expected / scale)))]
@@ -134,7 +129,7 @@ def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Gre
     """Where a layer is dark, for each threshold; low ones of the image itself are smoothed."""
     gate = settings.dark_noise * noise / layer.scale
     plain = smooth = layer.grey, layer.closed
-    if layer.scale == 1 and settings.pyramid and min(settings.thresholds) < _SMOOTH_BELOW:
+    if layer.scale == 1 and min(settings.thresholds) < _SMOOTH_BELOW:
         window = (5, 5) if noise > _MUCH_NOISE else (3, 3)
         grey = np.asarray(cv2.GaussianBlur(layer.grey, window, 0), np.uint8)
         smooth = grey, closing(grey, layer.radius)

@@ -1,12 +1,12 @@
 """The detector of square markers: one image in, markers with their corners out.
 
 `detect_markers` processes one image from top to bottom: the three phases of RAWSEEDS deliverable
-D2.1 part 2 (candidates, filtering, refinement and identification) and then, by default, the fit of
-the whole marker, which makes the corners more exact and rejects false markers.
+D2.1 part 2 (candidates, filtering, refinement and identification), the last by a fit of the whole
+marker, which makes the corners more exact and rejects false markers.
 
 The homography of the refined corners gives the centres of the cells, whose grey values are compared
-with all patterns in all four rotations. The nearest one is chosen if it is near enough and the
-second nearest is clearly farther away.
+with all patterns in all four rotations, and the likeliest are fitted. The nearest one is chosen if
+it is near enough and the second nearest is clearly farther away.
 """
 
 from __future__ import annotations
@@ -84,9 +84,6 @@ class MarkerDetections:
     corners: FloatArray
     covariance: FloatArray  # (N, 4, 2, 2) of each corner, pixels squared
     quality: FloatArray  # (N,) 1 less the mean difference between cells' whiteness and pattern
-    margin: FloatArray  # (N,) how much nearer the pattern is than the second best, in cells
-    #: (N,) share of the grey values' variance, noise aside, that the fit explains; NaN without one.
-    explained: FloatArray
     candidates: tuple[Candidate, ...]  # all regions that came as far as having corners
     rejected: Counter[str]  # how many regions and candidates were not taken, by cause
 
@@ -112,8 +109,7 @@ class _Marker(NamedTuple):
     id: int
     corners: FloatArray  # (4, 2) in the printed order, straight pixels
     covariance: FloatArray  # (4, 2, 2)
-    identity: Identity
-    explained: float
+    quality: float
     blur_px: float
 
 
@@ -168,7 +164,7 @@ def detect_markers(
         side = math.sqrt(signed_area(rough))
         capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
         refined = refine_quadrangle(
-            picture, rough, outline, templates.border, capture_px, quick=settings.joint
+            picture, rough, outline, templates.border, capture_px, quick=True
         )
         found = NO_EDGE if refined is None else _identified(picture, refined, templates, settings)
         if isinstance(found, str):
@@ -188,9 +184,7 @@ def detect_markers(
         ids=np.array([m.id for m in markers], dtype=np.int64),
         corners=np.array(outlines).reshape(-1, 4, 2),
         covariance=np.array(spreads).reshape(-1, 4, 2, 2),
-        quality=np.array([max(0.0, 1.0 - m.identity.distance) for m in markers]),
-        margin=np.array([m.identity.margin for m in markers]),
-        explained=np.array([m.explained for m in markers]),
+        quality=np.array([m.quality for m in markers]),
         candidates=tuple(candidates),
         rejected=+rejected,
     )
@@ -218,16 +212,10 @@ def _identified(
     cells = sampled_cells(picture, refined.corners, templates)
     if cells is None:
         return OUTSIDE
-    blur_px = float(np.median(refined.blur))
-    if not settings.joint:
-        identity = nearest_pattern(cells, templates, settings)
-        if isinstance(identity, str):
-            return identity
-        return _marker(identity, refined, templates, np.nan, blur_px)
 
     # The whole marker, fitted to the likely patterns.
     side = math.sqrt(signed_area(refined.corners))
-    blur_cells = blur_px / (templates.dictionary.cell * side)
+    blur_cells = float(np.median(refined.blur)) / (templates.dictionary.cell * side)
     if blur_cells > _HOPELESS_BLUR_CELLS:
         return TOO_SMALL
     likely = likely_patterns(cells, templates, blur_cells)
@@ -247,9 +235,9 @@ def _identified(
     fit = fit_marker(picture, start, templates, template)
     if fit is None:
         return NOT_FITTED
-    identity = verified_identity(fit, template, templates, settings)
-    if isinstance(identity, str):
-        return identity
+    quality = verified_quality(fit, template, templates, settings)
+    if isinstance(quality, str):
+        return quality
     best: RefinedQuadrangle | PatternFit = fit
     if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
@@ -257,7 +245,10 @@ def _identified(
         again = refine_quadrangle(picture, fit.corners, outline, templates.border, capture_px)
         if again is not None and _contradicts(again, fit):
             best = again
-    return _marker(identity, best, templates, fit.explained, fit.blur_px)
+    number, turns = templates.turned_id(template)
+    printed = (np.arange(4) - turns) % 4
+    corners, covariance = best.corners[printed], best.covariance[printed]
+    return _Marker(number, corners, covariance, quality, fit.blur_px)
 
 
 def _contradicts(refined: RefinedQuadrangle, fit: PatternFit) -> bool:
@@ -269,20 +260,6 @@ def _contradicts(refined: RefinedQuadrangle, fit: PatternFit) -> bool:
     spread = refined.covariance + fit.covariance + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
     solved = np.linalg.solve(spread, apart[..., None])[..., 0]
     return float(np.mean(apart * solved)) > _MOST_DISAGREEMENT
-
-
-def _marker(
-    identity: Identity,
-    found: RefinedQuadrangle | PatternFit,
-    templates: Templates,
-    explained: float,
-    blur_px: float,
-) -> _Marker:
-    """A marker with its corners in the printed order."""
-    number, turns = templates.turned_id(identity.template)
-    order = (np.arange(4) - turns) % 4
-    corners, covariance = found.corners[order], found.covariance[order]
-    return _Marker(number, corners, covariance, identity, explained, blur_px)
 
 
 def _image_covariance(
@@ -340,14 +317,6 @@ _PLAIN_LEAST_AGREEMENT = 0.95
 _PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
-class Identity(NamedTuple):
-    """A marker recognised."""
-
-    template: int
-    distance: float  # mean absolute difference between cells and pattern, 0 to 1
-    margin: float  # squared distance to the second best pattern less that to the best, in cells
-
-
 def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:
     """(G, G) grey values of the grid's cells, each the mean of 3x3; None if some are outside."""
     centres, cell = templates.dictionary.centres, templates.dictionary.cell
@@ -363,22 +332,6 @@ def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -
     return np.asarray(grey.reshape(side, 3, side, 3).mean(axis=(1, 3)))
 
 
-def nearest_pattern(
-    cells: FloatArray, templates: Templates, settings: MarkerSettings
-) -> Identity | str:
-    """The pattern nearest to grey values (G, G) as the report has it, or why there is none."""
-    low, high = float(cells.min()), float(cells.max())
-    if high <= low:
-        return NO_PATTERN
-    whiteness = ((cells - low) / (high - low)).ravel()
-    best, distance, margin = _nearest(whiteness, templates)
-    if distance > settings.largest_distance:
-        return NO_PATTERN
-    if margin < settings.least_margin:
-        return AMBIGUOUS
-    return Identity(best, distance, margin)
-
-
 def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) -> list[int]:
     """Templates that grey values (G, G) may show under a blur in cells, the best first."""
     flat = cells.ravel() - cells.mean()
@@ -392,10 +345,10 @@ def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) 
     return [int(template) for template in best if correlation[template] >= least]
 
 
-def verified_identity(
+def verified_quality(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
-) -> Identity | str:
-    """The identity of a fitted template by its cells, or the cause of its rejection."""
+) -> float | str:
+    """The quality of a fitted template, or the cause of its rejection by its cells."""
     weakness = templates.weakness
     if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
         return TOO_SMALL
@@ -422,7 +375,7 @@ def verified_identity(
         return AMBIGUOUS
     if decoys < _LEAST_LOG_ODDS:
         return NO_MARKER
-    return Identity(best, distance, margin)
+    return max(0.0, 1.0 - distance)
 
 
 def _between(pair: tuple[float, float], share: float) -> float:

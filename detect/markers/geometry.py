@@ -27,8 +27,6 @@ from redetect.compiled import kernel
 
 #: Rows of the image that its noise is estimated from.
 _NOISE_ROWS = 64
-#: Step of finite differences of the distortion, pixels.
-_STEP_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +51,10 @@ class Picture:
 
     def pixel_jacobians(self, pixels: FloatArray) -> FloatArray:
         """(N, 2, 2) d(pixel) / d(straight position) at (N, 2) pixels."""
-        steps = _STEP_PX * np.eye(2)
-        columns = [
-            (self.straighten(pixels + step) - self.straighten(pixels - step)) / (2.0 * _STEP_PX)
-            for step in steps
-        ]
-        return np.asarray(np.linalg.inv(np.stack(columns, axis=-1)))
+        c = self.camera
+        if c is None:
+            return np.tile(np.eye(2), (len(pixels), 1, 1))
+        return c.distort_jacobian(c.undistort(pixels)) / [c.scale_x, c.scale_y]
 
 
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:

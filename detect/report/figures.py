@@ -12,7 +12,6 @@ from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
-    DistanceBin,
     LineComparison,
     LinePairs,
 )
@@ -101,28 +100,8 @@ _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
 
-def counts_figure(rows: Sequence[SeenRows]) -> Part:
-    """Rows in each frame, over the run."""
-    with figure_file((_WIDE, 2.2), "svg") as (figure, content):
-        axes = figure.subplots()
-        for kind, name, colour, dashes in (
-            ("circles", "discs", DATA, "-"),
-            ("lines", "verticals", SECOND, "--"),
-            ("markers", "markers", MARK, ":"),
-        ):
-            frames = [getattr(seen, kind) for seen in rows]
-            counts = [np.nan if f is None else len(getattr(f, kind)) for f in frames]
-            if np.isfinite(counts).any():
-                axes.plot(counts, color=colour, ls=dashes, lw=1.0, label=name)
-        _finish(axes, "frame", "rows in it")
-        axes.set_ylim(bottom=0)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8, ncols=3)
-    return _part("Rows in each frame, over the run.", content, 2.2)
-
-
-def rates_figure(curve: RateCurve, axis: str) -> Part:
-    """Recall and precision over a threshold, and precision over recall with the knee."""
+def rates_figure(curve: RateCurve) -> Part:
+    """Recall and precision over the least quality, and precision over recall with the knee."""
     with figure_file((_WIDE, 3.1), "svg") as (figure, content):
         left, right = figure.subplots(1, 2)
         at = curve.threshold
@@ -133,13 +112,13 @@ def rates_figure(curve: RateCurve, axis: str) -> Part:
         best = knee(curve.recall, curve.precision)
         if best is not None:
             left.axvline(at[best], color=MARK, lw=0.9, ls=":", label=f"knee: {at[best]:.3g}")
-        _finish(left, axis, "share")
+        _finish(left, "least quality", "share")
         left.legend(fontsize=8)
         for limits in (left.set_ylim, right.set_ylim, right.set_xlim):
             limits(0.0, 1.05)
     words = (
-        f"Recall and precision of the rows that a threshold leaves ({axis}); on the right one "
-        "over the other. The knee is the point farthest beyond the chord between the ends."
+        "Recall and precision of the rows of a least quality; on the right one over the other. The "
+        "knee is the point farthest beyond the chord between the ends."
     )
     return _part(words, content, 3.1)
 
@@ -168,27 +147,6 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
         f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
         "the covariances are right, wider if they are too small."
     )
-    return _part(words, content, 2.8)
-
-
-def distance_figure(bins: Sequence[DistanceBin]) -> Part:
-    """Recall and precision by forward distance, over how many rows there are."""
-    shown = [part for part in bins if part.reference or part.detected]
-    with figure_file((_WIDE, 2.8), "svg") as (figure, content):
-        at = np.arange(len(shown))
-        rows, rates = figure.subplots(1, 2)
-        for key, shift, colour in (("reference", -0.2, REFERENCE), ("detected", 0.2, DATA)):
-            heights = [getattr(part, key) for part in shown]
-            rows.bar(at + shift, heights, 0.4, color=colour, label=f"{key} rows")
-        for key, mark, colour in (("recall", "o-", DATA), ("precision", "s--", SECOND)):
-            share = np.array([getattr(part, key) for part in shown], dtype=np.float64)
-            rates.plot(at, share, mark, color=colour, lw=1.2, ms=4, label=key)
-        rates.set_ylim(0.0, 1.05)
-        for axes, name in ((rows, "rows"), (rates, "share")):
-            axes.set_xticks(at, [str(part) for part in shown], fontsize=7)
-            _finish(axes, "forward distance / m", name)
-            axes.legend(fontsize=8)
-    words = "Rows, recall and precision by forward distance, each side's rows by their own."
     return _part(words, content, 2.8)
 
 
@@ -354,10 +312,7 @@ def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class RateCurve(NamedTuple):
-    """Recall and precision (NaN without rows) of the `kept` rows that pass each threshold.
-
-    That is the least quality of discs, or the largest sigma of lines (degrees).
-    """
+    """Recall and precision (NaN without rows) of the `kept` rows of at least each quality."""
 
     threshold: FloatArray
     recall: FloatArray
@@ -365,28 +320,22 @@ class RateCurve(NamedTuple):
     kept: IntArray
 
 
-def rates_over(comparison: DiscComparison | LineComparison, thresholds: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality, or of lines of at most each sigma.
-
-    Sigmas in radians. Rows are paired anew whenever fewer pass.
-    """
-    levels = np.asarray(thresholds, np.float64)
-    lines = isinstance(comparison, LineComparison)
-    score, sign = ("sigma", -1.0) if lines else ("quality", 1.0)
-    found, right, kept = np.zeros((3, len(levels)), np.int64)
+def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
+    """Recall and precision of discs of at least each quality; they are paired anew for each."""
+    levels = np.asarray(qualities, np.float64)
+    found, kept = np.zeros((2, len(levels)), np.int64)
     for match in comparison.frames:
         passed = match.frame.detected
-        for k in np.argsort(sign * levels, kind="stable"):
-            fewer = [row for row in passed if sign * getattr(row, score) >= sign * levels[k]]
+        for k in np.argsort(levels, kind="stable"):
+            fewer = [row for row in passed if row.quality >= levels[k]]
             if len(fewer) < len(passed):
                 passed = fewer
                 match = match_frame(match.frame._replace(detected=passed), comparison.options)
-            found[k] += len(match.matched) + len(match.joined)
-            right[k] += len(match.matched)
+            found[k] += len(match.matched)
             kept[k] += len(match.matched) + len(match.extra)
     with np.errstate(invalid="ignore"):
-        recall, precision = found / np.float64(comparison.reference), right / kept
-    return RateCurve(np.degrees(levels) if lines else levels, recall, precision, kept)
+        recall, precision = found / np.float64(comparison.reference), found / kept
+    return RateCurve(levels, recall, precision, kept)
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

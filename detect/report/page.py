@@ -15,13 +15,11 @@ from detect.comparison.result import Comparison, DiscComparison, Kind, LineCompa
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
-from detect.line_settings import LineSettings
 from detect.report import figures
 from detect.seen import Sight
-from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import CompareOptions, Gates, Report, RowFiles
+from detect.viewing_options import Report, RowFiles
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
@@ -38,13 +36,12 @@ class ReportInputs:
     files: RunRows
     names: tuple[str, ...]
     rows: tuple[SeenRows, ...]
-    options: CompareOptions
     sight: Sight | None
     discs: DiscComparison | None
     lines: LineComparison | None
 
 
-def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
+def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
     """Read and compare all rows of a run.
 
     Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
@@ -54,7 +51,6 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
     if not names:
         raise DetectError(f"{run.folder}: no frames: expected some of them")
     rows = tuple(files.of(name) for name in names)
-    compare = CompareOptions(**vars(gates))
     sight = files.sight(run.camera) if isinstance(run, Run) else None
 
     def compared(kind: Kind) -> Comparison | None:
@@ -66,7 +62,6 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
             kind,
             reference,
             [detected for detected, _ in both if detected],
-            compare,
             sight=sight,
             names=(reference.name, files.detected[kind].name),
         )
@@ -74,7 +69,7 @@ def gather(run: ImageRun, options: RowFiles, gates: Gates) -> ReportInputs:
     discs, lines = compared("circles"), compared("lines")
     assert isinstance(discs, DiscComparison | None)
     assert isinstance(lines, LineComparison | None)
-    return ReportInputs(run, files, names, rows, compare, sight, discs, lines)
+    return ReportInputs(run, files, names, rows, sight, discs, lines)
 
 
 _JPEG_QUALITY = 88
@@ -88,7 +83,7 @@ def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
     except FrameError as error:
         return Part("note", f"{words}: {error}")
     rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
-    picture = draw_rows(image, inputs.sight, rows, settings, inputs.options)
+    picture = draw_rows(image, inputs.sight, rows, settings)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
@@ -101,7 +96,7 @@ def perform(options: Report) -> int:
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
     demand_place(output, overwrite=options.force)
-    inputs = gather(run, options.files, options.gates)
+    inputs = gather(run, options.files)
     page = report_page(inputs, options.worst)
     write_bytes(output, page, overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
@@ -110,8 +105,9 @@ def perform(options: Report) -> int:
     return 0
 
 
-_NAMES = {"circles": "Discs", "lines": "Verticals", "markers": "Markers", "tilt": "Tilt"}
-_SETTINGS = {"circles": CircleSettings, "lines": LineSettings, "markers": MarkerSettings}
+_NAMES = {
+    "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
+}  # fmt: skip
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
@@ -135,31 +131,19 @@ def report_page(inputs: ReportInputs, worst: int) -> bytes:
 
 def _summary(inputs: ReportInputs) -> list[Part]:
     shown = [("frames", str(len(inputs.rows)))]
-    rows = []
-    for kind, path in inputs.files.detected.items():
-        frames = [getattr(seen, kind) for seen in inputs.rows]
-        counts = [
-            0 if frame is None else 1 if kind == "tilt" else len(getattr(frame, kind))
-            for frame in frames
-        ]
-        name = "frames with a tilt" if kind == "tilt" else _NAMES[kind].lower()
-        shown.append((name, str(sum(counts))))
-        rows.append(
-            (_NAMES[kind], path.name, str(sum(counts)), str(sum(count > 0 for count in counts)))
-        )
+    for kind in inputs.files.detected:
+        frames = [frame for seen in inputs.rows if (frame := getattr(seen, kind)) is not None]
+        count = len(frames) if kind == "tilt" else sum(len(getattr(f, kind)) for f in frames)
+        shown.append((_NAMES[kind], str(count)))
     for name, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
         if result is not None:
             shown.append((f"recall of {name}", number(result.recall, 3)))
             shown.append((f"precision of {name}", number(result.precision, 3)))
-    head = ("what", "file", "rows", "frames with some")
-    parts = [
-        Part("figures", rows=tuple(shown)),
-        Part("table", "Files of rows", head, tuple(rows), left=(0, 1)),
-    ]
+    parts = [Part("figures", rows=tuple(shown))]
     if len(inputs.rows) < 2:
         return parts
     plan = figures.floor_map(inputs.rows)
-    return [*parts, figures.counts_figure(inputs.rows), *([] if plan is None else [plan])]
+    return parts if plan is None else [*parts, plan]
 
 
 # -- against the reference --------------------------------------------------------------------
@@ -171,11 +155,9 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [_summary_of(result)]
-    if result.reference or result.detected:
-        parts.append(figures.distance_figure(result.bins))
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
-    parts += _rates(figures.rates_over(result, np.unique(levels)), "least quality", "quality")
+    parts += _rates(figures.rates_over(result, np.unique(levels)))
     if result.matched:
         parts.append(figures.floor_figure(result.pairs, lean=result.lean is not None))
     what = "two components for each matched disc"
@@ -190,13 +172,8 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     result = inputs.lines
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
-    sigma = [row.sigma for match in result.frames for row in match.frame.detected]
-    levels = np.quantile(sigma, np.linspace(0.0, 1.0, _CURVE_POINTS)) if sigma else np.zeros(0)
-    # Quantiles between rows may round below the greatest.
-    curve = figures.rates_over(result, np.nextafter(np.unique(levels), np.inf))
     return [
         _summary_of(result),
-        *_rates(curve, f"largest {_SIGMA} of the bearing / deg", f"{_SIGMA} / deg"),
         *_honesty(result, "one for each matched vertical"),
         *([figures.bearings_figure(result.pairs)] if result.matched else []),
     ]
@@ -210,10 +187,10 @@ def _summary_of(result: Comparison) -> Part:
     )
 
 
-def _rates(curve: figures.RateCurve, axis: str, name: str) -> list[Part]:
+def _rates(curve: figures.RateCurve) -> list[Part]:
     count = len(curve.threshold)
     if not count:
-        return [Part("note", "No rows: no rates over thresholds.")]
+        return [Part("note", "No rows: no rates over the quality.")]
     best = figures.knee(curve.recall, curve.precision)
     chosen = set(np.linspace(0, count - 1, _TABLE_POINTS).astype(int).tolist())
     chosen |= {best} - {None}
@@ -225,9 +202,9 @@ def _rates(curve: figures.RateCurve, axis: str, name: str) -> list[Part]:
         )
         for k in sorted(chosen)
     )
-    head = (name, "rows kept", "recall", "precision")
-    table = Part("table", f"Rates over the threshold ({axis})", head, rows)
-    return [table] if count < 2 else [figures.rates_figure(curve, axis), table]
+    head = ("least quality", "rows kept", "recall", "precision")
+    table = Part("table", "Rates over the quality", head, rows)
+    return [table] if count < 2 else [figures.rates_figure(curve), table]
 
 
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
@@ -288,42 +265,20 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
     tilts = [seen.tilt for seen in inputs.rows if seen.tilt is not None]
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
-    rows = []
-    for name, value, variance in (
-        ("pitch", [t.pitch for t in tilts], [t.cpp for t in tilts]),
-        ("roll", [t.roll for t in tilts], [t.crr for t in tilts]),
-    ):
-        angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
-        values = (angle.mean(), angle.std(), np.abs(angle).max(), np.median(sigma))
-        rows.append((name, *(f"{v:.3f}" for v in values)))
-    head = ("degrees", "mean", "deviation", "largest", f"median of its {_SIGMA}")
     lines = np.median([t.lines for t in tilts])
-    caption = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)"
+    words = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)."
     figure = [figures.tilt_figure(inputs.rows)] if len(tilts) > 1 else []
-    return [*figure, Part("table", caption, head, tuple(rows))]
+    return [*figure, Part("note", words)]
 
 
 def _settings(inputs: ReportInputs) -> list[Part]:
     parts: list[Part] = []
     for kind, head in inputs.files.heads.items():
-        default = _SETTINGS[kind]() if kind in _SETTINGS else None
-        # As heads write them.
-        usual = (
-            {name: str(value).replace(" ", "") for name, value in vars(default).items()}
-            if default
-            else {}
-        )
         name = inputs.files.detected[kind].name
         parts.append(Part("heading", name))
         if head.settings:
-            changed = [usual.get(key, value) != value for key, value in head.settings]
-            rows = tuple(
-                (key, value, usual.get(key, "") if differs else "")
-                for (key, value), differs in zip(head.settings, changed)
-            )
-            bold = tuple(np.flatnonzero(changed).tolist())
-            caption = f"Settings in the head of {name}; bold where not the default"
-            parts.append(Part("table", caption, ("setting", "value", "default"), rows, bold=bold))
+            caption = f"Settings in the head of {name}"
+            parts.append(Part("table", caption, ("setting", "value"), head.settings))
         words = [line for line in head.comments if line and not line.startswith("settings ")]
         parts += [Part("note", line) for line in words] or [Part("note", "No head in the file.")]
     parts.append(Part("note", f"Page written by detect report, version {__version__}."))

@@ -50,7 +50,6 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
-from detect.viewing_options import CompareOptions
 from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
 from redetect.landmarks import (
     CircleLandmark,
@@ -320,7 +319,7 @@ def _drawn(rows: Mapping[str, str], found: FrameDetections, plan: FramePlan) -> 
     frames: dict[str, Any] = {kind: frame}
     seen = SeenRows(**frames, tilt=found.tilt)
     name = Path(frame.step.prefix).name
-    picture = draw_rows(found.image, sight, seen, settings, CompareOptions(), name)
+    picture = draw_rows(found.image, sight, seen, settings, name)
     return png_of(picture if found.markers is None else draw_candidates(picture, found.markers))
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 import fnmatch
 import os
 import re
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import (
@@ -137,13 +138,20 @@ _SAMPLES = 5
 
 
 class RunFrames(Frames):
-    """The frames of a run folder in the order of its odometry."""
+    """The frames of a file of STEP rows, with the images that these name, in its order."""
 
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
 
-    def __init__(self, images: ImageNames, odometry: Path, bits: int) -> None:
-        self._images, self._odometry, self._bits = images, odometry, bits
+    def __init__(
+        self,
+        images: ImageNames,
+        odometry: Path,
+        bits: int,
+        times: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
+        self._images, self._odometry = images, odometry
+        self._bits, self._times = bits, times
         # Errors in the odometry are raised here, before any work is done.
         named = set()
         self.expected = 0
@@ -161,7 +169,8 @@ class RunFrames(Frames):
             try:
                 found = self._images.place_of(step.prefix)
                 image = None if found is None else self._images.checked(found)
-                yield RunFrame(step, image, bits=self._bits)
+                time_s = None if image is None else self._times.get(image.stem)
+                yield RunFrame(step, image, time_s=time_s, bits=self._bits)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
 
@@ -203,6 +212,10 @@ class ImageFiles(Source):
                 yield RunFrame(step, self._path(place), time_s=time_s, bits=self._bits)
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
+
+    def along(self, odometry: Path) -> RunFrames:
+        """The images that a file of STEP rows names, in its order."""
+        return RunFrames(self._names, odometry, self._bits, self._times)
 
 
 def bits_of_images(names: ImageNames) -> int:

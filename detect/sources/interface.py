@@ -25,10 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, camera_in
+from camera.calibration.images import decoded_image
 from detect.errors import DetectError, FrameError
 from redetect.array_types import GreyImage
 from redetect.landmarks import Step
-from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded, without_orientation
+from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded
 
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
@@ -194,7 +195,7 @@ def decode_gray(
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
     demand_bounded(content, name, size)
-    image = _decoded(content)
+    image = decoded_image(content)
     if image is None:
         raise FrameError(f"{name}: cannot be decoded: expected an image")
     return gray_of_pixels(image, name, bits)
@@ -249,17 +250,8 @@ def significant_bits_of_file(path: Path) -> int | None:
         demand_bounded(content, path, None)
     except FrameError:
         return None  # reported when the file is processed
-    image = _decoded(content)
+    image = decoded_image(content)
     return None if image is None or image.dtype != np.uint16 else significant_bits(image)
-
-
-def _decoded(content: bytes) -> NDArray[Any] | None:
-    # A calibration is of the sensor's pixels, whichever way up a telephone would show them (Exif).
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        return cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
-    except cv2.error:  # sizes beyond OpenCV's bounds
-        return None
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:

@@ -6,23 +6,20 @@ import math
 import re
 from pathlib import Path
 
-from camera import camera_in, read_camera
+from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import (
     IMAGE_SUFFIXES,
     WILDCARDS,
     ImageFiles,
-    RunFrames,
-    bits_of_images,
-    images_of_folder,
 )
 from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
+    FramesAlongPoses,
+    FramesAlongRows,
     PoseStream,
-    frames_along_poses,
-    frames_along_rows,
     tick_poses,
     tum_poses,
 )
@@ -81,20 +78,18 @@ def demand_recording(name: Path) -> None:
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
     """Open any source, with a calibration where there is one; `posed`: one with a pose."""
-    own = _own_odometry(name) if name.is_dir() else None
-    if own is not None and options.plain and not _is_ros2_bag(name):
-        camera = camera_in(name) if camera_path is None else read_camera(camera_path)
-        images = images_of_folder(name)
-        frames: Frames = RunFrames(images, own, options.bits or bits_of_images(images))
-        frames = FirstFrames(frames, options.frames) if options.frames else frames
-        run = ImageRun(name, frames, own, name / "detected")
-        return run if camera is None else run.calibrated(camera)
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
-    frames, odometry = _frames(source, options)
+    frames: Frames
+    odometry: Path | None
+    if options.plain and isinstance(source, ImageFiles) and (own := _own_odometry(name)):
+        frames, odometry, has_times = source.along(own), own, False
+    else:
+        frames, odometry = _frames(source, options)
+        has_times = source.has_times
     frames = FirstFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
-    run = ImageRun(base.parent, frames, odometry, base, has_times=source.has_times)
+    run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     if camera is None:
         return run
     if source.size is not None and source.size != (camera.width, camera.height):
@@ -144,8 +139,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
         poses = source.poses(named)
     elif named.endswith(".tum"):
-        path, axes = Path(named), options.odometry_axes
-        poses = PoseStream(named, path, lambda: tum_poses(path, axes))
+        poses = PoseStream(named, Path(named), lambda: tum_poses(Path(named)))
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
@@ -154,7 +148,10 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        return frames_along_rows(source, Path(named)), Path(named)
+        path = Path(named)
+        if isinstance(source, ImageFiles):
+            return source.along(path), path
+        return FramesAlongRows(source, path), path
     else:
         poses = None if named else source.poses(None)
     if poses is None:
@@ -164,7 +161,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             f"{source.name}: no times of the images: a trajectory needs them: "
             "name a file of rows 'prefix seconds' by --times"
         )
-    return frames_along_poses(source, poses), poses.path
+    return FramesAlongPoses(source, poses), poses.path
 
 
 def _is_ros2_bag(name: Path) -> bool:

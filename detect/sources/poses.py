@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
-from detect.options import Axes
 from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
@@ -147,18 +146,15 @@ class PosesOverTime:
         return pose_between(before, after, time_s)
 
 
-def tum_poses(path: Path, axes: Axes = "robotics") -> Generator[TimedPose, None, None]:
-    """The poses of a TUM trajectory; `axes` are the robot's, as in `SourceOptions`."""
+def tum_poses(path: Path) -> Generator[TimedPose, None, None]:
+    """The poses of a TUM trajectory."""
     for place, row in _number_rows(path, "TUM trajectory", "t x y z qx qy qz qw"):
         time_s, x, y, _, *quaternion = row
         if max(abs(x), abs(y)) > FARTHEST:
             raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
         if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
             raise DetectError(f"{place}: qx qy qz qw: expected a unit quaternion")
-        theta = heading_rad(*quaternion)
-        # Only the robot's own axes differ; the fixed frame is the trajectory's.
-        turned = 0.5 * math.pi if axes == "dataset" else 0.0
-        yield TimedPose(time_s, x, y, theta - turned)
+        yield TimedPose(time_s, x, y, heading_rad(*quaternion))
 
 
 def tick_poses(
@@ -208,83 +204,60 @@ def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
     return math.atan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
 
 
-class FramesAlong(Frames):
-    """The frames of a source along its odometry, as one of the functions below gives them."""
-
-    def __init__(
-        self,
-        source: Source,
-        framed: Callable[[Iterator[RunFrame]], Generator[RunFrame | None, None, None]],
-        why_left_out: str,
-    ) -> None:
-        self._source, self._framed = source, framed
-        self.ships_images, self.expected = source.ships_images, source.expected
-        self.why_left_out = why_left_out
-
-    def __iter__(self) -> Generator[RunFrame, None, None]:
-        self.left_out = 0
-        with closing(iter(self._source)) as images, closing(self._framed(images)) as frames:
-            for frame in frames:
-                if frame is None:
-                    self.left_out += 1
-                else:
-                    yield frame
-
-
-def frames_along_poses(source: Source, stream: PoseStream) -> FramesAlong:
+class FramesAlongPoses(Frames):
     """The frames of a source whose robot's poses are known over time.
 
     The pose of an image is that between the two poses before and after it. Images without a pose
     at their time are no part of the run; the first one's step is zero.
     """
 
-    def framed(images: Iterator[RunFrame]) -> Generator[RunFrame | None, None, None]:
-        with closing(stream.read()) as read:
-            poses = PosesOverTime(read, stream.name)
+    def __init__(self, source: Source, stream: PoseStream) -> None:
+        self._source, self._stream = source, stream
+        self.ships_images, self.expected = source.ships_images, source.expected
+        self.why_left_out = f"images without a pose of {stream.name} at their time: left out"
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        self.left_out = 0
+        with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
+            poses = PosesOverTime(read, self._stream.name)
             last: TimedPose | None = None
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)
                 if pose is None:
-                    yield None
+                    self.left_out += 1
                     continue
                 if last is not None:
                     image = replace(image, step=step_between(image.step.prefix, last, pose))
                 yield image
                 last = pose
 
-    why = f"images without a pose of {stream.name} at their time: left out"
-    return FramesAlong(source, framed, why)
 
+class FramesAlongRows(Frames):
+    """The frames of a source whose STEP rows are in a file, by the last parts of their prefixes.
 
-def frames_along_rows(source: Source, path: Path) -> FramesAlong:
-    """The frames of a source whose STEP rows are in a file, in the same order.
-
-    A row belongs to the image whose name is the last part of its prefix. Images without a row are
-    no part of the run; rows without an image are frames that cannot be worked on.
+    Images without a row are no part of the run; rows without an image are frames that cannot be
+    worked on, at the end.
     """
-    names = {_image_name(step) for step in read_steps(path)}
 
-    def framed(images: Iterator[RunFrame]) -> Generator[RunFrame | None, None, None]:
-        steps = read_steps(path)
-        for image in images:
-            prefix = image.step.prefix
-            if prefix not in names:
-                yield None
-                continue
-            for step in steps:
-                if _image_name(step) == prefix:
+    why_left_out = "images are not named by a STEP row: left out"
+
+    def __init__(self, source: Source, path: Path) -> None:
+        self._source = source
+        self._steps = {last_part(step.prefix.strip('"')): step for step in read_steps(path)}
+        self.ships_images, self.expected = source.ships_images, source.expected
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        self.left_out = 0
+        steps = dict(self._steps)
+        with closing(iter(self._source)) as images:
+            for image in images:
+                step = steps.pop(image.step.prefix, None)
+                if step is None:
+                    self.left_out += 1
+                else:
                     yield replace(image, step=step)
-                    break
-                yield RunFrame(step, None)
-            else:
-                raise DetectError(
-                    f"{path}: the row of {prefix} comes too early: "
-                    "expected the STEP rows in the order of the images"
-                )
-        for step in steps:
+        for step in steps.values():
             yield RunFrame(step, None)
-
-    return FramesAlong(source, framed, "images are not named by a STEP row: left out")
 
 
 class FirstFrames(Frames):
@@ -299,7 +272,3 @@ class FirstFrames(Frames):
         with closing(iter(self._frames)) as frames:
             yield from islice(frames, self._count)
             self.left_out = self._frames.left_out
-
-
-def _image_name(step: Step) -> str:
-    return last_part(step.prefix.strip('"'))

@@ -1,8 +1,8 @@
 """A video file, and a live camera, as sources: frames by OpenCV, decoded on demand.
 
-A live camera is read all the time, so that an image's time is that of its arrival; images that
-could not be processed in time are dropped. The first Ctrl-C ends the stream: the images so far are
-processed and the results written. A second one ends the program, which then writes nothing.
+An image of a live camera has the time of its arrival. The first Ctrl-C ends the stream: the images
+so far are processed and the results written. A second one ends the program, which then writes
+nothing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import signal
 import threading
 import time
-from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,6 @@ from types import FrameType
 from typing import Any
 
 import cv2
-from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
@@ -92,13 +90,6 @@ def quiet_opencv() -> Iterator[None]:
         levels.setLogLevel(before)
 
 
-#: How long a camera may be silent (s).
-PATIENCE_S = 10.0
-
-# How often a new image, or an interrupt, is noticed (s).
-_LOOK_S = 0.002
-
-
 class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
 
@@ -109,59 +100,22 @@ class LiveCamera(Source):
         _open_camera(index).release()
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        newest = _Newest(_open_camera(self._index))
+        capture = _open_camera(self._index)
         try:
             with _stoppable() as stop:
                 for number in itertools.count():
-                    taken = newest.next(stop)
-                    if taken is None:
+                    there, pixels = capture.read()
+                    time_s = time.time()
+                    if stop.is_set():
                         return
-                    time_s, pixels = taken
+                    if not there:
+                        _log.info("the camera gives no more images: the results so far are written")
+                        return
                     prefix = numbered_prefix(f"camera{self._index}", number)
                     gray = gray_of_pixels(pixels, prefix)
                     yield RunFrame(still(prefix), None, gray, time_s)
         finally:
-            newest.close()
-
-
-class _Newest:
-    """The newest image of a camera that a thread reads."""
-
-    def __init__(self, capture: cv2.VideoCapture) -> None:
-        self._capture = capture
-        self._image: deque[tuple[float, NDArray[Any]]] = deque(maxlen=1)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def next(self, stop: threading.Event) -> tuple[float, NDArray[Any]] | None:
-        """Wait for an image that was not given yet; None when there will be none."""
-        latest_s = time.monotonic() + PATIENCE_S
-        while not stop.is_set():
-            ended = self._ended.is_set()
-            if self._image:
-                return self._image.popleft()
-            if ended:
-                _log.info("the camera gives no more images: the results so far are written")
-                return None
-            if time.monotonic() >= latest_s:
-                _log.info(f"no image came within {PATIENCE_S:g} s: the results so far are written")
-                return None
-            time.sleep(_LOOK_S)
-        return None
-
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join(PATIENCE_S)
-        self._capture.release()
-
-    def _read(self) -> None:
-        while not self._ended.is_set():
-            there, pixels = self._capture.read()
-            if there and pixels is not None:
-                self._image.append((time.time(), pixels))
-            else:
-                self._ended.set()
+            capture.release()
 
 
 @contextmanager
@@ -192,4 +146,5 @@ def _open_camera(index: int) -> cv2.VideoCapture:
             f"camera:{index}: no camera of that number answers: "
             "expected one that is plugged in, not in use, and open to you (often camera:0)"
         )
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an image that waited is older than its time
     return capture

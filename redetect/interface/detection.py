@@ -24,7 +24,6 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
-from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
@@ -194,7 +193,7 @@ class Detection(Table):
         """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
         sight = Sight(self.camera, self.settings.radius_m)
-        return draw_rows(self.image, sight, rows, self.settings, CompareOptions(), self.name)
+        return draw_rows(self.image, sight, rows, self.settings, self.name)
 
     def __str__(self) -> str:
         words = f"{self.name}: {len(self.discs)} discs, {len(self.verticals)} verticals, "

@@ -9,7 +9,6 @@ from redetect.landmarks.arrays import Association as Association
 from redetect.landmarks.arrays import CircleArrays as CircleArrays
 from redetect.landmarks.arrays import associate as associate
 from redetect.landmarks.arrays import associate_positions as associate_positions
-from redetect.landmarks.arrays import associate_within_covariance as associate_within_covariance
 from redetect.landmarks.arrays import circle_arrays as circle_arrays
 from redetect.landmarks.arrays import circle_landmarks as circle_landmarks
 from redetect.landmarks.arrays import is_positive_definite as is_positive_definite

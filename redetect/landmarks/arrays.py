@@ -173,35 +173,6 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
     return associate(squared, distance <= gate_m)
 
 
-def associate_within_covariance(
-    first: ArrayLike, second: ArrayLike, covariance: ArrayLike, *, gate_sigma: float
-) -> Association:
-    """Pair positions by their Mahalanobis distance.
-
-    Parameters
-    ----------
-    first, second : (N, 2), (M, 2) array_like
-        Positions in one frame (m).
-    covariance : (N, 2, 2) or (N, M, 2, 2) array_like
-        Positive definite covariance of each position of the first set, or of each difference (m^2).
-    gate_sigma : float
-        Largest Mahalanobis distance of a pair (standard deviations), at least 0.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If a covariance is singular.
-    ValueError
-        If one makes a squared distance negative.
-    """
-    spread = np.asarray(covariance, dtype=np.float64)
-    if spread.ndim == 3:
-        spread = spread[:, np.newaxis]
-    with np.errstate(over="ignore", invalid="ignore"):  # as in associate_positions
-        squared = squared_mahalanobis(_differences(first, second), spread)
-    return associate(squared, squared <= gate_sigma**2)
-
-
 def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
     """Square of the Mahalanobis distance, ``offset' covariance^-1 offset``.
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera.boards.board import PAGES, Board
+from camera.boards.board import Board
 from camera.boards.points import find_board
 from camera.cli import main
 
@@ -65,7 +65,7 @@ def test_squares_have_their_size(tmp_path: Path) -> None:
     assert main(command) == 0
 
     size, outlines = page_of(output.read_bytes())
-    assert sorted(size) == pytest.approx(PAGES["A4"], abs=1e-5)
+    assert size == pytest.approx((0.258, 0.207), abs=1e-5)
     squares = [o for o in outlines if np.ptp(o[:, 0]) == pytest.approx(0.025, abs=1e-5)]
     assert len(squares) == 35  # of 10 x 7, the black ones
     for square in squares:
@@ -110,7 +110,7 @@ def test_printed_boards_are_found_where_they_are(board: Board, tmp_path: Path) -
     np.testing.assert_allclose(pixels, expected, atol=0.7)
 
 
-def test_discs_and_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_discs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "discs.pdf"
     flags = ["--board", "discs", "--circle-m", "0.2", "-o", str(output)]
 
@@ -119,8 +119,7 @@ def test_discs_and_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     disc = max(outlines, key=lambda outline: float(np.ptp(outline[:, 1])))
     assert np.ptp(disc, axis=0) == pytest.approx((0.2, 0.2), abs=1e-4)
     assert main(["board", *flags, "--columns", "2", "--rows", "3", "--force"]) == 0
-    assert "on A1" in capsys.readouterr().out
-    assert main(["board", *flags, "--columns", "2", "--page", "A4", "--force"]) == 1
-    assert "do not fit on A4" in capsys.readouterr().err
+    size, _ = page_of(output.read_bytes())
+    assert size == pytest.approx((0.428, 0.672), abs=1e-5)
     assert main(["board", "--board", "discs", "-o", str(tmp_path / "no.pdf")]) == 1
     assert "--circle-m above 0" in capsys.readouterr().err

@@ -51,7 +51,7 @@ def test_a_wrong_count_is_mended(
     photographs: Path, columns: int, rows: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = replace(BOARD, columns=columns, rows=rows)
-    found = true_board(calibration_images([photographs], 1, 60), given)
+    found = true_board(calibration_images([photographs], 60), given)
     told = capsys.readouterr().err
     if (columns, rows) == (6, 9):  # the same board, lying
         assert (found, told) == (given, "")

@@ -124,7 +124,7 @@ def test_how_a_telephone_was_held_turns_no_video(tmp_path: Path) -> None:
     turned = reader.read()[1]
     reader.release()
     assert turned.shape[:2] == (64, 48)  # what OpenCV does unless told
-    frames = [image for _, image in calibration_images([path], 1, 9)]
+    frames = [image for _, image in calibration_images([path], 9)]
     assert len(frames) == 2
     for frame in (*frames, *(image.content for image in VideoFile(path))):
         assert isinstance(frame, np.ndarray)
@@ -137,7 +137,7 @@ def test_a_file_that_is_named_twice_is_taken_once(tmp_path: Path) -> None:
     # As some systems leave them on memory cards.
     (tmp_path / "._a.png").write_bytes(b"notes")
     named = [tmp_path, tmp_path / "a.png", tmp_path / "." / "b.png"]
-    assert [name for name, _ in calibration_images(named, 1, 9)] == ["a.png", "b.png"]
+    assert [name for name, _ in calibration_images(named, 9)] == ["a.png", "b.png"]
 
 
 def test_a_board_in_a_picture_of_ten_bits_is_found(tmp_path: Path) -> None:
@@ -167,13 +167,13 @@ def test_a_video_that_is_cut_off_gives_what_it_has_and_says_so(
     for _ in range(20):
         writer.write(rng.integers(0, 255, (48, 64, 3), np.uint8))
     writer.release()
-    assert len(list(calibration_images([path], 1, 99))) == 20
+    assert len(list(calibration_images([path], 99))) == 20
     assert capsys.readouterr().err == ""
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 5])
-    found = len(list(calibration_images([path], 1, 99)))
+    found = len(list(calibration_images([path], 99)))
     assert 5 < found < 20
     told = f"{path}: only {found} of 20 frames can be read\n"
     assert capsys.readouterr().err == told
     # Every fourth, and one of them is not there.
-    assert len(list(calibration_images([path], 1, 5))) == -(-found // 4)
+    assert len(list(calibration_images([path], 5))) == -(-found // 4)
     assert capsys.readouterr().err == told

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,13 +15,11 @@ from scipy.stats import chi2
 from camera import Camera, read_camera
 from camera.calibration.adjustment import Estimate, fit_points
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
-from camera.calibration.command import camera_of, report_text
+from camera.calibration.command import camera_of, describe
 from camera.calibration.consensus import demand_different_views
 from camera.calibration.model import CalibrationSettings
-from camera.calibration.pictures import pictures
 from camera.cli import main
 from camera.errors import CalibrationError
-from camera.options import Calibrate
 from camera.rotations import rotation_of
 from camera.uncertainty import UNPOSED, covariance_of, intrinsics_of
 from redetect.array_types import FloatArray
@@ -70,7 +67,6 @@ def assert_true(found: Calibration) -> None:
     squared = normalised_error(TRUTH, found.intrinsics, found.adjusted.covariance)
     assert squared < chi2.ppf(0.999, 5)
     assert found.adjusted.sigma_px == pytest.approx(0.1, rel=0.1)
-    assert not any("in scale" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("wrong", [(0, 7), pytest.param((3, 4, 8, 11, 12), marks=pytest.mark.long)])
@@ -100,21 +96,14 @@ def test_a_picture_stays_for_all_but_a_point_that_is_wrong() -> None:
     assert_true(found)
 
 
-def test_a_picture_without_a_residual_is_reported(tmp_path: Path) -> None:
+def test_a_picture_without_a_residual_is_reported() -> None:
     views = seen_views(6)
     nowhere(views[4])
     for settings in (SETTINGS, replace(SETTINGS, keep_outliers=True)):
         found = calibrate(views, BOARD, (640, 480), settings)
         assert found.outliers == (("04.png", np.inf),)
         assert_true(found)
-    camera = camera_of(found)
-    flags = Calibrate(images=(tmp_path,), output=tmp_path, columns=9, rows=6, square_m=0.04)
-    report = json.loads(report_text(flags, found, camera, None))
-    assert report["left_out"] == [{"name": "04.png", "rms_px": None}]
-    chart = cv2.imdecode(np.frombuffer(pictures(found, camera)["views"], np.uint8), 1)
-    assert chart is not None
-    red = np.all(np.abs(chart.astype(int) - (40, 39, 214)) < 8, axis=-1)
-    assert red.any(axis=1).sum() > 0.5 * len(chart)
+    assert "left out: 04.png, where no pose" in describe(found, camera_of(found))
 
 
 def test_pictures_that_contradict_each_other_are_named() -> None:
@@ -156,32 +145,9 @@ def test_another_board_among_the_photographs_is_named(
     command += ["--coefficients", "2", "--tangential", "off", "--polynomial", "off"]
     assert main([*command, "-o", str(output)]) == 0
     printed = capsys.readouterr().out
+    assert printed.count("left out: ") == 1
     assert "left out: other.png, residuals of" in printed
-    report = json.loads((tmp_path / "my.json").read_text())
-    assert [left["name"] for left in report["left_out"]] == ["other.png"]
     found = read_camera(output)
     covariance = covariance_of(found)
     assert covariance is not None
     assert normalised_error(CAMERA, intrinsics_of(found), covariance[:14, :14]) < chi2.ppf(0.999, 6)
-
-
-def zoomed_views(factor: float, zoomed: Sequence[int]) -> list[BoardView]:
-    """Some by a focal length that is longer."""
-    views = seen_views()
-    rng = np.random.default_rng(SEED)
-    poses = board_poses(TRUTH, BOARD, COUNT, SEED, distances_m=(0.3, 0.6))
-    for view in zoomed:
-        (R, t), f = poses[view], factor * TRUTH.scale_x
-        pixels = replace(TRUTH, scale_x=f, scale_y=f).project(BOARD.points @ R.T + factor * t)
-        views[view].pixels[:] = pixels + rng.normal(scale=0.1, size=pixels.shape)
-    return views
-
-
-def test_pictures_by_two_focal_lengths_are_told() -> None:
-    zoomed = range(0, COUNT, 2)
-    found = calibrate(zoomed_views(1.1, zoomed), BOARD, (640, 480), SETTINGS)
-    (told,) = [text for text in found.warnings if "in scale" in text]
-    assert "zoom or autofocus" in told
-    larger, smaller = told.split(" than in ")
-    for view, name in enumerate(found.names):
-        assert name in (larger if view in zoomed else smaller)

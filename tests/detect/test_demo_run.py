@@ -37,7 +37,7 @@ def redetected(run: Path, settings: CircleSettings, folder: Path) -> DiscCompari
     summary = detected(run, settings, output)
     assert summary.failures == []
     reference = read_frames(run / "map.circles")
-    return compare_frames(reference, read_frames(output), CompareOptions(sigma=4.0))
+    return compare_frames(reference, read_frames(output), CompareOptions(gate_m=0.3))
 
 
 @pytest.mark.long

@@ -25,7 +25,6 @@ from detect.lines import ACCEPTED, JOINED, detect_lines
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import decode_gray
-from detect.viewing_options import CompareOptions
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, LineLandmark, Step, parse_record
 from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
@@ -364,9 +363,7 @@ def test_drawn_lines_lie_on_the_edges() -> None:
     image = np.full((160, 240), 90, np.uint8)
     found = detect_lines(scene(CAMERA), TABLE)
     frame = Frame(Step("x", *[0.0] * 9), found.landmarks())
-    picture = draw_rows(
-        image, Sight(CAMERA), SeenRows(lines=frame), CircleSettings(), CompareOptions()
-    )
+    picture = draw_rows(image, Sight(CAMERA), SeenRows(lines=frame), CircleSettings())
     green = (picture[..., 1] > 150) & (picture[..., 2] < 120)
     rows = np.arange(40, 120)
     for bearing in truth():

@@ -48,7 +48,7 @@ def looked_at(source: Path, rows: list[str], output: Path) -> dict[str, bytes]:
     assert main(["report", str(source), *rows, "-o", str(page)]) == 0
     grid = ["--threshold", "0.3,0.6,0.9", "--jobs", "1"]
     assert main(["tune", str(source), *grid, *rows[2:], "-o", str(tuned)]) == 0
-    return {path.name: path.read_bytes() for path in [page, *drawn.iterdir(), tuned / "table.csv"]}
+    return {path.name: path.read_bytes() for path in [page, *drawn.iterdir(), tuned / "table.json"]}
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +57,9 @@ def expected(
 ) -> dict[str, bytes]:
     """What is written of the folder of images."""
     files = looked_at(small_run_template, rows, tmp_path_factory.mktemp("of") / "folder")
-    assert sorted(files) == ["page.html", "s.0000.png", "s.0001.png", "s.0002.png", "table.csv"]
+    assert sorted(files) == ["page.html", "s.0000.png", "s.0001.png", "s.0002.png", "table.json"]
     assert b"data:image/jpeg" in files["page.html"]
-    assert files["table.csv"].count(b"\n") == 4
+    assert files["table.json"].count(b'"threshold": 0.') == 4
     return files
 
 

@@ -14,7 +14,6 @@ from redetect.landmarks import (
     Association,
     associate,
     associate_positions,
-    associate_within_covariance,
     squared_mahalanobis,
     wrap_angle,
 )
@@ -137,12 +136,8 @@ def test_positions_pair_within_the_gate_and_not_beyond() -> None:
 
 def test_distances_past_the_largest_number_are_beyond_any_gate() -> None:
     far, near = [[1e308, 0.0], [1.0, 0.0]], [[-1e308, 0.0], [1.0, 0.0]]
-    covariance = np.tile(np.eye(2), (2, 1, 1))
-    for found in (
-        associate_positions(far, near, gate_m=1.0),
-        associate_within_covariance(far, near, covariance, gate_sigma=1.0),
-    ):
-        assert list(zip(found.first, found.second)) == [(1, 1)]
+    found = associate_positions(far, near, gate_m=1.0)
+    assert list(zip(found.first, found.second)) == [(1, 1)]
 
 
 def test_crowded_positions_give_way_to_each_other() -> None:
@@ -156,16 +151,6 @@ def test_empty_sets_leave_the_other_alone(first: int, second: int) -> None:
     found = associate_positions(np.zeros((first, 2)), np.zeros((second, 2)), gate_m=1.0)
     assert len(found.first) == len(found.second) == 0
     assert (len(found.first_alone), len(found.second_alone)) == (first, second)
-
-
-def test_mahalanobis_gate_follows_the_ellipse() -> None:
-    covariance = [[[0.01, 0.0], [0.0, 1.0]]]
-    along = associate_within_covariance([[0, 0]], [[0, 3.9]], covariance, gate_sigma=4)
-    across = associate_within_covariance([[0, 0]], [[0.41, 0]], covariance, gate_sigma=4)
-    assert len(along.first) == 1
-    assert len(across.first) == 0
-    each = np.broadcast_to(np.array(covariance)[:, np.newaxis], (1, 1, 2, 2))
-    assert len(associate_within_covariance([[0, 0]], [[0, 3.9]], each, gate_sigma=4).first) == 1
 
 
 def test_mahalanobis_distance_is_that_of_whitened_differences() -> None:

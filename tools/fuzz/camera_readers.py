@@ -50,7 +50,7 @@ def _foreign(
 _DECENTRED_TEXT = CAMERA_TEXT.removesuffix(b"}\n") + b"tangential: { 0.002 -0.003 }\n}\n"
 _POLYNOMIAL_TEXT = _DECENTRED_TEXT.removesuffix(b"}\n") + b"polynomial: { -0.02 0.01 0 }\n}\n"
 _OPENCV = ForeignCamera("radtan", 64, 48, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.01, 0.001, 0.002, 0.0))
-_RATIONAL = ForeignCamera("rational", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1,) * 8 + (0.0,) * 4)
+_RATIONAL = ForeignCamera("rational", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1,) * 8)
 _FISHEYE = ForeignCamera("fisheye", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1, 0.01, 0.0, 0.0))
 _YAML_WORDS = (
     b"&a", b"*a", b"!!python/object/apply:os.system", b"!!opencv-matrix", b"<<: ", b"---\n",

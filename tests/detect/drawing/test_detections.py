@@ -11,7 +11,6 @@ from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows
 from detect.seen import Sight
 from detect.settings import CircleSettings
-from detect.viewing_options import CompareOptions
 from lut import ring
 from redetect.landmarks import Frame, Step, circle_landmarks
 
@@ -26,7 +25,7 @@ def drawn(
     covariance = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
     discs = circle_landmarks(xy, np.full(len(xy), 0.87), covariance, np.full(len(xy), -1))
     rows = SeenRows(circles=Frame(Step("x", *[0.0] * 9), discs))
-    picture = draw_rows(image, Sight(camera), rows, SETTINGS, CompareOptions())
+    picture = draw_rows(image, Sight(camera), rows, SETTINGS)
     return picture[: image.shape[0]]
 
 

@@ -18,7 +18,7 @@ from detect.markers import detect as identities
 from detect.markers import edges, geometry
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
-from detect.settings import PUBLISHED_MARKERS, MarkerSettings
+from detect.settings import MarkerSettings
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
 FloatArray = NDArray[np.float64]
@@ -69,7 +69,6 @@ def test_a_marker_of_every_dictionary_is_found(name: str) -> None:
     assert found.ids.tolist() == [number]
     assert np.abs(found.corners[0] - corners).max() < 0.06
     assert found.quality[0] > 0.95
-    assert found.explained[0] > 0.98
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 90.0, 180.0, 270.0, 37.0, 211.0])
@@ -104,11 +103,10 @@ def test_corners_are_where_they_were_drawn(
     assert np.abs(found.corners[0] - corners).max() < tolerance_px
 
 
-@pytest.mark.parametrize("joint", [True, False])
-def test_covariances_are_right(joint: bool) -> None:
+def test_covariances_are_right() -> None:
     # 40 independent images: the mean of 8 * 40 normalised squared errors, which hang together
     # within an image, is within 0.43 of 1.
-    settings = MarkerSettings(dictionary="6x6_250", joint=joint, systematic_px=0.0)
+    settings = MarkerSettings(dictionary="6x6_250", systematic_px=0.0)
     errors = []
     for seed in range(40):
         rng = np.random.default_rng(1000 + seed)
@@ -117,7 +115,7 @@ def test_covariances_are_right(joint: bool) -> None:
         found = detect_markers(image, settings)
         assert found.ids.tolist() == [7]
         errors.append(normalised_error(found, corners))
-    assert 0.57 < np.mean(errors) < (1.43 if joint else 1.7)
+    assert 0.57 < np.mean(errors) < 1.43
 
 
 @pytest.mark.parametrize("width", [15.0, 16.0, 17.0, 18.0])
@@ -131,17 +129,6 @@ def test_small_sharpened_tags_are_found(width: float) -> None:
         found = detect_markers(image, MarkerSettings(dictionary="apriltag_36h11"))
         assert found.ids.tolist() == [0]
         assert np.abs(found.corners[0] - corners).max() < 0.15
-
-
-def test_the_whole_marker_knows_more_than_its_edges() -> None:
-    apart = {True: [], False: []}  # type: dict[bool, list[float]]
-    for seed in range(12):
-        image, corners = picture(view=View(40.0, 30.0, 30.0 * seed, 17.0), noise=4.0, seed=seed)
-        for joint, errors in apart.items():
-            found = detect_markers(image, MarkerSettings(dictionary="6x6_250", joint=joint))
-            assert found.ids.tolist() == [7]
-            errors.append(float(np.abs(found.corners[0] - corners).max()))
-    assert np.median(apart[True]) < 0.7 * np.median(apart[False])
 
 
 def test_sixty_pixels_wide_at_noise_three() -> None:
@@ -301,8 +288,10 @@ def test_a_ring_segment_is_not_solid() -> None:
     assert regions.SOLIDITY in squares(painted(grey)).rejected
 
 
-def test_the_published_filters_count_holes_and_their_share() -> None:
-    published = MarkerSettings(**{**vars(PUBLISHED_MARKERS), "dictionary": "6x6_250"})
+def test_the_filters_count_holes_and_their_share() -> None:
+    published = MarkerSettings(
+        dictionary="6x6_250", thresholds=(0.5,), least_holes=1, least_solidity=0.9, least_white=0.25
+    )
     grey = np.full((120, 120), 200.0)
     grey[40:80, 40:80] = 40.0
     assert regions.HOLES in squares(painted(grey), published).rejected
@@ -356,14 +345,6 @@ def test_expected_ids_and_width_narrow_the_search() -> None:
     assert len(detect_markers(image, MarkerSettings(dictionary="6x6_250", width_px=300.0))) == 0
 
 
-def test_the_published_detector_finds_a_plain_marker() -> None:
-    image, corners = picture(dictionary="rawseeds", number=31, view=View(90.0, 20.0, 30.0, 12.0))
-    found = detect_markers(image, PUBLISHED_MARKERS)
-    assert found.ids.tolist() == [31]
-    assert np.abs(found.corners[0] - corners).max() < 0.1
-    assert np.isnan(found.explained[0])
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -402,11 +383,9 @@ def real_frame(shared_data: Path) -> tuple[NDArray[np.uint8], FloatArray]:
     return np.asarray(image, np.uint8), np.array(truth["markers"][0]["corners_TL_TR_BR_BL"])
 
 
-@pytest.mark.parametrize("joint", [True, False])
-def test_the_real_frame(shared_data: Path, joint: bool) -> None:
+def test_the_real_frame(shared_data: Path) -> None:
     image, corners = real_frame(shared_data)
-    settings = MarkerSettings(dictionary="artoolkitplus12", joint=joint)
-    found = detect_markers(image, settings)
+    found = detect_markers(image, MarkerSettings(dictionary="artoolkitplus12"))
     assert found.ids.tolist() == [31]
     assert np.abs(found.corners[0] - corners).max() < 0.1
 

@@ -60,15 +60,10 @@ def test_rows_of_a_folder_without_a_calibration(
     assert len(list((folder / "drawn").glob("*.png"))) == 3
 
 
-def test_ids_and_presets_on_the_command_line(folder: Path) -> None:
+def test_ids_on_the_command_line(folder: Path) -> None:
     output = folder / "only.markers"
     assert main(["markers", str(folder), "--ids", "9", "11", "-o", str(output)]) == 0
     assert [[m.id for m in f.markers] for f in read_frames(output)] == [[], [], [9]]
-    assert (
-        main(["markers", str(folder), "--preset", "published", "--force", "-o", str(output)]) == 0
-    )
-    assert [[m.id for m in f.markers] for f in read_frames(output)] == [[5], [], [5, 9]]
-    assert "joint=False" in output.read_text()
 
 
 def test_a_calibration_of_another_size_costs_its_frames(folder: Path) -> None:

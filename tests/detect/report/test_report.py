@@ -71,18 +71,6 @@ def test_rates_of_a_case_made_by_hand() -> None:
     np.testing.assert_allclose(curve.precision, [2 / 5, 2 / 4, 2 / 3, 1.0, 1.0, np.nan])
 
 
-def test_rates_of_verticals_count_joined_ones_as_comparing_does() -> None:
-    wanted = [line(0.0, 0.001), line(0.004, 0.001), line(0.5, 0.001), line(-0.5, 0.001)]
-    found = [line(0.001, 0.01), line(0.502, 0.002), line(1.0, 0.004)]
-    result = compared_lines([(wanted, found)])
-    curve = rates_over(result, [0.003, 0.005, 0.02])
-    # The wide one represents both lines that it covers.
-    np.testing.assert_allclose(curve.recall, [1 / 4, 1 / 4, 3 / 4])
-    np.testing.assert_allclose(curve.precision, [1.0, 1 / 2, 2 / 3])
-    np.testing.assert_allclose(curve.threshold, np.degrees([0.003, 0.005, 0.02]))
-    assert (result.recall, result.precision) == (curve.recall[-1], curve.precision[-1])
-
-
 def test_rows_set_aside_are_not_kept() -> None:
     """At the least threshold, the rates are those of the comparison."""
     discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
@@ -263,9 +251,7 @@ def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Pat
     words = " ".join(" ".join(page.words).split())
     assert "No reference rows" in words
     assert "Frame s.0002 (no reference rows)" in words
-    changed = [attributes for attributes in page.of("tr") if attributes.get("class") == "changed"]
-    assert len(changed) == 1
-    assert "threshold 0.4 0.5" in words
+    assert "threshold 0.4" in words
 
 
 def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path) -> None:
@@ -283,7 +269,6 @@ def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path)
     page = reported(judged_run, tmp_path / "r.html")
     figures = [image["alt"] or "" for image in page.of("img")]
     assert [words.split(",")[0].split(" (")[0] for words in figures] == [
-        "Rows",
         "Where on the floor the two sides put the same disc",
         "Residuals in units of the covariance that the rows state",
         "Frame s.0000",

@@ -163,11 +163,11 @@ def test_a_decentred_lens_is_taken_over(small_run: Path, tmp_path: Path) -> None
 
 
 def test_a_lens_that_the_model_cannot_follow(small_run: Path, tmp_path: Path) -> None:
-    """A thin prism is neither radial nor tangential: refused, with the deviation."""
+    """A fisheye that sees nearly to its side: refused, with the deviation."""
     ros = Ros()
-    k = [460.0, 0, 384, 0, 230, 144, 0, 0, 1]
-    prism = [-0.05, 0.01, *[0.0] * 6, 0.02, 0.0, 0.0, 0.0]
-    bent = ros.camera_info(768, 288, "rational_polynomial", prism, k, OPTICAL)
+    k = [270.0, 0, 384, 0, 270, 144, 0, 0, 1]
+    wide = [-0.01, 0.02, -0.005, 1e-3]
+    bent = ros.camera_info(768, 288, "equidistant", wide, k, OPTICAL)
     said = [Said("/front/camera_info", 1.0, bent)]
     path = ros.write(tmp_path / "bent", recorded(small_run, ros, said))
     with pytest.raises(DetectError, match=r"differs from it by up to [0-9.]+ px, more than 0\.05"):

@@ -63,6 +63,26 @@ def test_a_video_gives_the_rows_of_its_images(
     assert times == pytest.approx({p: 0.1 * k for k, p in enumerate(PREFIXES)}, abs=1e-6)
 
 
+def test_rows_and_images_of_a_video_without_each_other(small_run: Path, video: Path) -> None:
+    steps = (small_run / "s.txt").read_text().replace("s.0001", "t.0001")
+    (small_run / "other.txt").write_text(steps)
+    run = open_source(video, None, SourceOptions(odometry=str(small_run / "other.txt")))
+    frames = list(run.frames)
+    assert [frame.step.prefix for frame in frames] == ["s.0000", "s.0002", "t.0001"]
+    assert [frame.content is None for frame in frames] == [False, False, True]
+    assert run.frames.left_out == 1
+
+
+def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) -> None:
+    assert main(["circles", str(video)]) == 0
+    found = list(read_frames(video.parent / "s.detected.circles"))
+    assert [frame.step.prefix for frame in found] == PREFIXES
+    assert all(frame.step.dx == frame.step.cxx == 0.0 for frame in found)
+    landmarks = [row for row in expected_rows if row.startswith("LANDMARK_C")]
+    written = rows(video.parent / "s.detected.circles")
+    assert [row for row in written if row.startswith("LANDMARK_C")] == landmarks
+
+
 def test_all_of_a_video_is_named_after_it(video: Path) -> None:
     assert main(["all", str(video)]) == 0
     names = sorted(path.name for path in video.parent.iterdir() if "log" not in path.name)
@@ -76,16 +96,6 @@ def test_all_of_a_video_is_named_after_it(video: Path) -> None:
     for ending in endings[:-1]:
         (video.parent / f"s.detected.{ending}").unlink()
     assert main(["all", str(video)]) == 1  # the times stand there
-
-
-def test_without_odometry_steps_are_zero(video: Path, expected_rows: list[str]) -> None:
-    assert main(["circles", str(video)]) == 0
-    found = list(read_frames(video.parent / "s.detected.circles"))
-    assert [frame.step.prefix for frame in found] == PREFIXES
-    assert all(frame.step.dx == frame.step.cxx == 0.0 for frame in found)
-    landmarks = [row for row in expected_rows if row.startswith("LANDMARK_C")]
-    written = rows(video.parent / "s.detected.circles")
-    assert [row for row in written if row.startswith("LANDMARK_C")] == landmarks
 
 
 def test_any_number_of_frames(video: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
-from detect.line_settings import LineSettings
 from detect.report.figures import f1_score, knee, pareto_front
 from detect.settings import CircleSettings
 from detect.tune import (
@@ -95,44 +93,39 @@ def test_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
     ],
 )
 def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...]) -> None:
-    values = parameter_values(CircleSettings, name, text)
+    values = parameter_values(name, text)
     assert values == expected
     assert [type(v) for v in values] == [type(v) for v in expected]
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "text", "says"),
+    ("name", "text", "says"),
     [
-        (CircleSettings, "radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
-        (CircleSettings, "least_rows", "1", "no parameter of CircleSettings"),
-        (LineSettings, "radius_m", "1", "no parameter of LineSettings"),
-        (LineSettings, "refine_steps_px", "1", "a list of numbers"),
-        (LineSettings, "blurred_widths", "2", "a list of numbers"),
-        (CircleSettings, "threshold", "0.3:0.7", "FROM:TO:STEP"),
-        (CircleSettings, "threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
-        (CircleSettings, "threshold", "0.3:0.7:0", "FROM:TO:STEP"),
-        (CircleSettings, "threshold", "0:inf:1", "FROM:TO:STEP"),
-        (CircleSettings, "threshold", "a:b:c", "FROM:TO:STEP"),
-        (CircleSettings, "threshold", "much", "expected a number"),
-        (CircleSettings, "samples", "8:9:0.5", "expected a whole number"),
-        (CircleSettings, "verify", "maybe", "True or False"),
-        (CircleSettings, "polarity", "grey", "any, light, dark"),
+        ("radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
+        ("least_rows", "1", "no parameter of CircleSettings"),
+        ("threshold", "0.3:0.7", "FROM:TO:STEP"),
+        ("threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
+        ("threshold", "0.3:0.7:0", "FROM:TO:STEP"),
+        ("threshold", "0:inf:1", "FROM:TO:STEP"),
+        ("threshold", "a:b:c", "FROM:TO:STEP"),
+        ("threshold", "much", "expected a number"),
+        ("samples", "8:9:0.5", "expected a whole number"),
+        ("verify", "maybe", "True or False"),
+        ("polarity", "grey", "any, light, dark"),
     ],
 )
-def test_values_that_are_none_are_refused(kind: type, name: str, text: str, says: str) -> None:
+def test_values_that_are_none_are_refused(name: str, text: str, says: str) -> None:
     with pytest.raises(DetectError, match=says):
-        parameter_values(kind, name, text)
+        parameter_values(name, text)
 
 
 def test_all_combinations_are_tried() -> None:
-    grid = combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 4)
+    grid = combinations({"threshold": "0.4,0.5", "samples": "8,16"})
     assert [replace(CircleSettings(), **c) for c in grid] == [
         CircleSettings(threshold=t, samples=s) for t in (0.4, 0.5) for s in (8, 16)
     ]
-    with pytest.raises(DetectError, match="4 combinations: expected at most 3"):
-        combinations(CircleSettings, {"threshold": "0.4,0.5", "samples": "8,16"}, 3)
     with pytest.raises(DetectError, match="nothing is varied"):
-        combinations(CircleSettings, {}, 3)
+        combinations({})
 
 
 # -- tables and pictures ----------------------------------------------------------------------
@@ -174,26 +167,23 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     folder = tmp_path / "t"
     arguments = ["tune", str(small_run), "--threshold", "0.4,0.999", "--samples", "8,16"]
     assert main([*arguments, "-o", str(folder)]) == 0
-    with (folder / "table.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
+    document = json.loads((folder / "table.json").read_text())
+    rows = document["trials"]
     assert [(r["threshold"], r["samples"]) for r in rows] == [
-        ("0.4", "8"), ("0.999", "8"), ("0.4", "16"), ("0.999", "16"),
+        (0.4, 8), (0.999, 8), (0.4, 16), (0.999, 16),
     ]  # fmt: skip
-    assert (float(rows[2]["recall"]), float(rows[2]["precision"])) == (0.5, round(2 / 3, 6))
+    assert (rows[2]["recall"], rows[2]["precision"]) == (0.5, round(2 / 3, 6))
     for row in rows:
-        flags = ["--threshold", row["threshold"], "--samples", row["samples"]]
+        flags = ["--threshold", str(row["threshold"]), "--samples", str(row["samples"])]
         assert main(["circles", str(small_run), *flags, "--force"]) == 0
         reference, found = (
             read_frames(small_run / f"{name}.circles") for name in ("map", "detected")
         )
         expected = compare_frames(reference, found)
         counts = (expected.reference, expected.detected, expected.matched)
-        assert tuple(int(row[n]) for n in ("reference", "detected", "matched")) == counts
-        assert row["recall"] == f"{expected.recall:.6g}"
-        shown = "" if expected.precision is None else f"{expected.precision:.6g}"
-        assert row["precision"] == shown
-    document = json.loads((folder / "table.json").read_text())
-    assert len(document["trials"]) == 4
+        assert tuple(row[n] for n in ("reference", "detected", "matched")) == counts
+        assert row["recall"] == pytest.approx(expected.recall, rel=1e-5)
+        assert row["precision"] == pytest.approx(expected.precision, rel=1e-5)
     assert document["varied"] == {"samples": "8,16", "threshold": "0.4,0.999"}
     assert document["settings"]["radius_m"] == 0.1
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -207,21 +197,8 @@ def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
     arguments = ["tune", str(small_run), "--threshold", "0.4:0.9:0.25"]
     for jobs in ("1", "2"):
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
-    for name in ("table.csv", "table.json", "curve.png"):
+    for name in ("table.json", "curve.png"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
-
-
-def test_verticals_are_tuned_as_well(small_run: Path, tmp_path: Path) -> None:
-    (small_run / "map.lines").write_text(
-        "STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_L 0 -0.5 0 0.2 0 0 0 0.002 1\n"
-    )
-    arguments = ["tune", str(small_run), "--verticals", "--least-rows", "14,20"]
-    assert main([*arguments, "-o", str(tmp_path / "t")]) == 0
-    document = json.loads((tmp_path / "t" / "table.json").read_text())
-    assert document["frames"] == ["s.0000"]
-    assert [trial["least_rows"] for trial in document["trials"]] == [14, 20]
-    assert [trial["matched"] for trial in document["trials"]] == [0, 0]
-    assert document["settings"]["largest_horizon_gap_px"] == 11.0
 
 
 def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
@@ -233,11 +210,6 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused([*tune, "--threshold", "0.5"], small_run, "none of the 3", capsys)
     write_reference(small_run, SMALL_RUN_DISCS)
     assert_refused([*tune, "--threshold", "2"], small_run, "threshold is 2", capsys)
-    assert_refused([*tune, "--least-rows", "20"], small_run, "no parameter of Circle", capsys)
-    assert_refused(
-        [*tune, "--verticals", "--radius-m", "0.1"], small_run, "no parameter of Line", capsys
-    )
-    assert_refused([*tune, "--threshold", "0.1:0.9:0.001", "--most", "9"], small_run, "801", capsys)
     assert not (tmp_path / "t").exists()
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "curve.png").write_bytes(b"mine")
