@@ -214,42 +214,29 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     assert {row["marker"] for row in content["residuals"]} == set(rig.ids)
     refused(["rig", *runs, *options], "rig.json: exists already", capsys)
 
-    reference = tmp_path / "reference.csv"
-    times, planar = drive(25)
-    write_planar_poses(reference, PlanarPoses(times[::3], planar[::3]))
-    together = [
-        "rig", *runs, *options, "--force", "--network", str(session / "network.json"),
-        "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]), "199",
-        "--widths", "31=0.24", "13=0.24",
-    ]  # fmt: skip
-    assert main(together) == 0
-    told = capsys.readouterr().err
-    assert "widths: marker 13 is not among those found" in told
-    assert "ids: not in any of the runs: 199" in told
+    together = ["--force", "--network", str(session / "network.json"), "--robot", str(known)]
+    assert main(["rig", *runs, *options, *together]) == 0
     found = read_rig(output)
-    assert found.ids == rig.ids[:4]
-    error = log_se3(inverse(rig.robot_from_marker[:4]) @ found.robot_from_marker)
+    assert found.ids == rig.ids
+    error = log_se3(inverse(rig.robot_from_marker) @ found.robot_from_marker)
     assert np.abs(error).max() < 6e-3
 
 
 @pytest.mark.parametrize(
-    ("options", "names"),
+    ("width", "names"),
     [
-        (["--width-m", "0"], "width_m is 0"),
-        (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
-        (["--width-m", "0.2", "--widths", "31=inf"], "'31=inf': expected a marker and metres"),
-        (["--width-m", "0.2", "--widths", "31=0.1", "31=0.2"], "marker 31 twice"),
-        (["--width-m", "0.2", "--ids", "99"], "ids: none of these markers in any of the runs"),
-        (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
-        (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
+        ("0", "width_m is 0"),
+        ("0.2", "markers of the dictionaries ['aruco', 'rawseeds']: expected markers of one"),
     ],
 )
 def test_rigs_that_cannot_be_made_are_refused(
-    tmp_path: Path, capsys: Captured, options: list[str], names: str
+    tmp_path: Path, capsys: Captured, width: str, names: str
 ) -> None:
     session = write_session(tmp_path / "s", count=2)
+    detected = session / "a" / "detected.markers"
+    detected.write_text(detected.read_text().replace("rawseeds", "aruco", 1))
     output = tmp_path / "rig.json"
-    refused(["rig", str(session / "a"), *options, "-o", str(output)], names, capsys)
+    refused(["rig", str(session / "a"), "--width-m", width, "-o", str(output)], names, capsys)
     assert not output.exists()
 
 

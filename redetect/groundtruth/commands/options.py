@@ -17,7 +17,7 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-from redetect.storage.bounds import MaybeInt, MaybePath, MaybeStr
+from redetect.storage.bounds import MaybeInt, MaybePath
 
 
 @dataclass(frozen=True)
@@ -29,22 +29,13 @@ class Rig:
 
     runs: Positional[tuple[Path, ...]]  # Run folders with detected.markers and a calibration.
     width_m: float  # Width of the markers' black squares (m).
-    widths: tuple[str, ...] = ()  # Other widths, as `31=0.15`.
-    # The markers that may be on the robot; by default all that were found.
-    ids: tuple[int, ...] = ()
-    # Their dictionary; by default that of the markers found, if it is one.
-    dictionary: MaybeStr = None
     # Calibration of the cameras to each other: then images of one time are used together.
     network: MaybePath = None
     # The marker whose frame is the robot's; by default the one seen best.
     reference: MaybeInt = None
     robot: MaybePath = None  # A rig file with the pose of one or more markers in the robot's frame.
-    # Known poses (t, x, y, theta) of the robot standing level, which define its frame; needs
-    # --network.
-    reference_poses: MaybePath = None
-    output: Annotated[Path, arg(aliases=["-o"])] = Path("rig.json")  # The rig file to write.
-    # The picture to write; by default the output's name with the ending .png.
-    picture: MaybePath = None
+    # The rig file to write, and a picture beside it (.png).
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("rig.json")
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[RigSettings] = field(default_factory=RigSettings)
 
@@ -123,10 +114,8 @@ class Lasers:
     # Folder with scanners.json (poses measured by hand), the scans of the empty area and
     # building.csv or building.dxf.
     session: Positional[Path]
-    building: MaybePath = None  # The building map, if it is not the one in the session.
-    # The picture to write; by default the output's name with the ending .png.
-    picture: MaybePath = None
-    # The scanners file to write; by default aligned.json in the session.
+    # The scanners file to write, and a picture beside it (.png); by default aligned.json in the
+    # session.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[AlignmentSettings] = field(default_factory=AlignmentSettings)
