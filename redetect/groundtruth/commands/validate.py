@@ -80,8 +80,6 @@ def perform(options: Validate) -> int:
             )
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
-    elif (session / "building.csv").is_file() or (session / "building.dxf").is_file():
-        segments = read_building(find_building(session))  # for the picture
     solved = poses_from_distances(survey, measured)
     references, refused = reference_poses(solved, onboard, segments, clock)
     for entry in refused:
@@ -110,12 +108,8 @@ def perform(options: Validate) -> int:
             {**row, "note": r.note, "points": r.points, "rms_m": r.rms_m}
             for row, r in zip(rows, references)
         ],
-        "sigma": [
-            {"pose": r.index, "linear_m": linear, "angular_rad": angular}
-            for r, (linear, angular) in zip(errors.references, errors.sigma.tolist())
-        ],
-    }  # fmt: skip
-    pictures = {"errors.png": draw_errors(errors, score, segments)}
+    }
+    pictures = {"errors.png": draw_errors(errors, score)}
     if segments is not None and any(r.still is not None for r in errors.references):
         content |= _scanners_on_board(references, segments)
         pictures["scans.png"] = draw_scans(errors, segments)

@@ -2,8 +2,8 @@
 
 The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
 fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls leave a direction undetermined or the results disagree. If distances leave several poses, the
-walls decide. From all of them follow the errors of ranges, and where the scanners are mounted.
+walls leave a direction undetermined or the results disagree. From all of them follow the errors of
+ranges, and where the scanners are mounted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.special import chdtrc
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
-from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
+from redetect.groundtruth.lasers.alignment import StillScan, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.trajectories.streams import pose_differences
@@ -43,9 +43,6 @@ _NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
 _WEAK_SIGMA_M = 0.05
 # Distances and walls disagree if right ones would by as much in less than this share.
 _DISAGREEMENT_PROBABILITY = 1e-4
-# The walls decide among several poses if at least this share of the points is on a wall, and the
-# share at the next pose is smaller by at least this fraction.
-_LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,35 +132,25 @@ def reference_poses(
     references: list[ReferencePose] = []
     refused: list[Refused] = []
     for d in distances:
-        reference, reason = None, d.reason
-        if d.status in ("ok", "ambiguous") and onboard and segments is not None:
+        if d.status != "ok":
+            refused.append(Refused(d.index, d.time_s, d.status, d.reason))
+        elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            reason = f"{d.reason}; the walls do not decide"
             try:
-                reference = refine_pose(d, still_scans(onboard, time), segments)
+                references.append(refine_pose(d, still_scans(onboard, time), segments))
             except GeometryError as error:
-                if d.status == "ok":
-                    reference = _unrefined(d, "moved", str(error))
-        elif d.status == "ok":
-            reference = _unrefined(d, "not asked")
-        if reference is None:
-            refused.append(Refused(d.index, d.time_s, d.status, reason))
+                references.append(_unrefined(d, "moved", str(error)))
         else:
-            references.append(reference)
+            references.append(_unrefined(d, "not asked"))
     return references, refused
 
 
 def _unrefined(
-    d: DistancePose,
-    scans: ScanStatus,
-    reason: str = "",
-    chosen: int = 0,
-    still: StillScans | None = None,
+    d: DistancePose, scans: ScanStatus, reason: str = "", still: StillScans | None = None
 ) -> ReferencePose:
     """The pose by distances alone."""
     note = "; ".join(part for part in (d.reason, reason) if part)
-    pose, covariance = d.candidates[chosen], d.covariances[chosen]
-    return ReferencePose(d, pose, covariance, scans, note, still=still)
+    return ReferencePose(d, d.candidates[0], d.covariances[0], scans, note, still=still)
 
 
 def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
@@ -197,27 +184,18 @@ def _median(metres: FloatArray) -> FloatArray:
     return middle
 
 
-def refine_pose(
-    distances: DistancePose, still: StillScans, segments: FloatArray
-) -> ReferencePose | None:
-    """Combine what distances and walls (S, 4) (m) say of a pose.
-
-    If distances are `ambiguous`, the walls decide; None if they do not.
-    """
-    chosen = 0
-    if distances.status == "ambiguous":
-        decided = _decided(distances, still, segments)
-        if decided is None:
-            return None
-        chosen = decided
-    prior, covariance = distances.candidates[chosen], distances.covariances[chosen]
+def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
+    """Combine what distances and walls (S, 4) (m) say of a pose."""
+    prior, covariance = distances.candidates[0], distances.covariances[0]
     try:
-        found = _by_walls(still, segments, prior)
+        found = fit_to_walls(
+            still.scans, still.mounts, segments, prior, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
+        )
     except GeometryError as error:
-        return _unrefined(distances, "no scans", str(error), chosen)
+        return _unrefined(distances, "no scans", str(error))
     if found.open_directions:
         reason = "the walls leave a direction open"
-        return _unrefined(distances, "undetermined", reason, chosen, still)
+        return _unrefined(distances, "undetermined", reason, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
     apart = pose_differences(found.pose, prior)
@@ -227,7 +205,7 @@ def refine_pose(
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
             "from the pose by distances, more than both allow"
         )
-        return _unrefined(distances, "disagrees", reason, chosen, still)
+        return _unrefined(distances, "disagrees", reason, still)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
@@ -237,28 +215,6 @@ def refine_pose(
     return ReferencePose(
         distances, pose, combined, "used", distances.reason, found.used, found.rms_m, still
     )
-
-
-def _by_walls(still: StillScans, segments: FloatArray, start: FloatArray) -> WallFit:
-    return fit_to_walls(
-        still.scans, still.mounts, segments, start, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
-    )
-
-
-def _decided(distances: DistancePose, still: StillScans, segments: FloatArray) -> int | None:
-    """Which candidate's points are on walls, if those of one only are."""
-    count = sum(len(scan.range_m) for scan in still.scans)
-    shares = []
-    for pose in distances.candidates:
-        try:
-            shares.append(_by_walls(still, segments, pose).used / count)
-        except GeometryError:
-            shares.append(0.0)
-    order = np.argsort(shares)[::-1]
-    best, next_best = shares[order[0]], shares[order[1]]
-    if best < _LEAST_SHARE or next_best > (1.0 - _LEAST_SHARE) * best:
-        return None
-    return int(order[0])
 
 
 #: Readings farther from the wall that their beam meets are of something else (m).

@@ -100,7 +100,8 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
-_HEADINGS = 24
+# Bearings, and headings, that the search begins from.
+_DIRECTIONS = 12
 _SAME_M = 1e-4
 # Steps of the descent, and when they are as good as none (m, rad).
 _STEPS, _SETTLED = 60, 1e-10
@@ -165,8 +166,7 @@ class Measured(NamedTuple):
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    Levenberg-Marquardt from all starts at once: where, for headings all round, two circles about
-    fiducial points meet.
+    Levenberg-Marquardt from all starts at once: all round, in all headings.
     """
     poses = _starts(measured)
     damping = np.full(len(poses), 1e-3)
@@ -287,25 +287,11 @@ def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
 
 
 def _starts(measured: Measured) -> FloatArray:
-    """(S, 3) poses at which, for a heading, two of the distances are right."""
-    fiducials, levers, distances_m, _ = measured
-    pairs = _wide_pairs(fiducials)
-    starts = []
-    for heading in np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS):
-        c, s = np.cos(heading), np.sin(heading)
-        centres = fiducials - levers @ np.array([[c, s], [-s, c]])
-        for k, m in pairs:
-            across = centres[m] - centres[k]
-            apart = max(float(np.hypot(*across)), 1e-9)
-            unit = across / apart
-            along = (apart**2 + distances_m[k] ** 2 - distances_m[m] ** 2) / (2.0 * apart)
-            # Noise, or the wrong heading, keeps circles apart: then the place nearest to both.
-            along = float(np.clip(along, -distances_m[k], distances_m[k]))
-            up = math.sqrt(max(distances_m[k] ** 2 - along**2, 0.0))
-            for side in (up, -up):
-                place = centres[k] + along * unit + side * np.array([-unit[1], unit[0]])
-                starts.append((place[0], place[1], heading))
-    return np.array(starts)
+    """(S, 3) poses in all headings, all round the fiducial of the first distance."""
+    angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
+    bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
+    point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
+    return np.column_stack([point - rotation(heading) @ measured.levers[0], heading])
 
 
 def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
@@ -317,19 +303,6 @@ def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
         if not np.any(apart.max(axis=1, initial=0.0) < closer):
             kept.append(i)
     return kept
-
-
-def _wide_pairs(fiducials: FloatArray) -> list[tuple[int, int]]:
-    """Two pairs of far fiducials that share no distance, so that one gross error spoils one."""
-    apart = np.hypot(*(fiducials[:, None] - fiducials[None]).transpose(2, 0, 1))
-    pairs = []
-    for _ in range(2):
-        k, m = (int(i) for i in np.unravel_index(int(np.argmax(apart)), apart.shape))
-        if k != m:
-            pairs.append((k, m))
-            apart[[k, m], :] = -1.0
-            apart[:, [k, m]] = -1.0
-    return pairs or [(0, 1)]
 
 
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"

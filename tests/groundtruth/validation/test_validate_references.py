@@ -225,7 +225,6 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
         prior = solved(measured(truth, survey, rng), survey)
         refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
-        assert refined is not None
         assert refined.scans == "used", refined.note
         error = refined.pose - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
@@ -236,24 +235,6 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
     assert low < total < high
 
 
-def test_walls_decide_between_mirror_images() -> None:
-    rng = np.random.default_rng(5)
-    survey = survey_of(
-        {"a": (0.0, 3.0), "b": (4.0, 3.0), "c": (10.0, 3.0)},
-        {"front": (0.3, 0.0), "back": (-0.4, 0.0)},
-    )
-    truth = np.array([4.0, 1.9, 0.7])
-    prior = solved(measured(truth, survey, rng), survey)
-    assert prior.status == "ambiguous"
-    refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
-    assert refined is not None
-    assert refined.scans == "used"
-    np.testing.assert_allclose(refined.pose, truth, atol=0.005)
-    # Walls that no reading lies on decide nothing.
-    points = still_scans(onboard(truth, ROOM, rng), 5.0)
-    assert refine_pose(prior, points, ROOM + 300.0) is None
-
-
 def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
     rng = np.random.default_rng(6)
     corridor = np.array([[-500.0, 0, 500, 0], [-500, 3, 500, 3]])
@@ -261,7 +242,6 @@ def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
     truth = np.array([4.0, 1.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
     refined = refine_pose(prior, still_scans(onboard(truth, corridor, rng), 5.0), corridor)
-    assert refined is not None
     assert refined.scans == "undetermined"
     np.testing.assert_array_equal(refined.pose, prior.candidates[0])
 
@@ -273,13 +253,11 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     prior = solved(measured(truth, survey, rng), survey)
     points = still_scans(onboard(truth, ROOM, rng), 5.0)
     refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
-    assert refined is not None
     assert refined.scans == "disagrees"
     assert "more than both allow" in refined.note
     np.testing.assert_array_equal(refined.pose, prior.candidates[0])
     # No readings at all about the time.
     nothing = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 99.0), ROOM)
-    assert nothing is not None
     assert nothing.scans == "no scans"
 
 
@@ -294,8 +272,6 @@ def test_an_unsure_mount_makes_the_pose_unsure() -> None:
     mounted = tuple(replace(one, covariance=sigma) for one in points.scanners)
     loose = points._replace(scanners=mounted)
     unsure = refine_pose(prior, loose, ROOM)
-    assert sure is not None
-    assert unsure is not None
     assert unsure.scans == "used"
     # Two mounts, each 1 cm unsure, share the pose: somewhere about 7 mm.
     assert 0.003 < math.sqrt(unsure.covariance[0, 0]) < 0.015
