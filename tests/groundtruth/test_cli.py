@@ -139,17 +139,18 @@ def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> N
     assert (session / "poses.csv").read_bytes() == before
 
 
-def test_single_runs_and_all_options(tmp_path: Path, capsys: Captured) -> None:
+def test_files_and_settings_that_options_name(tmp_path: Path, capsys: Captured) -> None:
     session = write_session(tmp_path / "s", count=6)
     output = tmp_path / "out.csv"
     arguments = [
-        "poses", str(session / "a"), str(session / "c"), "--rig", str(session / "rig.json"),
-        "--solver", "ippe", "--loss", "cauchy", "--floor", "-o", str(output),
+        "poses", str(session), "--rig", str(session / "rig.json"),
+        "--network", str(session / "network.json"),
+        "--solver", "ippe", "--loss", "cauchy", "-o", str(output),
     ]  # fmt: skip
     assert main(arguments) == 0
     assert len(read_planar_poses(output)) == 6
     beside = json.loads((tmp_path / "out.json").read_text())
-    assert beside["settings"]["floor"] is True
+    assert beside["settings"]["loss"] == "cauchy"
     assert capsys.readouterr().err == ""
 
 
@@ -175,7 +176,7 @@ def test_sessions_that_lack_something_are_refused(
 
 def test_nothing_to_work_on_is_refused(tmp_path: Path, capsys: Captured) -> None:
     refused(["poses", str(tmp_path / "absent")], "no such folder", capsys)
-    refused(["poses", str(tmp_path)], "no detected.markers in it", capsys)
+    refused(["poses", str(tmp_path)], "no detected.markers in its folders", capsys)
     session = write_session(tmp_path / "s", count=2)
     network = json.loads((session / "network.json").read_text())
     del network["cameras"]["b"], network["covariance"]
@@ -244,7 +245,16 @@ def test_rigs_that_cannot_be_made_are_refused(
     "words",
     [
         ["fuse", "odometry.csv", "--laser", "laser.csv", "-o", "{}/fused.json"],
-        ["sync", "odometry.csv", "laser.csv", "-o", "{}/clock", "--apply", "{}/x/../clock"],
+        [
+            "fuse",
+            "odometry.csv",
+            "--laser",
+            "laser.csv",
+            "-o",
+            "{}/fused",
+            "--filtered",
+            "{}/x/../fused",
+        ],
     ],
 )
 def test_two_outputs_in_one_place_are_refused(
@@ -298,7 +308,10 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
     (folder / "boards.json").write_text(json.dumps(content))
     (tmp_path / "out").mkdir()
     output = tmp_path / "out" / "network.json"
-    for options in ([], ["--estimate-offset", "--force"]):
+    for options in ([], ["--force"]):
+        if options:  # the offset is estimated then
+            del content["first_from_second"]
+            (folder / "boards.json").write_text(json.dumps(content))
         assert main(["network", str(folder), "-o", str(output), *options]) == 0
         assert "4 cameras" in capsys.readouterr().out
         network = read_network(output)  # finds the calibrations from where it stands

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +36,11 @@ def perform(command: NetworkCommand) -> int:
             failures.append(str(error))
     for line in failures:
         print(f"left out: {line}", file=sys.stderr)
-    double = boards.double
-    if double is not None and command.estimate_offset:
-        double = replace(double, offset=None)
     estimate = estimate_network(
         boards.cameras,
         boards.boards,
         {"world": boards.world_from_board},
-        double,
+        boards.double,
         list(shots.values()),
         command.settings,
     )

@@ -48,8 +48,6 @@ class Network:
     """
 
     boards: Positional[Path]  # A boards.json, or its folder.
-    # Estimate how the double board's halves lie to each other, whatever the file says.
-    estimate_offset: bool = False
     # The network file to write. It names the calibrations relative to its own folder.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("network.json")
     force: bool = False  # Replace an existing file.
@@ -63,9 +61,8 @@ class Poses:
     Example: groundtruth poses SESSION -o poses.csv --report report.jsonl
     """
 
-    # A session (a folder with a run folder per camera), or run folders, whose names are those of
-    # the network's cameras.
-    paths: Positional[tuple[Path, ...]]
+    # A folder with a run folder per camera, by the names of the network's cameras.
+    session: Positional[Path]
     rig: MaybePath = None  # Where the markers are on the robot; by default rig.json in the session.
     # Where the cameras are in the world; by default network.json in the session.
     network: MaybePath = None
@@ -150,7 +147,6 @@ class Sync:
     # Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
     groundtruth: Positional[Path]
     ptpd: MaybePath = None  # Log of ptpd, to compare with.
-    apply: MaybePath = None  # Write the odometry on the ground truth's clock to this file.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")  # The clock file to write.
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[SyncSettings] = field(default_factory=SyncSettings)
@@ -168,8 +164,6 @@ class Fuse:
     camera: MaybePath = None  # Ground truth from the markers, in the same columns.
     # Output of `groundtruth sync`; without it all clocks are assumed to be one.
     clock: MaybePath = None
-    # Factors on the covariances of laser and camera.
-    covariance_scale: tuple[float, float] = (1.0, 1.0)
     # Leave each segment of the ground truth between two others out as well, predict it, and print
     # how far off the prediction is (pauses of more than 5 s begin another segment).
     leave_out: bool = False

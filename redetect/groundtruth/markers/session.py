@@ -201,8 +201,6 @@ def _joint_covariance(
 
 
 DETECTED_NAME = "detected.markers"
-NETWORK_NAME = "network.json"
-RIG_NAME = "rig.json"
 
 _IMAGE_SUFFIX = re.compile(r"\.(?:jpe?g|png|p[gp]m|tiff?|bmp)\Z", re.IGNORECASE)
 
@@ -226,26 +224,20 @@ class View:
     rig_index: int
 
 
-def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Path], Path]:
-    """The run folders and the network file that a command line means.
+def find_runs(session: Path) -> list[Path]:
+    """The run folders of a session that have found markers.
 
-    `paths`: a session (a folder with one run folder per camera), or the run folders themselves.
-    `network_path`: by default ``network.json`` in the session, or beside the run folders. Returns
-    run folders; for a session all that have found markers. the network file.
+    Raises `GroundTruthError` if there are none.
     """
-    for path in paths:
-        if not path.is_dir():
-            raise GroundTruthError(f"{path}: no such folder: expected a session or a run folder")
-    if len(paths) == 1 and not (paths[0] / DETECTED_NAME).is_file():
-        runs = sorted(p for p in paths[0].iterdir() if (p / DETECTED_NAME).is_file())
-        if not runs:
-            raise GroundTruthError(
-                f"{paths[0]}: no {DETECTED_NAME} in it or in its folders: "
-                "run `detect markers` on each camera's folder first"
-            )
-        return runs, network_path if network_path is not None else paths[0] / NETWORK_NAME
-    beside = paths[0].resolve().parent / NETWORK_NAME
-    return list(paths), network_path if network_path is not None else beside
+    if not session.is_dir():
+        raise GroundTruthError(f"{session}: no such folder: expected a session")
+    runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())
+    if not runs:
+        raise GroundTruthError(
+            f"{session}: no {DETECTED_NAME} in its folders: run `detect markers` on each camera's "
+            "folder first"
+        )
+    return runs
 
 
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:

@@ -115,14 +115,6 @@ def heading(transforms: ArrayLike) -> FloatArray:
     return np.asarray(np.arctan2(t[..., 1, 0], t[..., 0, 0]))
 
 
-def roll_pitch(transforms: ArrayLike) -> FloatArray:
-    """(..., 2) roll about x and pitch about y (rad) of (..., 4, 4) poses, as in yaw-pitch-roll."""
-    t = np.asarray(transforms, dtype=np.float64)
-    roll = np.arctan2(t[..., 2, 1], t[..., 2, 2])
-    pitch = np.arcsin(np.clip(-t[..., 2, 0], -1.0, 1.0))
-    return np.stack([roll, pitch], axis=-1)
-
-
 def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
     """(..., 3, 6) derivative of (x, y, theta) by the right perturbation of (..., 4, 4) poses."""
     rotation = np.asarray(world_from_robot, dtype=np.float64)[..., :3, :3]

@@ -96,16 +96,6 @@ def test_the_planar_ambiguity_occurs_and_is_reported() -> None:
     assert wrong > 0  # and the lower cost is not always the truth
 
 
-def test_the_floor_decides_the_ambiguity() -> None:
-    generator = np.random.default_rng(23)
-    truth = planar_transform(1.5, 1.5, float(np.arctan2(-4.5, -4.5)))
-    for _ in range(10):
-        estimate = estimated(frontal_marker(generator), PoseSettings(floor=True))
-        assert not estimate.ambiguous
-        error = log_se3(inverse(truth) @ estimate.candidates[0].world_from_robot)
-        assert error @ np.linalg.solve(estimate.candidates[0].covariance, error) < 30.0
-
-
 def test_a_misread_marker_is_found_and_does_not_move_the_pose() -> None:
     generator = np.random.default_rng(24)
     found = 0
