@@ -36,14 +36,7 @@ def perform(command: NetworkCommand) -> int:
             failures.append(str(error))
     for line in failures:
         print(f"left out: {line}", file=sys.stderr)
-    estimate = estimate_network(
-        boards.cameras,
-        boards.boards,
-        {"world": boards.world_from_board},
-        boards.double,
-        list(shots.values()),
-        command.settings,
-    )
+    estimate = estimate_network(boards, list(shots.values()), command.settings)
     folder = command.boards if command.boards.is_dir() else command.boards.parent
     calibrations = tuple(
         Path(os.path.relpath(folder / boards.calibrations[name], command.output.parent)).as_posix()

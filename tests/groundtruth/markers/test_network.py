@@ -18,6 +18,7 @@ from camera.boards.board import Board
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import (
     BoardImage,
+    BoardsFile,
     BoardView,
     DoubleBoard,
     checkerboard,
@@ -98,14 +99,9 @@ def estimated(
     sigma_px: float = 0.1,
 ) -> NetworkEstimate:
     covariance = np.zeros((6, 6)) if sigmas is None else np.diag(sigmas**2)
-    return estimate_network(
-        dict.fromkeys(NAMES, lens()),
-        BOARDS,
-        {"world": WORLD},
-        DoubleBoard(offset, covariance),
-        found,
-        NetworkSettings(corner_sigma_px=sigma_px),
-    )
+    double, cameras = DoubleBoard(offset, covariance), dict.fromkeys(NAMES, lens())
+    setup = BoardsFile(BOARDS, WORLD, double, cameras, {}, ())
+    return estimate_network(setup, found, NetworkSettings(corner_sigma_px=sigma_px))
 
 
 def errors_of(estimate: NetworkEstimate) -> FloatArray:
