@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -40,7 +39,7 @@ _RANSAC_PX = 4.0
 
 
 def solve_camera(
-    camera: Camera, points: FloatArray, pixels: FloatArray, solver: Solver = "sqpnp"
+    camera: Camera, points: FloatArray, pixels: FloatArray, solver: str = "sqpnp"
 ) -> list[FloatArray]:
     """Pose of points seen by one camera.
 
@@ -54,8 +53,7 @@ def solve_camera(
     solver : str
         `sqpnp` (Terzakis & Lourakis 2020), `epnp` (Lepetit et al. 2009; of points in one plane it
         may give the mirror image), `iterative` (DLT or homography, then least squares), `ippe`
-        (Collins & Bartoli 2014: both solutions that a square has), or `pycolmap` (RANSAC, then
-        least squares).
+        (Collins & Bartoli 2014: both solutions that a square has).
 
     Returns
     -------
@@ -73,12 +71,8 @@ def solve_camera(
     normalised = camera.undistort(pixels)
     if not np.all(np.isfinite(normalised)):
         raise GeometryError("a corner lies where the lens sees nothing")
-    if solver == "pycolmap":
-        poses = _pycolmap(camera, points, normalised)
-    else:
-        poses = _opencv(points, normalised, solver)
     return _best_first(
-        poses,
+        _opencv(points, normalised, solver),
         lambda pose: _rms(camera.project(apply(pose, points)) - pixels),
         f"{solver} found no pose with all points in front of the camera",
     )
@@ -87,15 +81,15 @@ def solve_camera(
 def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
     """Pose of a robot seen by one or several cameras.
 
-    `pycolmap` works on all cameras at once; the others on one camera, so there is a solution for
-    each camera, and for `ippe` two for each marker in each image.
+    `pycolmap` (RANSAC, then least squares) works on all cameras at once; the others on one camera,
+    so there is a solution for each camera, and for `ippe` two for each marker in each image.
 
-    `solver`: as in `solve_camera`. Returns `world_from_robot`, those with the least residuals over
-    all cameras first. Solutions in which a corner is behind its camera are left out.
+    `solver`: else as in `solve_camera`. Returns `world_from_robot`, those with the least residuals
+    over all cameras first. Solutions in which a corner is behind its camera are left out.
     """
     used = np.unique(problem.seen.camera)
-    if solver == "pycolmap" and len(used) > 1:
-        poses = _pycolmap_cameras(problem)
+    if solver == "pycolmap":
+        poses = _pycolmap(problem)
     elif solver == "ippe":
         poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     else:
@@ -153,7 +147,7 @@ def _rms(residuals: FloatArray) -> float:
     return value if np.isfinite(value) else float("inf")
 
 
-def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[FloatArray]:
+def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[FloatArray]:
     flags = {
         "sqpnp": cv2.SOLVEPNP_SQPNP,
         "epnp": cv2.SOLVEPNP_EPNP,
@@ -177,56 +171,40 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[
     return [pose for pose in poses if np.all(np.isfinite(pose))]
 
 
-def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> list[FloatArray]:
-    found = pycolmap.estimate_and_refine_absolute_pose(
-        normalised * camera.scale_x,
-        points,
-        _pinhole(camera),
-        estimation_options=pycolmap.AbsolutePoseEstimationOptions(ransac=_ransac()),
-    )
-    return [] if found is None else [_matrix(found["cam_from_world"])]
-
-
-def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
+def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
     used, index = np.unique(problem.seen.camera, return_inverse=True)
+    lenses = [problem.network.cameras[camera] for camera in used]
     pixels = np.empty_like(problem.seen.pixels)
-    for camera in used:
+    for lens, camera in zip(lenses, used):
         chosen = problem.seen.camera == camera
-        lens = problem.network.cameras[camera]
         pixels[chosen] = lens.undistort(problem.seen.pixels[chosen]) * lens.scale_x
     if not np.all(np.isfinite(pixels)):
         raise GeometryError("a corner lies where the lens sees nothing")
+    # Cameras without distortion whose pixels are about those of the images.
+    pinholes = [
+        pycolmap.Camera(
+            model="SIMPLE_PINHOLE",
+            width=lens.width,
+            height=lens.height,
+            params=[lens.scale_x, 0.0, 0.0],
+        )
+        for lens in lenses
+    ]
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
         pixels,
         problem.robot_points,
         index.tolist(),
         [pycolmap.Rigid3d(inverse(problem.network.world_from_camera[c])[:3]) for c in used],
-        [_pinhole(problem.network.cameras[camera]) for camera in used],
-        estimation_options=_ransac(),
+        pinholes,
+        # One thread and a seed: the same corners give the same pose.
+        estimation_options=pycolmap.RANSACOptions(
+            max_error=_RANSAC_PX, min_num_trials=100, random_seed=0, num_threads=1
+        ),
     )
-    return [] if found is None else [_matrix(found["rig_from_world"])]
-
-
-def _ransac() -> Any:
-    # One thread and a seed: the same corners give the same pose.
-    return pycolmap.RANSACOptions(
-        max_error=_RANSAC_PX, min_num_trials=100, random_seed=0, num_threads=1
-    )
-
-
-def _pinhole(camera: Camera) -> Any:
-    """A camera without distortion whose pixels are about those of `camera`."""
-    return pycolmap.Camera(
-        model="SIMPLE_PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[camera.scale_x, 0.0, 0.0],
-    )
-
-
-def _matrix(rigid: Any) -> FloatArray:
-    matrix = np.asarray(rigid.matrix(), dtype=np.float64)
-    return transform(matrix[:, :3], matrix[:, 3])
+    if found is None:
+        return []
+    matrix = np.asarray(found["rig_from_world"].matrix(), dtype=np.float64)
+    return [transform(matrix[:, :3], matrix[:, 3])]
 
 
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
