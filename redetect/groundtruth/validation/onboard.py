@@ -29,13 +29,10 @@ from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
 from redetect.plane import apply, compose, rotation
 
-ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
+ScanStatus = Literal["used", "undetermined", "disagrees", "no scans", "not asked"]
 
-# The robot is at rest for this long before and after the distances' time; it has moved if a quarter
-# of the beams change by more than this within that time. Along a corridor only the beams to its
-# ends change; a passer-by hides fewer.
+# The robot is at rest for this long before and after the distances' time.
 _STILL_S = 0.5
-_MOVED_M, _MOVED_SHARE = 0.03, 0.25
 # The first gate of the fit to the walls, how it narrows, to three times as much, and how well the
 # walls must determine each direction (m).
 _GATE_M = 0.2
@@ -77,7 +74,7 @@ class ReferencePose:
     pose: FloatArray  # (3,): x, y (m), theta (rad)
     covariance: FloatArray  # (3, 3)
     # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
-    # `moved`: the robot was not at rest; `no scans`: too few readings are on walls; `not asked`.
+    # `no scans`: too few readings are on walls; `not asked`.
     scans: ScanStatus
     note: str  # Remarks
     points: int = 0  # Points of the scans on walls that count
@@ -136,10 +133,7 @@ def reference_poses(
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
         elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            try:
-                references.append(refine_pose(d, still_scans(onboard, time), segments))
-            except GeometryError as error:
-                references.append(_unrefined(d, "moved", str(error)))
+            references.append(refine_pose(d, still_scans(onboard, time), segments))
         else:
             references.append(_unrefined(d, "not asked"))
     return references, refused
@@ -154,34 +148,12 @@ def _unrefined(
 
 
 def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
-    """Average the readings of the on-board scanners about a time.
-
-    `time_s`: on the robot's clock. Raises `GeometryError` if the robot moved then.
-    """
-    scans, changes = [], [np.zeros(0)]
+    """Average the readings of the on-board scanners about a time on the robot's clock."""
+    scans = []
     for board in onboard:
-        ranges = board.scans.ranges_mm[np.abs(board.scans.times_s - time_s) <= _STILL_S]
-        scans.append(still_scan(board.scanner, ranges))
-        half = len(ranges) // 2
-        if half >= 2:
-            metres = np.where(board.scanner.has_return(ranges), 1e-3 * ranges, np.nan)
-            changes.append(np.abs(_median(metres[half:]) - _median(metres[:half])))
-    change = np.concatenate(changes)
-    change = change[np.isfinite(change)]
-    if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > _MOVED_M:
-        raise GeometryError(
-            f"moved: a quarter of the beams change by more than {typical:.3f} m: expected a robot "
-            f"at rest for {2.0 * _STILL_S:g} s"
-        )
+        during = np.abs(board.scans.times_s - time_s) <= _STILL_S
+        scans.append(still_scan(board.scanner, board.scans.ranges_mm[during]))
     return StillScans(tuple(board.scanner for board in onboard), tuple(scans))
-
-
-def _median(metres: FloatArray) -> FloatArray:
-    """(readings,) medians of each beam's returns; NaN where most scans had none."""
-    enough = np.mean(np.isfinite(metres), axis=0) >= 0.5
-    middle = np.full(metres.shape[1], np.nan)
-    middle[enough] = np.nanmedian(metres[:, enough], axis=0)
-    return middle
 
 
 def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
