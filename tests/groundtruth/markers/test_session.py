@@ -59,15 +59,14 @@ def test_cameras_that_are_a_little_apart_are_used_together() -> None:
     assert [[f.camera for f in group] for group in groups] == [[0, 1], [0, 1], [2]]
 
 
-def test_times_of_images_that_are_called_alike_are_refused(tmp_path: Path) -> None:
-    """Folders and endings do not tell images apart: one's time must not be taken for another's."""
+def test_times_are_those_of_the_images(tmp_path: Path) -> None:
     run = tmp_path / "a"
     run.mkdir()
     (run / "detected.markers").write_text("STEP 001 0 0 0 0 0 0 0 0 0\n")
-    (run / "a.times").write_text("left/001.png 1.0\nleft/002.png 2.0\n")
-    assert [frame.time_s for frame in read_marker_frames(run, 0)] == [1.0]
-    (run / "a.times").write_text("left/001.png 1.0\nright/001.png 2.0\n")
-    with pytest.raises(GroundTruthError, match=r"a\.times: images 'left/001\.png' and 'right/001"):
+    (run / "a.times").write_text("001 1.5\n002 2.0\n")
+    assert [frame.time_s for frame in read_marker_frames(run, 0)] == [1.5]
+    (run / "a.times").write_text("002 2.0\n")
+    with pytest.raises(GroundTruthError, match=r"a\.times: no time of image 001"):
         read_marker_frames(run, 0)
 
 
