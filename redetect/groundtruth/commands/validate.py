@@ -205,10 +205,7 @@ def account(
         f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
         f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}, "
         f"{distances['gross']} gross errors",
-        f"linear error       mean {1e3 * score.position_mean_m:.2f} mm, sigma "
-        f"{1e3 * score.position_sigma_m:.2f}, worst {1e3 * score.position_max_m:.2f}",
-        f"angular error      mean {math.degrees(score.angle_mean_rad):+.3f} deg, sigma "
-        f"{math.degrees(score.angle_sigma_rad):.3f}, worst {math.degrees(score.angle_max_rad):.3f}",
+        *score.lines(),
     ]
     for p in PUBLISHED:
         lines.append(
@@ -216,14 +213,6 @@ def account(
             f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
             f"{p.angle_sigma_deg:.2f} (published)"
         )
-    if score.normalised:
-        low, high = normalised_band(score.normalised)
-        lines.append(
-            f"NEES / 3           {score.normalised_error:.3f} over {score.normalised} poses; 95 % "
-            f"of right ones between {low:.3f} and {high:.3f}"
-        )
-    else:
-        lines.append("NEES / 3           none: no covariance that can be inverted")
     return lines
 
 

@@ -5,6 +5,7 @@ A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,6 +76,24 @@ class PoseScore(ErrorFigures):
     # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
     # right. NaN without covariances.
     normalised_error: float
+
+    def lines(self) -> list[str]:
+        """The figures to print."""
+        nees = "none: no covariance that can be inverted"
+        if self.normalised:
+            low, high = normalised_band(self.normalised)
+            nees = (
+                f"{self.normalised_error:.3f} over {self.normalised} poses; 95 % of right, "
+                f"independent ones between {low:.3f} and {high:.3f}"
+            )
+        return [
+            f"position error     mean {1e3 * self.position_mean_m:.2f} mm, sigma "
+            f"{1e3 * self.position_sigma_m:.2f}, rmse {1e3 * self.position_rmse_m:.2f}, max "
+            f"{1e3 * self.position_max_m:.2f}",
+            f"angle error        mean {math.degrees(self.angle_mean_rad):+.3f} deg, sigma "
+            f"{math.degrees(self.angle_sigma_rad):.3f}, max {math.degrees(self.angle_max_rad):.3f}",
+            f"normalised error squared / dof  {nees}",
+        ]
 
 
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
