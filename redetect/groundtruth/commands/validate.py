@@ -159,16 +159,14 @@ def _table_rows(
     rows: list[dict[str, Any]] = []
     for r in references:
         sigma = np.sqrt(np.diagonal(r.covariance))
-        good = r.distances.residuals_m[r.distances.used]
         rows.append(
             {
                 "pose": r.index,
                 "t": r.time_s,
                 **dict(zip(("x_m", "y_m", "theta_rad"), r.pose.tolist())),
                 **dict(zip(("sigma_x_m", "sigma_y_m", "sigma_theta_rad"), sigma.tolist())),
-                "distances": int(r.distances.used.sum()),
-                "gross": int((~r.distances.used).sum()),
-                "distance_rms_m": float(np.sqrt(np.mean(good**2))),
+                "distances": len(r.distances.residuals_m),
+                "distance_rms_m": float(np.sqrt(np.mean(r.distances.residuals_m**2))),
                 "scans": r.scans,
                 **dict(zip(columns, by_index.get(r.index, [math.nan] * len(columns)))),
             }
@@ -203,8 +201,7 @@ def account(
         f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by "
         "scans",
         f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
-        f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}, "
-        f"{distances['gross']} gross errors",
+        f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}",
         *score.lines(),
     ]
     for p in PUBLISHED:
@@ -237,11 +234,10 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
 
 def _distance_figures(solved: Sequence[DistancePose], sigma_m: float) -> dict[str, Any]:
     good = [d for d in solved if d.status in ("ok", "ambiguous")]
-    residuals = np.concatenate([d.residuals_m[d.used] for d in good]) if good else np.zeros(0)
+    residuals = np.concatenate([d.residuals_m for d in good]) if good else np.zeros(0)
     freedom = sum(d.freedom for d in good)
     return {
         "sigma_m": sigma_m,
         "rms_m": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0,
         "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
-        "gross": int(sum((~d.used).sum() for d in good)),
     }

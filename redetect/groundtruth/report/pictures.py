@@ -424,7 +424,7 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
     """
     kept = [i for i, r in enumerate(errors.references) if r.still is not None]
     refined = np.stack([errors.references[i].pose for i in kept])
-    distances = np.stack([errors.references[i].distances.candidates[0] for i in kept])
+    distances = np.stack([errors.references[i].distances.pose for i in kept])
     clouds = [still.robot_points() for i in kept if (still := errors.references[i].still)]
     sets = {
         "poses by distances": distances,

@@ -76,7 +76,7 @@ class ReferencePose:
     # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
     # `no scans`: too few readings are on walls; `not asked`.
     scans: ScanStatus
-    note: str  # Remarks
+    note: str  # Why the scans are not used
     points: int = 0  # Points of the scans on walls that count
     rms_m: float = math.nan  # Of their distances from the walls; NaN without.
     still: StillScans | None = None  # What the scanners on board saw, at rest
@@ -143,8 +143,7 @@ def _unrefined(
     d: DistancePose, scans: ScanStatus, reason: str = "", still: StillScans | None = None
 ) -> ReferencePose:
     """The pose by distances alone."""
-    note = "; ".join(part for part in (d.reason, reason) if part)
-    return ReferencePose(d, d.candidates[0], d.covariances[0], scans, note, still=still)
+    return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
 
 
 def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
@@ -158,7 +157,7 @@ def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
 
 def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
     """Combine what distances and walls (S, 4) (m) say of a pose."""
-    prior, covariance = distances.candidates[0], distances.covariances[0]
+    prior, covariance = distances.pose, distances.covariance
     try:
         found = fit_to_walls(
             still.scans, still.mounts, segments, prior, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
@@ -184,9 +183,7 @@ def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray
     # Joseph's form stays symmetric and positive.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return ReferencePose(
-        distances, pose, combined, "used", distances.reason, found.used, found.rms_m, still
-    )
+    return ReferencePose(distances, pose, combined, "used", "", found.used, found.rms_m, still)
 
 
 #: Readings farther from the wall that their beam meets are of something else (m).
@@ -262,8 +259,8 @@ def refine_mounts(
     stills = [r.still for r in used if r.still is not None]
     if len(stills) < 3:
         return None
-    priors = np.stack([r.distances.candidates[0] for r in used])
-    roots = whitening(np.stack([r.distances.covariances[0] for r in used]))
+    priors = np.stack([r.distances.pose for r in used])
+    roots = whitening(np.stack([r.distances.covariance for r in used]))
     mounts = stills[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
     along = segments[:, 2:] - segments[:, :2]
