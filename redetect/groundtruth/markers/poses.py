@@ -228,11 +228,10 @@ class PoseCandidate(RefinedPose):
 class PoseEstimate:
     """Pose estimate from the corners of one time."""
 
-    # The best first; several if the markers are ambiguous or contradict each other.
+    # The best first; several if the markers are ambiguous.
     candidates: tuple[PoseCandidate, ...]
     # Natural logarithm of how much likelier the first is than each candidate: 0 for the first
     log_odds: tuple[float, ...]
-    contradiction: bool  # Equally many markers support poses that exclude each other
 
     @property
     def ambiguous(self) -> bool:
@@ -243,7 +242,8 @@ class PoseEstimate:
 def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     """All poses of a robot that its markers' corners allow.
 
-    Raises `GeometryError` if there is no view, or no pose explains any of them.
+    Raises `GeometryError` if there is no view, no pose explains any of them, or equally many
+    support poses that exclude each other.
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
@@ -253,24 +253,18 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     if not (found and _all_agree(found[0], settings)):
         found = _refined(problem, _starts(problem) + _own_poses(problem))
     if found and _all_agree(found[0], settings):
-        sets, contradiction = [(everything, found)], False
+        views = everything
     else:
-        sets, contradiction = _consensus(problem)
-    candidates: list[PoseCandidate] = []
-    for views, refined in sets:
-        alone = problem.only(views)
-        starts = _starts(alone)[:1] + _mirrored(alone)
-        minima = _distinct(refined + _refined(alone, starts))
-        candidates += [
-            PoseCandidate(**vars(pose), views=views) for pose in _likely(minima, settings)
-        ]
-    if contradiction:
-        # Different views were explained: their costs are not comparable.
-        return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
+        views, refined = _consensus(problem)
+        found = [refined]
+    alone = problem.only(views)
+    starts = _starts(alone)[:1] + _mirrored(alone)
+    likely = _likely(_distinct(found + _refined(alone, starts)), settings)
+    candidates = tuple(PoseCandidate(**vars(pose), views=views) for pose in likely)
     best = candidates[0]
     inflation = _inflation(best)
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
-    return PoseEstimate(tuple(candidates), log_odds, False)
+    return PoseEstimate(candidates, log_odds)
 
 
 def _all_agree(refined: RefinedPose, settings: PoseSettings) -> bool:
@@ -354,10 +348,8 @@ def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
     return bool(apart @ np.linalg.solve(best.covariance, apart) < 4.0)
 
 
-def _consensus(
-    problem: PoseProblem,
-) -> tuple[list[tuple[BoolArray, list[RefinedPose]]], bool]:
-    """The largest sets of views that agree, and whether there are several of one size."""
+def _consensus(problem: PoseProblem) -> tuple[BoolArray, RefinedPose]:
+    """The largest set of views that agree, and their pose."""
     count = problem.views
     found: dict[bytes, tuple[BoolArray, RefinedPose]] = {}
     # A larger marker is the better hypothesis.
@@ -381,9 +373,9 @@ def _consensus(
     best = [entry for entry in found.values() if int(entry[0].sum()) == largest]
     best.sort(key=lambda entry: entry[1].cost)
     # Sets that share most of their views are the same story with another doubtful view.
-    apart = [entry for entry in best if 2 * int((entry[0] & best[0][0]).sum()) <= largest]
-    kept = [best[0], *apart]
-    return [(views, [refined]) for views, refined in kept], len(kept) > 1
+    if any(2 * int((views & best[0][0]).sum()) <= largest for views, _ in best):
+        raise GeometryError(f"groups of {largest} markers exclude each other")
+    return best[0]
 
 
 def _explained(

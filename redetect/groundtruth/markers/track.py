@@ -134,7 +134,6 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     if estimate is not None:
         chosen = estimate.candidates[(choice.candidate or 0) if choice is not None else 0]
         entry["ambiguous"] = estimate.ambiguous
-        entry["contradiction"] = estimate.contradiction
         if choice is not None and estimate.ambiguous:
             entry["margin"] = round(choice.margin, 3)
         entry["candidates"] = [
@@ -183,16 +182,12 @@ def _estimated(
 
 
 def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
-    estimate = tracked.estimate
-    assert estimate is not None
-    kind = "contradicting markers" if estimate.contradiction else "planar ambiguity"
-    reason = ""
-    if choice.status == "rejected":
-        reason = "does not fit the times before and after"
-    elif choice.status == "resolved":
-        reason = f"{kind}, decided by the neighbours"
-    elif choice.status == "unresolved":
-        reason = f"{kind}, not decided by the neighbours"
+    reasons = {
+        "rejected": "does not fit the times before and after",
+        "resolved": "planar ambiguity, decided by the neighbours",
+        "unresolved": "planar ambiguity, not decided by the neighbours",
+    }
+    reason = reasons.get(choice.status, "")
     return replace(tracked, status=choice.status, choice=choice, reason=reason)
 
 

@@ -23,7 +23,7 @@ def estimate(*poses: FloatArray, odds: float = 0.5) -> PoseEstimate:
         PoseCandidate(pose, COVARIANCE, 2.0, 2, np.ones(1), np.ones(1), np.ones(1, dtype=np.bool_))
         for pose in poses
     )
-    return PoseEstimate(candidates, tuple(odds * i for i in range(len(poses))), False)
+    return PoseEstimate(candidates, tuple(odds * i for i in range(len(poses))))
 
 
 def driving(i: int) -> FloatArray:
