@@ -52,7 +52,6 @@ def perform(options: Fuse) -> int:
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "left_out": [asdict(segment) for segment in left_out],
         "covariances_repaired": fusion.repaired,
-        "measurements_repeated": fusion.repeated,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
         "rejected": [asdict(rejected) for rejected in fusion.rejected],

@@ -208,7 +208,6 @@ class MovementProblem:
     measured: MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     repaired: dict[str, int]  # Covariances that had to be raised, by stream
-    repeated: dict[str, int]  # Rows that repeated the row before and were left out, by stream
     settings: FuseSettings
 
     @property
@@ -442,7 +441,7 @@ def movement_problem(
 
     From the first measurement within the odometry's time to the last, on the measurements' clock.
     """
-    names, times, measured, covariances, repaired, repeated = gather(odometry, streams)
+    names, times, measured, covariances, repaired = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
@@ -456,6 +455,5 @@ def movement_problem(
         ),
         streams=names,
         repaired=repaired,
-        repeated=repeated,
         settings=settings,
     )
