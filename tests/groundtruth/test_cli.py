@@ -272,7 +272,14 @@ def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> N
 
 
 @pytest.mark.long
-def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
+def test_a_network_from_corners(
+    tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = [(view, number) for number, shot in enumerate(shots(0.1, 8)) for view in shot]
+    monkeypatch.setattr(
+        "redetect.groundtruth.commands.network.find_boards",
+        lambda image, *_: views[int(image.image.stem)][0],
+    )
     folder = tmp_path / "boards"
     folder.mkdir()
     for name in NAMES:
@@ -299,10 +306,9 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
                 "camera": view.camera,
                 "board": view.board,
                 "placement": number,
-                "corners": view.corners.tolist(),
+                "image": f"{view.camera}/{index}.png",
             }
-            for number, shot in enumerate(shots(0.1, 8))
-            for view in shot
+            for index, (view, number) in enumerate(views)
         ],
     }
     (folder / "boards.json").write_text(json.dumps(content))

@@ -50,8 +50,7 @@ _CLOCK_JSON = (
 _BOARDS_JSON = (
     '{"boards": {"world": {"columns": 3, "rows": 4, "square_m": 0.11}}, "world_from_board": {'
     + _POSE_JSON
-    + '}, "images": [{"camera": "a", "placement": 0, "board": "world",'
-    f' "corners": {[[u, v] for v in range(4) for u in range(3)]}}}]}}'
+    + '}, "images": [{"camera": "a", "placement": 0, "board": "world", "image": "a/0.png"}]}'
 )
 _DXF = (
     b"0 SECTION 2 HEADER 9 $ACADVER 1 AC1009 9 $INSUNITS 70 6 0 ENDSEC 0 SECTION 2 ENTITIES "
