@@ -28,10 +28,11 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, planar_transform
+from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3
 from redetect.landmarks import Frame, Step, write_frames
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 from tests.groundtruth.markers.test_network import BOARDS, OFFSET, WORLD, shots
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 Captured = pytest.CaptureFixture[str]

@@ -45,12 +45,6 @@ def quaternion_xyzw(transforms: ArrayLike) -> FloatArray:
     return np.asarray(q.reshape(*t.shape[:-2], 4))
 
 
-def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
-    """(4, 4) pose of a robot standing level on the floor at x, y with heading theta."""
-    c, s = np.cos(theta_rad), np.sin(theta_rad)
-    return transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
-
-
 def inverse(transforms: ArrayLike) -> FloatArray:
     """Inverses of (..., 4, 4) transforms."""
     t = np.asarray(transforms, dtype=np.float64)

@@ -16,10 +16,10 @@ from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     inverse,
     log_se3,
-    planar_transform,
     rotation_angle,
 )
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, pose_problem, robot_pose
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 

@@ -28,7 +28,6 @@ from redetect.groundtruth.trajectories.transforms import (
     inverse,
     log_se3,
     mean_pose,
-    planar_transform,
 )
 from tests.groundtruth.markers.scene import (
     box_rig,
@@ -41,6 +40,7 @@ from tests.groundtruth.markers.scene import (
     points_of,
     visible,
 )
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 

@@ -22,9 +22,10 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.markers.track import report_entry, track_robot
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import inverse, planar_transform, rotation_angle
+from redetect.groundtruth.trajectories.transforms import inverse, rotation_angle
 from redetect.landmarks import MarkerCorner
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
+from tools.simulator.driving import planar_transform
 
 NETWORK = Network(
     ("a", "b", "c", "d"), (lens(),) * 4, ("",) * 4, hall_cameras(4), np.zeros((24, 24))

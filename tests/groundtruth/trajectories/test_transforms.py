@@ -16,12 +16,12 @@ from redetect.groundtruth.trajectories.transforms import (
     heading,
     inverse,
     log_se3,
-    planar_transform,
     quaternion_xyzw,
     right_jacobian,
     rotation_angle,
     transform_from_quaternion,
 )
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 

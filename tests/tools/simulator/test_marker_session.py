@@ -20,11 +20,11 @@ from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     log_se3,
-    planar_transform,
     transform_from_quaternion,
 )
 from redetect.landmarks.times import read_times
 from tools.simulator.__main__ import main
+from tools.simulator.driving import planar_transform
 from tools.simulator.markers.calibration_set import (
     DOUBLE,
     WORLD,
