@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.uncertainty import with_pose
@@ -23,8 +24,6 @@ def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
 
 def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
     """(4, 4) rotation of a tilted robot about its origin on the floor. `tilt_rad` (2,)."""
-    from scipy.spatial.transform import Rotation
-
     p, q = np.asarray(tilt_rad, dtype=np.float64)
     return transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
 
