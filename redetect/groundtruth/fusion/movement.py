@@ -36,6 +36,7 @@ from redetect.groundtruth.fusion.kernels import (
     FilterHistory,
     Gating,
     MeasuredPoses,
+    MeasurementAccount,
     Odometry,
     empty_history,
     filter_forward,
@@ -130,16 +131,14 @@ def _likeliest(
     )
     history = empty_history(count)
     for _ in range(_MOST_STEPS):
-        squared, _, _, surprise = filter_forward(
-            odometry, begin, spread, measured, _no_gate(count), path, history
-        )
+        account = filter_forward(odometry, begin, spread, measured, _no_gate(count), path, history)
         better, _ = smooth_backward(history)
         moved = float(np.max(np.abs(better[:, 2] - path[:, 2])))
         path = better
         if not moved < 10.0 * math.pi:
             return None
         if moved < _SETTLED_RAD:
-            return float(surprise), float(squared[0]), path
+            return account.surprise, float(account.squared[0]), path
     return None
 
 
@@ -181,17 +180,6 @@ _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 _LOST_VARIANCE = 0.5**2
 _RELINEARISATIONS = 1
 _RELINEARISATIONS_WHERE_LOST = 3
-
-
-@dataclass(frozen=True, eq=False)
-class MeasurementAccount:
-    """How the measurements were used."""
-
-    squared: FloatArray  # (M,): squared normalised innovations
-    accepted: BoolArray  # (M,)
-    # (N,): whether the filter was restarted at a node, and why (see `kernels`)
-    restarted: NDArray[np.int8]
-    surprise: float  # Minus twice the logarithm of their likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,22 +403,20 @@ class MovementProblem:
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:
         means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
-        return MeasurementAccount(
-            *filter_forward(
-                Odometry(self.controls, variances),
-                np.concatenate([self.measured.poses[0], means]),
-                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
-                self.measured,
-                Gating(
-                    self.gate(),
-                    _RESTART_AFTER,
-                    _RESTART_VARIANCES,
-                    _LOST_VARIANCE if points is None else math.inf,
-                    np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
-                ),
-                np.empty((1, STATE)) if points is None else points,
-                empty_history(0) if history is None else history,
-            )
+        return filter_forward(
+            Odometry(self.controls, variances),
+            np.concatenate([self.measured.poses[0], means]),
+            np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
+            self.measured,
+            Gating(
+                self.gate(),
+                _RESTART_AFTER,
+                _RESTART_VARIANCES,
+                _LOST_VARIANCE if points is None else math.inf,
+                np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
+            ),
+            np.empty((1, STATE)) if points is None else points,
+            empty_history(0) if history is None else history,
         )
 
 

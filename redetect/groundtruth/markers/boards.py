@@ -98,7 +98,6 @@ class BoardsFile:
     world_from_board: FloatArray  # (4, 4)
     double: DoubleBoard | None
     cameras: dict[str, Camera]
-    calibrations: dict[str, str]  # Their files, relative to the folder
     images: tuple[BoardImage, ...]
 
 
@@ -125,16 +124,16 @@ def read_boards(path: Path) -> BoardsFile:
             entry = content.inner("first_from_second")
             double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))
     images = tuple(_image(row, path, boards) for row in content.rows("images"))
-    names = sorted({image.camera for image in images})
-    calibrations = {name: f"{name}/{name}.cam" for name in names}
-    return BoardsFile(
-        boards,
-        world,
-        double,
-        {name: read_camera(_inside(path, calibrations[name])) for name in names},
-        calibrations,
-        images,
-    )
+    cameras = {
+        name: read_camera(_inside(path, calibration_of(name)))
+        for name in sorted({image.camera for image in images})
+    }
+    return BoardsFile(boards, world, double, cameras, images)
+
+
+def calibration_of(camera: str) -> str:
+    """The file of a camera's calibration, relative to that of the boards."""
+    return f"{camera}/{camera}.cam"
 
 
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:

@@ -100,7 +100,7 @@ def estimated(
 ) -> NetworkEstimate:
     covariance = np.zeros((6, 6)) if sigmas is None else np.diag(sigmas**2)
     double, cameras = DoubleBoard(offset, covariance), dict.fromkeys(NAMES, lens())
-    setup = BoardsFile(BOARDS, WORLD, double, cameras, {}, ())
+    setup = BoardsFile(BOARDS, WORLD, double, cameras, ())
     return estimate_network(setup, found, NetworkSettings(corner_sigma_px=sigma_px))
 
 
@@ -248,7 +248,7 @@ def test_a_boards_file_is_read(tmp_path: Path) -> None:
     assert boards.double.offset is not None
     np.testing.assert_allclose(boards.double.covariance, 1e-6 * np.eye(6))
     assert boards.images[0].image == tmp_path / "a" / "0.png"
-    assert boards.calibrations == {"a": "a/a.cam"}
+    assert list(boards.cameras) == ["a"]
 
 
 @pytest.mark.parametrize(
