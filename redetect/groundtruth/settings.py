@@ -10,7 +10,6 @@ from typing import Annotated, ClassVar, Literal
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.storage.bounds import (
-    FINITE,
     PROBABILITY,
     Bounds,
     NotNegative,
@@ -53,10 +52,6 @@ class PoseSettings(_Bounded):
     corner_floor_px: NotNegative = 0.01
     # A second solution is ruled out only if the first is this many times likelier.
     ambiguity_odds: Annotated[float, _ODDS] = 1000.0
-    floor: bool = False  # Assume that the robot is on the floor: z, roll and pitch are known.
-    floor_z_m: Annotated[float, FINITE] = 0.0  # Height of the robot's origin there (m).
-    floor_sigma_z_m: Positive = 0.01  # Standard deviation of the height (m).
-    floor_sigma_tilt_deg: Positive = 0.5  # Standard deviation of roll and pitch (deg).
     # Images whose times differ by at most this are used together (s).
     time_tolerance_s: NotNegative = 0.005
     # Speed that the robot reaches, when neighbouring frames decide between solutions (m/s).
@@ -154,8 +149,6 @@ class SyncSettings(_Bounded):
     # Bound of the drift: the clocks' rates differ by at most this share.
     largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
     segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).
-    # Refine the estimate by headings with the whole movement if the ground truth has covariances.
-    use_movement: bool = True
 
     @property
     def largest(self) -> tuple[float, float]:

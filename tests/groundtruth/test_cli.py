@@ -28,10 +28,11 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3, planar_transform
+from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3
 from redetect.landmarks import Frame, Step, write_frames
 from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
 from tests.groundtruth.markers.test_network import BOARDS, OFFSET, WORLD, shots
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 Captured = pytest.CaptureFixture[str]
@@ -139,17 +140,18 @@ def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> N
     assert (session / "poses.csv").read_bytes() == before
 
 
-def test_single_runs_and_all_options(tmp_path: Path, capsys: Captured) -> None:
+def test_files_and_settings_that_options_name(tmp_path: Path, capsys: Captured) -> None:
     session = write_session(tmp_path / "s", count=6)
     output = tmp_path / "out.csv"
     arguments = [
-        "poses", str(session / "a"), str(session / "c"), "--rig", str(session / "rig.json"),
-        "--solver", "ippe", "--loss", "cauchy", "--floor", "-o", str(output),
+        "poses", str(session), "--rig", str(session / "rig.json"),
+        "--network", str(session / "network.json"),
+        "--solver", "ippe", "--loss", "cauchy", "-o", str(output),
     ]  # fmt: skip
     assert main(arguments) == 0
     assert len(read_planar_poses(output)) == 6
     beside = json.loads((tmp_path / "out.json").read_text())
-    assert beside["settings"]["floor"] is True
+    assert beside["settings"]["loss"] == "cauchy"
     assert capsys.readouterr().err == ""
 
 
@@ -175,7 +177,7 @@ def test_sessions_that_lack_something_are_refused(
 
 def test_nothing_to_work_on_is_refused(tmp_path: Path, capsys: Captured) -> None:
     refused(["poses", str(tmp_path / "absent")], "no such folder", capsys)
-    refused(["poses", str(tmp_path)], "no detected.markers in it", capsys)
+    refused(["poses", str(tmp_path)], "no detected.markers in its folders", capsys)
     session = write_session(tmp_path / "s", count=2)
     network = json.loads((session / "network.json").read_text())
     del network["cameras"]["b"], network["covariance"]
@@ -214,42 +216,29 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     assert {row["marker"] for row in content["residuals"]} == set(rig.ids)
     refused(["rig", *runs, *options], "rig.json: exists already", capsys)
 
-    reference = tmp_path / "reference.csv"
-    times, planar = drive(25)
-    write_planar_poses(reference, PlanarPoses(times[::3], planar[::3]))
-    together = [
-        "rig", *runs, *options, "--force", "--network", str(session / "network.json"),
-        "--reference-poses", str(reference), "--ids", *map(str, rig.ids[:4]), "199",
-        "--widths", "31=0.24", "13=0.24",
-    ]  # fmt: skip
-    assert main(together) == 0
-    told = capsys.readouterr().err
-    assert "widths: marker 13 is not among those found" in told
-    assert "ids: not in any of the runs: 199" in told
+    together = ["--force", "--network", str(session / "network.json"), "--robot", str(known)]
+    assert main(["rig", *runs, *options, *together]) == 0
     found = read_rig(output)
-    assert found.ids == rig.ids[:4]
-    error = log_se3(inverse(rig.robot_from_marker[:4]) @ found.robot_from_marker)
+    assert found.ids == rig.ids
+    error = log_se3(inverse(rig.robot_from_marker) @ found.robot_from_marker)
     assert np.abs(error).max() < 6e-3
 
 
 @pytest.mark.parametrize(
-    ("options", "names"),
+    ("width", "names"),
     [
-        (["--width-m", "0"], "width_m is 0"),
-        (["--width-m", "0.2", "--widths", "31:0.2"], "'31:0.2': expected a marker and metres"),
-        (["--width-m", "0.2", "--widths", "31=inf"], "'31=inf': expected a marker and metres"),
-        (["--width-m", "0.2", "--widths", "31=0.1", "31=0.2"], "marker 31 twice"),
-        (["--width-m", "0.2", "--ids", "99"], "ids: none of these markers in any of the runs"),
-        (["--width-m", "0.2", "--dictionary", "aruco"], "no markers of the dictionary aruco"),
-        (["--width-m", "0.2", "--reference-poses", "x.csv"], "needs --network"),
+        ("0", "width_m is 0"),
+        ("0.2", "markers of the dictionaries ['aruco', 'rawseeds']: expected markers of one"),
     ],
 )
 def test_rigs_that_cannot_be_made_are_refused(
-    tmp_path: Path, capsys: Captured, options: list[str], names: str
+    tmp_path: Path, capsys: Captured, width: str, names: str
 ) -> None:
     session = write_session(tmp_path / "s", count=2)
+    detected = session / "a" / "detected.markers"
+    detected.write_text(detected.read_text().replace("rawseeds", "aruco", 1))
     output = tmp_path / "rig.json"
-    refused(["rig", str(session / "a"), *options, "-o", str(output)], names, capsys)
+    refused(["rig", str(session / "a"), "--width-m", width, "-o", str(output)], names, capsys)
     assert not output.exists()
 
 
@@ -257,7 +246,16 @@ def test_rigs_that_cannot_be_made_are_refused(
     "words",
     [
         ["fuse", "odometry.csv", "--laser", "laser.csv", "-o", "{}/fused.json"],
-        ["sync", "odometry.csv", "laser.csv", "-o", "{}/clock", "--apply", "{}/x/../clock"],
+        [
+            "fuse",
+            "odometry.csv",
+            "--laser",
+            "laser.csv",
+            "-o",
+            "{}/fused",
+            "--filtered",
+            "{}/x/../fused",
+        ],
     ],
 )
 def test_two_outputs_in_one_place_are_refused(
@@ -275,7 +273,14 @@ def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> N
 
 
 @pytest.mark.long
-def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
+def test_a_network_from_corners(
+    tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = [(view, number) for number, shot in enumerate(shots(0.1, 8)) for view in shot]
+    monkeypatch.setattr(
+        "redetect.groundtruth.commands.network.find_boards",
+        lambda image, *_: views[int(image.image.stem)][0],
+    )
     folder = tmp_path / "boards"
     folder.mkdir()
     for name in NAMES:
@@ -302,16 +307,18 @@ def test_a_network_from_corners(tmp_path: Path, capsys: Captured) -> None:
                 "camera": view.camera,
                 "board": view.board,
                 "placement": number,
-                "corners": view.corners.tolist(),
+                "image": f"{view.camera}/{index}.png",
             }
-            for number, shot in enumerate(shots(0.1, 8))
-            for view in shot
+            for index, (view, number) in enumerate(views)
         ],
     }
     (folder / "boards.json").write_text(json.dumps(content))
     (tmp_path / "out").mkdir()
     output = tmp_path / "out" / "network.json"
-    for options in ([], ["--estimate-offset", "--force"]):
+    for options in ([], ["--force"]):
+        if options:  # the offset is estimated then
+            del content["first_from_second"]
+            (folder / "boards.json").write_text(json.dumps(content))
         assert main(["network", str(folder), "-o", str(output), *options]) == 0
         assert "4 cameras" in capsys.readouterr().out
         network = read_network(output)  # finds the calibrations from where it stands

@@ -36,7 +36,7 @@ def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Ca
     path.write_bytes(content)
     said = f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
     with pytest.raises(GroundTruthError, match=re.escape(said)):
-        find_boards(BoardImage("a", "b", 0, path, None), checkerboard(5, 4, 0.1), published_camera)
+        find_boards(BoardImage("a", "b", 0, path), checkerboard(5, 4, 0.1), published_camera)
 
 
 @pytest.mark.parametrize("deep", [False, True])

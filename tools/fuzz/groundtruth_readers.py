@@ -11,7 +11,6 @@ import numpy as np
 
 from camera import CameraError
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_table
 from redetect.groundtruth.fusion.clock import read_clock, read_ptpd
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
@@ -36,7 +35,8 @@ def _npz(**arrays: object) -> bytes:
 
 _POSE_JSON = '"translation_m": [0, 0, 1], "quaternion_xyzw": [0, 0, 0, 1]'
 _RIG_JSON = (
-    f'{{"dictionary": "rawseeds", "markers": {{"3": {{"width_m": 0.1, {_POSE_JSON}MORE}}}}}}'
+    f'{{"dictionary": "rawseeds", "markers": {{"3": {{"width_m": 0.1, {_POSE_JSON},'
+    ' "sigmas": [1, 1, 1, 1, 1, 1]}}}'
 )
 _SCANNER_JSON = (
     '{"name": "a", "pose": [0, 0, 0.5], "pose_sigma": [0.1, 0.1, 0.1], "first_angle_rad": -1.5,'
@@ -50,8 +50,7 @@ _CLOCK_JSON = (
 _BOARDS_JSON = (
     '{"boards": {"world": {"columns": 3, "rows": 4, "square_m": 0.11}}, "world_from_board": {'
     + _POSE_JSON
-    + '}, "images": [{"camera": "a", "placement": 0, "board": "world",'
-    f' "corners": {[[u, v] for v in range(4) for u in range(3)]}}}]}}'
+    + '}, "images": [{"camera": "a", "placement": 0, "board": "world", "image": "a/0.png"}]}'
 )
 _DXF = (
     b"0 SECTION 2 HEADER 9 $ACADVER 1 AC1009 9 $INSUNITS 70 6 0 ENDSEC 0 SECTION 2 ENTITIES "
@@ -93,14 +92,9 @@ _SURVEY_JSON = (
     ' "b": [1, 1]}, "sigma_m": 0.01}'
 )
 _NETWORK_JSON = f'{{"cameras": {{"a": {{"calibration": "a.cam", {_POSE_JSON}}}}}}}'
-_RIGS = (
-    _RIG_JSON.replace("MORE", "").encode(),
-    _RIG_JSON.replace("MORE", ', "sigmas": [1, 1, 1, 1, 1, 1]').encode(),
-)
 
 GROUNDTRUTH_READERS: tuple[Reader, ...] = (
     _reader("poses", "laser.csv", read_planar_poses, _RAWSEEDS, b"0 1 2 3\n1 1 2 3\n"),
-    _reader("rows", "rows.csv", lambda p: read_table(p, "x,y,z"), b"1,2,3\n4 5 6\n"),
     _reader("relations", "relations.csv", read_relations,
             b"0,1,0.5,0,0,0,0,0.1\n0 1 0.5 0 0 0 0 0.1\n"),
     _reader("scans", "a.scans.csv", lambda p: read_scans(p, 3), b"t,r\n0.1,1,2,3\n0.2,1,2,80\n",
@@ -116,7 +110,7 @@ GROUNDTRUTH_READERS: tuple[Reader, ...] = (
     _reader("survey", "fiducials.json", read_survey, _SURVEY_JSON.encode(), words=JSON_WORDS),
     _reader("distances", "distances.csv", lambda p: read_distances(p, _survey()),
             b"pose,t,point,fiducial,distance_m\n0,0.5,p,q,1.25\n"),
-    _reader("rig", "rig.json", read_rig, *_RIGS, words=JSON_WORDS),
+    _reader("rig", "rig.json", read_rig, _RIG_JSON.encode(), words=JSON_WORDS),
     _reader("network", "network.json", read_network, _NETWORK_JSON.encode(), words=JSON_WORDS,
             beside="a.cam"),
     _reader("boards", "boards.json", read_boards, _BOARDS_JSON.encode(),

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
-from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.landmarks import CircleLandmark, LineLandmark
 from redetect.slam.models import disc_in_robot
+from tools.simulator.driving import planar_transform
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.uncertainty import IDENTITY
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
-from redetect.groundtruth.trajectories.transforms import planar_transform
+from tools.simulator.driving import planar_transform
 from tools.simulator.scene import Scene
 
 _RAYS_ACROSS_EDGES = 12

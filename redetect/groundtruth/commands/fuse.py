@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.storage.bounds import ABOVE_0, demand
 
 
 def perform(options: Fuse) -> int:
@@ -30,8 +29,7 @@ def perform(options: Fuse) -> int:
     files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
     if not files:
         raise GroundTruthError("neither --laser nor --camera: expected at least one ground truth")
-    demand(options, GroundTruthError, covariance_scale=ABOVE_0)
-    settings, scales = options.settings, dict(zip(named, options.covariance_scale))
+    settings = options.settings
     odometry = read_planar_poses(options.odometry)
     if options.clock is not None:
         times = read_clock(options.clock).groundtruth_times(odometry.times_s)
@@ -42,12 +40,11 @@ def perform(options: Fuse) -> int:
             raise GroundTruthError(
                 f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
             )
-        streams[name] = replace(stream, covariances=scales[name] * stream.covariances)
     fusion = fuse(odometry, streams, settings)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     document = {
         **provenance(
-            {**asdict(settings), "covariance_scale": scales},
+            settings,
             [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
         ),
         "used": fusion.used,
@@ -55,7 +52,6 @@ def perform(options: Fuse) -> int:
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "left_out": [asdict(segment) for segment in left_out],
         "covariances_repaired": fusion.repaired,
-        "measurements_repeated": fusion.repeated,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
         "rejected": [asdict(rejected) for rejected in fusion.rejected],

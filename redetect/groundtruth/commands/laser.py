@@ -100,7 +100,7 @@ def account_lines(track: LaserTrack) -> list[str]:
 def describe(
     track: LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
 ) -> dict[str, Any]:
-    """Visits and how their front was found; what each scanner's residuals say of its pose."""
+    """Sets by status, visits and how their front was found, and what residuals say of scanners."""
     segments = []
     for segment, front in sorted(track.fronts.items()):
         times = track.times_s[track.segment == segment]
@@ -123,4 +123,9 @@ def describe(
                 "left_out": out,
             }
         )
-    return {"segments": segments, "scanners": entries}
+    counts = np.bincount(track.status, minlength=len(STATUS)).tolist()
+    return {
+        "sets": {status: count for status, count in zip(STATUS, counts) if count},
+        "segments": segments,
+        "scanners": entries,
+    }

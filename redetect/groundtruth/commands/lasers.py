@@ -32,11 +32,11 @@ def perform(options: Lasers) -> int:
     """Carry the command out; returns the exit code."""
     session = options.session
     output = options.output or session / "aligned.json"
-    picture = options.picture or output.with_suffix(".png")
+    picture = output.with_suffix(".png")
     check_outputs([output, picture], options.force)
     by_hand = session / "scanners.json"
     measured = read_scanners(by_hand)
-    map_file = options.building or find_building(session)
+    map_file = find_building(session)
     building = read_building(map_file)
     empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
     alignment = align_scanners(measured, empties, building, options.settings)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from redetect.groundtruth.commands.outputs import (
     residual_figures,
 )
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards import BoardView, find_boards, read_boards
+from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
 from redetect.groundtruth.markers.network_estimation import NetworkEstimate, estimate_network
 from redetect.groundtruth.markers.session import Network, write_network
 
@@ -28,29 +27,16 @@ def perform(command: NetworkCommand) -> int:
     check_outputs((command.output,), command.force)
     boards = read_boards(command.boards)
     shots: dict[int, list[BoardView]] = {}
-    failures = []
     for image in progress(boards.images, "boards"):
         try:
             view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
             shots.setdefault(image.placement, []).append(view)
         except GroundTruthError as error:
-            failures.append(str(error))
-    for line in failures:
-        print(f"left out: {line}", file=sys.stderr)
-    double = boards.double
-    if double is not None and command.estimate_offset:
-        double = replace(double, offset=None)
-    estimate = estimate_network(
-        boards.cameras,
-        boards.boards,
-        {"world": boards.world_from_board},
-        double,
-        list(shots.values()),
-        command.settings,
-    )
+            print(f"left out: {error}", file=sys.stderr)
+    estimate = estimate_network(boards, list(shots.values()), command.settings)
     folder = command.boards if command.boards.is_dir() else command.boards.parent
     calibrations = tuple(
-        Path(os.path.relpath(folder / boards.calibrations[name], command.output.parent)).as_posix()
+        Path(os.path.relpath(folder / calibration_of(name), command.output.parent)).as_posix()
         for name in estimate.names
     )
     network = Network(

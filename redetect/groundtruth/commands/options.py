@@ -17,7 +17,7 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-from redetect.storage.bounds import MaybeInt, MaybePath, MaybeStr
+from redetect.storage.bounds import MaybeInt, MaybePath
 
 
 @dataclass(frozen=True)
@@ -29,22 +29,13 @@ class Rig:
 
     runs: Positional[tuple[Path, ...]]  # Run folders with detected.markers and a calibration.
     width_m: float  # Width of the markers' black squares (m).
-    widths: tuple[str, ...] = ()  # Other widths, as `31=0.15`.
-    # The markers that may be on the robot; by default all that were found.
-    ids: tuple[int, ...] = ()
-    # Their dictionary; by default that of the markers found, if it is one.
-    dictionary: MaybeStr = None
     # Calibration of the cameras to each other: then images of one time are used together.
     network: MaybePath = None
     # The marker whose frame is the robot's; by default the one seen best.
     reference: MaybeInt = None
     robot: MaybePath = None  # A rig file with the pose of one or more markers in the robot's frame.
-    # Known poses (t, x, y, theta) of the robot standing level, which define its frame; needs
-    # --network.
-    reference_poses: MaybePath = None
-    output: Annotated[Path, arg(aliases=["-o"])] = Path("rig.json")  # The rig file to write.
-    # The picture to write; by default the output's name with the ending .png.
-    picture: MaybePath = None
+    # The rig file to write, and a picture beside it (.png).
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("rig.json")
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[RigSettings] = field(default_factory=RigSettings)
 
@@ -57,8 +48,6 @@ class Network:
     """
 
     boards: Positional[Path]  # A boards.json, or its folder.
-    # Estimate how the double board's halves lie to each other, whatever the file says.
-    estimate_offset: bool = False
     # The network file to write. It names the calibrations relative to its own folder.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("network.json")
     force: bool = False  # Replace an existing file.
@@ -72,9 +61,8 @@ class Poses:
     Example: groundtruth poses SESSION -o poses.csv --report report.jsonl
     """
 
-    # A session (a folder with a run folder per camera), or run folders, whose names are those of
-    # the network's cameras.
-    paths: Positional[tuple[Path, ...]]
+    # A folder with a run folder per camera, by the names of the network's cameras.
+    session: Positional[Path]
     rig: MaybePath = None  # Where the markers are on the robot; by default rig.json in the session.
     # Where the cameras are in the world; by default network.json in the session.
     network: MaybePath = None
@@ -123,10 +111,8 @@ class Lasers:
     # Folder with scanners.json (poses measured by hand), the scans of the empty area and
     # building.csv or building.dxf.
     session: Positional[Path]
-    building: MaybePath = None  # The building map, if it is not the one in the session.
-    # The picture to write; by default the output's name with the ending .png.
-    picture: MaybePath = None
-    # The scanners file to write; by default aligned.json in the session.
+    # The scanners file to write, and a picture beside it (.png); by default aligned.json in the
+    # session.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[AlignmentSettings] = field(default_factory=AlignmentSettings)
@@ -161,7 +147,6 @@ class Sync:
     # Poses (t, x, y, theta, and perhaps 9 of covariance) on the ground truth's clock.
     groundtruth: Positional[Path]
     ptpd: MaybePath = None  # Log of ptpd, to compare with.
-    apply: MaybePath = None  # Write the odometry on the ground truth's clock to this file.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("clock.json")  # The clock file to write.
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[SyncSettings] = field(default_factory=SyncSettings)
@@ -179,8 +164,6 @@ class Fuse:
     camera: MaybePath = None  # Ground truth from the markers, in the same columns.
     # Output of `groundtruth sync`; without it all clocks are assumed to be one.
     clock: MaybePath = None
-    # Factors on the covariances of laser and camera.
-    covariance_scale: tuple[float, float] = (1.0, 1.0)
     # Leave each segment of the ground truth between two others out as well, predict it, and print
     # how far off the prediction is (pauses of more than 5 s begin another segment).
     leave_out: bool = False

@@ -14,7 +14,6 @@ from redetect.groundtruth.commands.outputs import check_outputs, progress, prove
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.session import (
-    RIG_NAME,
     MarkerFrame,
     Network,
     find_runs,
@@ -31,10 +30,10 @@ from redetect.storage.command_line import EXIT_ERROR
 
 def perform(command: Poses) -> int:
     """Carry out ``groundtruth poses``; returns the exit code: 1 without a single pose."""
-    runs, network_path = find_runs(command.paths, command.network)
-    folder = network_path.parent if command.network is None else command.paths[0]
-    rig_path = command.rig if command.rig is not None else folder / RIG_NAME
-    output = command.output if command.output is not None else folder / "poses.csv"
+    runs = find_runs(command.session)
+    network_path = command.network or command.session / "network.json"
+    rig_path = command.rig or command.session / "rig.json"
+    output = command.output or command.session / "poses.csv"
     settings_path = output.with_suffix(".json")
     check_outputs((output, settings_path, command.tum, command.report), command.force)
     network = read_network(network_path)

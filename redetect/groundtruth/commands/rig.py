@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +18,7 @@ from redetect.groundtruth.commands.outputs import (
 )
 from redetect.groundtruth.commands.poses import read_all_frames
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.rig_estimation import (
-    RigEstimate,
-    estimate_rig,
-    rig_by_known_markers,
-    rig_by_reference_poses,
-)
+from redetect.groundtruth.markers.rig_estimation import estimate_rig
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
     Network,
@@ -36,24 +29,27 @@ from redetect.groundtruth.markers.session import (
     write_rig,
 )
 from redetect.groundtruth.report.pictures import draw_rig
-from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.storage import write_bytes
+from redetect.storage.bounds import ABOVE_0, demand
 
 
 def perform(command: RigCommand) -> int:
     """Carry out ``groundtruth rig``; returns the exit code."""
-    if command.robot is not None and command.reference_poses is not None:
-        raise GroundTruthError("--robot and --reference-poses both define the robot's frame")
-    if command.reference_poses is not None and command.network is None:
-        raise GroundTruthError("--reference-poses needs --network: where the cameras are")
-    picture = command.picture if command.picture is not None else command.output.with_suffix(".png")
+    demand(command, GroundTruthError, width_m=ABOVE_0)
+    picture = command.output.with_suffix(".png")
     check_outputs((command.output, picture), command.force)
     network, groups = _input(command)
-    dictionary, widths = _markers(command, groups)
     estimate = estimate_rig(
-        groups, network, dictionary, widths, command.settings, reference=command.reference
+        groups,
+        network,
+        command.width_m,
+        command.settings,
+        reference=command.reference,
+        known=None if command.robot is None else read_rig(command.robot),
     )
-    estimate, frame = _in_robot_frame(command, estimate)
+    frame = f"marker {estimate.reference}"
+    if command.robot is not None:
+        frame = f"robot, by {command.robot.name}"
     rig = estimate.rig
     table = [
         {
@@ -123,69 +119,3 @@ def _calibration(run: Path) -> Path:
     if found is None:
         raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
     return found
-
-
-def _markers(
-    command: RigCommand, groups: Sequence[Sequence[MarkerFrame]]
-) -> tuple[str, dict[int, float]]:
-    """The dictionary, and the widths of the markers that may be on the robot."""
-    markers = [marker for group in groups for frame in group for marker in frame.markers]
-    dictionaries = sorted({marker.dictionary for marker in markers})
-    if command.dictionary is None and len(dictionaries) != 1:
-        raise GroundTruthError(
-            f"markers of the dictionaries {dictionaries}: name the robot's by --dictionary"
-        )
-    dictionary = command.dictionary if command.dictionary is not None else dictionaries[0]
-    found = {marker.id for marker in markers if marker.dictionary == dictionary}
-    ids = sorted(found & set(command.ids)) if command.ids else sorted(found)
-    if not found:
-        raise GroundTruthError(f"no markers of the dictionary {dictionary} in any of the runs")
-    if not ids:
-        raise GroundTruthError(
-            "ids: none of these markers in any of the runs: "
-            f"expected some of {_listed(sorted(found))}"
-        )
-    if missing := sorted(set(command.ids or ()) - found):
-        print(f"warning: ids: not in any of the runs: {_listed(missing)}", file=sys.stderr)
-    if not (np.isfinite(command.width_m) and command.width_m > 0.0):
-        raise GroundTruthError(f"width_m is {command.width_m:g}: expected metres above 0")
-    widths = dict.fromkeys(ids, command.width_m)
-    named: dict[int, float] = {}
-    for word in command.widths:
-        marker, _, width = word.partition("=")
-        try:
-            number, metres = int(marker), float(width)
-        except ValueError:
-            number, metres = -1, float("nan")
-        if number < 0 or not (np.isfinite(metres) and metres > 0.0):
-            raise GroundTruthError(f"widths: {word!r}: expected a marker and metres, as 31=0.15")
-        if number in named:
-            raise GroundTruthError(f"widths: marker {number} twice: expected one width")
-        named[number] = metres
-    for number, metres in named.items():
-        if number in widths:
-            widths[number] = metres
-        else:
-            print(
-                f"warning: widths: marker {number} is not among those found ({_listed(ids)}): its "
-                "width counts for none",
-                file=sys.stderr,
-            )
-    return dictionary, widths
-
-
-def _listed(ids: Sequence[int]) -> str:
-    return ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
-
-
-def _in_robot_frame(command: RigCommand, estimate: RigEstimate) -> tuple[RigEstimate, str]:
-    """The estimate in the robot's frame, and what that is."""
-    if command.robot is not None:
-        known = read_rig(command.robot)
-        moved = rig_by_known_markers(estimate, known, command.settings)
-        return moved, f"robot, by {command.robot.name}"
-    if command.reference_poses is not None:
-        reference = read_planar_poses(command.reference_poses)
-        moved, used = rig_by_reference_poses(estimate, reference, command.settings)
-        return moved, f"robot, by {used} poses of {command.reference_poses.name}"
-    return estimate, f"marker {estimate.reference}"

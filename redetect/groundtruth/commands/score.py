@@ -35,23 +35,8 @@ def perform(command: Score) -> int:
     if alignment is not None:
         poses = moved_poses(poses, alignment)
     score = score_poses(poses, truth, unmatched)
-    print(f"poses             {score.poses} ({score.unmatched} without the other at their time)")
-    print(
-        f"position error    mean {1e3 * score.position_mean_m:.2f} mm, sigma "
-        f"{1e3 * score.position_sigma_m:.2f}, rmse {1e3 * score.position_rmse_m:.2f}, "
-        f"max {1e3 * score.position_max_m:.2f}"
-    )
-    print(
-        f"angle error       mean {math.degrees(score.angle_mean_rad):.3f} deg, sigma "
-        f"{math.degrees(score.angle_sigma_rad):.3f}, max {math.degrees(score.angle_max_rad):.3f}"
-    )
-    if score.normalised:
-        print(
-            f"normalised error squared / dof  {score.normalised_error:.3f} "
-            f"({score.normalised} poses with a covariance that can be inverted)"
-        )
-    else:
-        print("normalised error squared / dof  none: no covariance that can be inverted")
+    print(f"poses              {score.poses} ({score.unmatched} without the other at their time)")
+    print(*score.lines(), sep="\n")
     relative = {}
     if relations is not None:
         relative["relations"] = score_relations(solution, relations, command.largest_gap_s)

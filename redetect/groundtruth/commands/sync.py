@@ -18,18 +18,14 @@ from redetect.groundtruth.fusion.clock import (
     read_ptpd,
 )
 from redetect.groundtruth.fusion.sync import synchronise
-from redetect.groundtruth.trajectories.streams import (
-    PlanarPoses,
-    read_planar_poses,
-    write_planar_poses,
-)
+from redetect.groundtruth.trajectories.streams import read_planar_poses
 
 _CONFIDENCE = 1.959964
 
 
 def perform(options: Sync) -> int:
     """Carry out ``groundtruth sync``; returns the exit code: 1 if no segment could be aligned."""
-    check_outputs([options.output, options.apply], options.force)
+    check_outputs([options.output], options.force)
     odometry = read_planar_poses(options.odometry)
     truth = read_planar_poses(options.groundtruth)
     log = None if options.ptpd is None else read_ptpd(options.ptpd)
@@ -49,11 +45,6 @@ def perform(options: Sync) -> int:
         document["ptpd"] = compare_with_ptpd(model, determined, log)
         print(_ptpd_line(document["ptpd"]))
     write_json(options.output, document, overwrite=options.force)
-    if options.apply is not None:
-        aligned = PlanarPoses(
-            model.groundtruth_times(odometry.times_s), odometry.poses, odometry.covariances
-        )
-        write_planar_poses(options.apply, aligned, overwrite=options.force)
     return 0
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -204,9 +204,8 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
 _LARGEST_FILE_BYTES = 1 << 28
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _OFFSET_MESSAGE = re.compile(
-    r"offset from master:\s*([+-]?[0-9]{1,12})\s*s(?:ec)?\s+([+-]?[0-9]{1,12})\s*n"
+    rf"offset from master:\s*({_NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
 )
-_OFFSET_SECONDS = re.compile(rf"offset from master:\s*({_NUMBER})\s*(?:s\b|$)")
 _DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({_NUMBER})")
 _LEADING_TIME = re.compile(rf"^\s*\[?({_NUMBER})\]?[\s,:]")
 _CALENDAR = (
@@ -235,7 +234,7 @@ def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
     the master.
     """
-    rows = list(_rows(Path(path)))
+    rows = _rows(Path(path))
     if not rows:
         raise GroundTruthError(
             f"{path}: no line reports an offset from master: expected a log of ptpd"
@@ -244,49 +243,37 @@ def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
 
 
-def _rows(path: Path) -> Iterator[tuple[float, float, float]]:
+def _rows(path: Path) -> list[list[float]]:
     """Time, offset (s) and drift (ppb) of each report."""
+    rows: list[list[float]] = []
     columns: dict[str, int] = {}
-    pending: tuple[float, float] | None = None
     content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)
     for line in content.decode(errors="replace").splitlines():
         lowered = line.lower()
-        message = _OFFSET_MESSAGE.search(lowered)
-        seconds = _OFFSET_SECONDS.search(lowered)
-        drift = _DRIFT_MESSAGE.search(lowered)
-        if message or seconds:
-            if pending is not None:
-                yield (*pending, math.nan)
-            if message:
-                offset = int(message[1]) + 1e-9 * int(message[2])
-            else:
-                assert seconds is not None
-                offset = float(seconds[1])
-            leading = _LEADING_TIME.match(line)
-            pending = (float(leading[1]) if leading else math.nan, offset)
-        elif drift:
-            if pending is not None:
-                yield (*pending, float(drift[1]))
-            pending = None
+        if message := _OFFSET_MESSAGE.search(lowered):
+            time = _LEADING_TIME.match(line)
+            offset = float(message[1]) + 1e-9 * int(message[2] or 0)
+            rows.append([float(time[1]) if time else math.nan, offset, math.nan])
+        elif drift := _DRIFT_MESSAGE.search(lowered):
+            # It follows the offset of the same report.
+            if rows and math.isnan(rows[-1][2]):
+                rows[-1][2] = float(drift[1])
         elif _OFFSET in lowered and "," in lowered:
             names = [name.strip(" #\t") for name in lowered.split(",")]
             found = {name: k for k, name in enumerate(names)}
             columns = found if _OFFSET in found else {}
-        elif columns:
-            row = _table_row(line, columns)
-            if row is not None:
-                yield row
-    if pending is not None:
-        yield (*pending, math.nan)
+        elif columns and (row := _table_row(line, columns)) is not None:
+            rows.append(row)
+    return rows
 
 
-def _table_row(line: str, columns: dict[str, int]) -> tuple[float, float, float] | None:
+def _table_row(line: str, columns: dict[str, int]) -> list[float] | None:
     """A row of the comma-separated layout; None for states in which there is no offset."""
     words = [word.strip() for word in line.split(",")]
     named = {name: words[at] for name, at in columns.items() if at < len(words)}
     offset = _number(named.get(_OFFSET, ""))
     drift = _number(named.get("observed drift", named.get("drift", "")))
-    return None if math.isnan(offset) else (_time(named.get("timestamp", "")), offset, drift)
+    return None if math.isnan(offset) else [_time(named.get("timestamp", "")), offset, drift]
 
 
 def _number(word: str) -> float:

@@ -187,8 +187,6 @@ class Fusion:
     # Covariances that were not positive definite as written, by stream; they were raised by their
     # file's rounding.
     repaired: dict[str, int]
-    # Rows that were the row before once more, by stream; they counted once.
-    repeated: dict[str, int]
     # Between which times odometry was not written, within the poses' time. What may have been
     # driven there besides, at the rates at which the robot usually goes, makes it less certain.
     pauses_s: tuple[tuple[float, float], ...]
@@ -269,7 +267,6 @@ def fuse(
         ),
         localisation=localisation,
         repaired=problem.repaired,
-        repeated=problem.repeated,
         pauses_s=tuple(
             (begin, end)
             for begin, end in pauses_of(last_of_each_time(odometry))

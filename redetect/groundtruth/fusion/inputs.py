@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.settings import FuseSettings
-from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+from redetect.groundtruth.trajectories.streams import (
+    RAWSEEDS_ROUNDING,
+    PlanarPoses,
+    last_of_each_time,
+)
 from redetect.plane import between, log_motion
 
 
@@ -137,22 +141,20 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
 
 def gather(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
-) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int], dict[str, int]]:
+) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
     """All measurements within the odometry's time, in order, with covariances that can be used.
 
-    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
-    stream how many covariances had to be raised and how many rows repeat the row before to the last
-    digit: these are left out, since one measurement must not count twice.
+    Of several poses of one time in a stream, the last counts. Returns each measurement's stream,
+    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream how many covariances had to be
+    raised.
     """
     found = []
-    repaired, repeated = {}, {}
-    for name, stream in streams.items():
+    repaired = {}
+    for name, all_poses in streams.items():
+        stream = last_of_each_time(all_poses)
         if stream.covariances is None:
             raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
         inside = stream.during(odometry.times_s[0], odometry.times_s[-1])
-        again = inside & _repeats(stream, stream.covariances)
-        repeated[name] = int(np.count_nonzero(again))
-        inside &= ~again
         usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
         names = np.full(len(usable), name)
         found.append((names, stream.times_s[inside], stream.poses[inside], usable))
@@ -163,14 +165,7 @@ def gather(
             f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
         )
     order = np.argsort(times, kind="stable")
-    return names[order], times[order], poses[order], covariances[order], repaired, repeated
-
-
-def _repeats(stream: PlanarPoses, covariances: FloatArray) -> BoolArray:
-    """(N,) which rows are those before them."""
-    rows = np.column_stack([stream.times_s, stream.poses, covariances.reshape(len(stream), 9)])
-    same = np.all(rows[1:] == rows[:-1], axis=1)
-    return np.concatenate([np.zeros(min(len(rows), 1), dtype=np.bool_), same])
+    return names[order], times[order], poses[order], covariances[order], repaired
 
 
 def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:

@@ -234,6 +234,15 @@ class FilterHistory(NamedTuple):
     transitions: FloatArray
 
 
+class MeasurementAccount(NamedTuple):
+    """How a filter used M measurements at N nodes."""
+
+    squared: FloatArray  # (M,): squared normalised innovations
+    accepted: BoolArray  # (M,)
+    restarted: NDArray[np.int8]  # (N,): whether the filter began anew at a node, and why
+    surprise: float  # Minus twice the logarithm of the likelihood of the accepted innovations
+
+
 def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
     """A history to be filled; of no nodes where none is wanted."""
     states, spreads = (nodes, state), (nodes, state, state)
@@ -261,15 +270,13 @@ def filter_forward(
     gating: Gating,
     points: FloatArray,
     history: FilterHistory,
-) -> tuple[FloatArray, BoolArray, NDArray[np.int8], float]:
+) -> MeasurementAccount:
     """Filter N nodes forward.
 
     `start`, `start_covariance` (6,), (6, 6): before the measurements at the first node. `points`
     (N, 6): states at which each movement away from a node is linearised, with headings that go on
     without jumps; measured headings are assumed to be within half a turn of them. Of length 1: at
-    the filter's own. `history`: filled, unless it is of no nodes. Returns `squared_innovations`
-    (M,): normalised. `accepted` (M,). `restarted` (N,): whether the filter began anew at a node,
-    and why. `surprise`: minus twice the logarithm of the likelihood of the accepted innovations.
+    the filter's own. `history`: filled, unless it is of no nodes.
     """
     controls, nodes = odometry.controls, measured.nodes
     kept = len(history.predicted) > 0
@@ -348,7 +355,7 @@ def filter_forward(
             m += 1
         if kept:
             keep(filtered, filtered_covariance, k, x, p)
-    return squared_innovations, accepted, restarted, surprise
+    return MeasurementAccount(squared_innovations, accepted, restarted, surprise)
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:

@@ -93,14 +93,13 @@ class LocalisationProblem(NamedTuple):
     gate: float  # Largest squared normalised innovation
 
 
-def localisation_problem(
-    odometry: PlanarPoses, measured: PlanarPoses, gate: float
-) -> LocalisationProblem:
-    """Align odometry with two or more measured poses within its time.
+def localisation_problem(odometry: PlanarPoses, problem: MovementProblem) -> LocalisationProblem:
+    """Align odometry, that of the problem, with the two or more poses measured there.
 
-    `odometry` has no two samples of one time; `gate` is the largest squared normalised innovation.
+    `odometry` has no two samples of one time.
     """
-    assert measured.covariances is not None
+    _, poses, covariances = problem.measured
+    measured = PlanarPoses(problem.measured_s, poses, covariances)
     own, _ = interpolate_poses(odometry, measured.times_s)
     usual = np.ones(len(measured), dtype=np.bool_)
     for _ in range(_TRIMMINGS):
@@ -115,11 +114,9 @@ def localisation_problem(
     centroid = beside.poses[:, :2].mean(axis=0)
     return LocalisationProblem(
         moved_poses(odometry, motion),
-        Differences(
-            measured.times_s, differences, measured.covariances, beside.poses[:, :2] - centroid
-        ),
+        Differences(measured.times_s, differences, covariances, beside.poses[:, :2] - centroid),
         centroid,
-        gate,
+        problem.gate(),
     )
 
 
@@ -277,14 +274,10 @@ def as_localisation(
     thin = problem.thinned(_SPACING_S)
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None
-    errors, surprise = learn_localisation(_beside(odometry, thin))
+    errors, surprise = learn_localisation(localisation_problem(odometry, thin))
     if not surprise < thin.account(noise).surprise - _CLEAR_LEAD:
         return None
-    poses, squared, offset = smooth_localisation(_beside(odometry, problem), errors, times_s)
+    poses, squared, offset = smooth_localisation(
+        localisation_problem(odometry, problem), errors, times_s
+    )
     return poses, squared, LocalisationErrors(*(float(error) for error in (*errors, offset)))
-
-
-def _beside(odometry: PlanarPoses, problem: MovementProblem) -> LocalisationProblem:
-    _, poses, covariances = problem.measured
-    measured = PlanarPoses(problem.measured_s, poses, covariances)
-    return localisation_problem(odometry, measured, problem.gate())

@@ -36,6 +36,7 @@ from redetect.groundtruth.fusion.kernels import (
     FilterHistory,
     Gating,
     MeasuredPoses,
+    MeasurementAccount,
     Odometry,
     empty_history,
     filter_forward,
@@ -130,16 +131,14 @@ def _likeliest(
     )
     history = empty_history(count)
     for _ in range(_MOST_STEPS):
-        squared, _, _, surprise = filter_forward(
-            odometry, begin, spread, measured, _no_gate(count), path, history
-        )
+        account = filter_forward(odometry, begin, spread, measured, _no_gate(count), path, history)
         better, _ = smooth_backward(history)
         moved = float(np.max(np.abs(better[:, 2] - path[:, 2])))
         path = better
         if not moved < 10.0 * math.pi:
             return None
         if moved < _SETTLED_RAD:
-            return float(surprise), float(squared[0]), path
+            return account.surprise, float(account.squared[0]), path
     return None
 
 
@@ -184,17 +183,6 @@ _RELINEARISATIONS_WHERE_LOST = 3
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurementAccount:
-    """How the measurements were used."""
-
-    squared: FloatArray  # (M,): squared normalised innovations
-    accepted: BoolArray  # (M,)
-    # (N,): whether the filter was restarted at a node, and why (see `kernels`)
-    restarted: NDArray[np.int8]
-    surprise: float  # Minus twice the logarithm of their likelihood
-
-
-@dataclass(frozen=True, eq=False)
 class MovementProblem:
     """Odometry and measured poses on common nodes, whatever odometry errs at random."""
 
@@ -208,7 +196,6 @@ class MovementProblem:
     measured: MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     repaired: dict[str, int]  # Covariances that had to be raised, by stream
-    repeated: dict[str, int]  # Rows that repeated the row before and were left out, by stream
     settings: FuseSettings
 
     @property
@@ -416,22 +403,20 @@ class MovementProblem:
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> MeasurementAccount:
         means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
-        return MeasurementAccount(
-            *filter_forward(
-                Odometry(self.controls, variances),
-                np.concatenate([self.measured.poses[0], means]),
-                np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
-                self.measured,
-                Gating(
-                    self.gate(),
-                    _RESTART_AFTER,
-                    _RESTART_VARIANCES,
-                    _LOST_VARIANCE if points is None else math.inf,
-                    np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
-                ),
-                np.empty((1, STATE)) if points is None else points,
-                empty_history(0) if history is None else history,
-            )
+        return filter_forward(
+            Odometry(self.controls, variances),
+            np.concatenate([self.measured.poses[0], means]),
+            np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
+            self.measured,
+            Gating(
+                self.gate(),
+                _RESTART_AFTER,
+                _RESTART_VARIANCES,
+                _LOST_VARIANCE if points is None else math.inf,
+                np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
+            ),
+            np.empty((1, STATE)) if points is None else points,
+            empty_history(0) if history is None else history,
         )
 
 
@@ -442,7 +427,7 @@ def movement_problem(
 
     From the first measurement within the odometry's time to the last, on the measurements' clock.
     """
-    names, times, measured, covariances, repaired, repeated = gather(odometry, streams)
+    names, times, measured, covariances, repaired = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
@@ -456,6 +441,5 @@ def movement_problem(
         ),
         streams=names,
         repaired=repaired,
-        repeated=repeated,
         settings=settings,
     )

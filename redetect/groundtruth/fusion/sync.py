@@ -104,8 +104,6 @@ def synchronise(
     by_movement: list[ClockSegment] = []
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
         segment = groundtruth.only(part)
-        if not bounds.use_movement:
-            segment = replace(segment, covariances=None)
         own = _segment(odometry, segment, bounds, _MOST_JUMPS)
         refined = refine_by_movement(own, odometry, segment, bounds.largest)
         if len(refined) > 1 and not _differ(refined):

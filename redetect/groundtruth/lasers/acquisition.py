@@ -14,10 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.cluster.hierarchy import fclusterdata
 from scipy.linalg import block_diag
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -332,13 +330,9 @@ def acquire(
 
 def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
     """Where the robot's middle might be: the middles of heaps, those of parts of large ones."""
-    pairs = cKDTree(points).query_pairs(settings.link_m, output_type="ndarray")
-    # SciPy before 1.12 does not support graphs with 64-bit indices.
-    ends = (pairs[:, 0].astype(np.int32), pairs[:, 1].astype(np.int32))
-    graph = coo_array((np.ones(len(pairs), dtype=np.int8), ends), (len(points),) * 2)
-    count, label = connected_components(graph, directed=False)
+    label = fclusterdata(points, settings.link_m, criterion="distance", method="single")
     places: list[FloatArray] = []
-    for k in range(count):
+    for k in np.unique(label):
         heap = points[label == k]
         if len(heap) < settings.least_readings:
             continue

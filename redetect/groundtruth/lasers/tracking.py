@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -319,16 +320,14 @@ class Tracker:
 
         The residuals of half a second; one set's alone would say too little.
         """
-        scale = np.ones(len(good))
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
-        chi2 = self.track.chi2[good] * freedom
-        for i in range(len(good)):
-            part = slice(max(0, i - 18), i + 19)
-            total = float(freedom[part].sum())
-            ratio = float(chi2[part].sum()) / total
-            # Within its own scatter a ratio above 1 is none.
-            scale[i] = ratio if ratio > 1.0 + 4.0 * math.sqrt(2.0 / total) else 1.0
-        return scale
+        total, squared = (
+            convolve1d(values, np.ones(37), mode="constant")
+            for values in (freedom, self.track.chi2[good] * freedom)
+        )
+        # Within its own scatter a ratio above 1 is none.
+        ratio = squared / total
+        return np.where(ratio > 1.0 + 4.0 * np.sqrt(2.0 / total), ratio, 1.0)
 
     def _correct(self) -> None:
         """Corrections of the scanners' poses, by all residuals."""

@@ -10,8 +10,7 @@
 
 ``first`` and ``second`` are the double board; ``first_from_second`` may be absent, then it is
 estimated, and may have ``sigmas`` or a ``covariance``. Images of one placement were taken without
-moving the board. Instead of ``image`` there may be ``corners``, found by other means. A camera's
-calibration is ``<camera>/<camera>.cam`` beside the file.
+moving the board. A camera's calibration is ``<camera>/<camera>.cam`` beside the file.
 
 A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
 right, y up, z out of the print, held so that the square in its top left corner is black. With one
@@ -88,8 +87,7 @@ class BoardImage:
     camera: str
     board: str
     placement: int
-    image: Path | None
-    corners: FloatArray | None
+    image: Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,6 @@ class BoardsFile:
     world_from_board: FloatArray  # (4, 4)
     double: DoubleBoard | None
     cameras: dict[str, Camera]
-    calibrations: dict[str, str]  # Their files, relative to the folder
     images: tuple[BoardImage, ...]
 
 
@@ -127,16 +124,16 @@ def read_boards(path: Path) -> BoardsFile:
             entry = content.inner("first_from_second")
             double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))
     images = tuple(_image(row, path, boards) for row in content.rows("images"))
-    names = sorted({image.camera for image in images})
-    calibrations = {name: f"{name}/{name}.cam" for name in names}
-    return BoardsFile(
-        boards,
-        world,
-        double,
-        {name: read_camera(_inside(path, calibrations[name])) for name in names},
-        calibrations,
-        images,
-    )
+    cameras = {
+        name: read_camera(_inside(path, calibration_of(name)))
+        for name in sorted({image.camera for image in images})
+    }
+    return BoardsFile(boards, world, double, cameras, images)
+
+
+def calibration_of(camera: str) -> str:
+    """The file of a camera's calibration, relative to that of the boards."""
+    return f"{camera}/{camera}.cam"
 
 
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
@@ -145,9 +142,6 @@ def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     Raises `GroundTruthError` if the image cannot be read, has another size than the calibration, or
     shows no board.
     """
-    if image.corners is not None:
-        return BoardView(image.camera, image.board, image.corners)
-    assert image.image is not None
     try:
         grey = read_grey(image.image)
     except CalibrationError as error:
@@ -186,11 +180,5 @@ def _image(row: JsonObject, path: Path, boards: dict[str, Board]) -> BoardImage:
     camera, board = row.text("camera", "its name"), row.text("board")
     if board not in boards:
         raise row.wrong("board", f"one of {sorted(boards)}")
-    if ("image" in row) == ("corners" in row):
-        raise GroundTruthError(f"{row.place}: expected either image or corners")
-    placement = row.whole("placement")
-    if "image" in row:
-        image = _inside(path, row.text("image", "a file's name"))
-        return BoardImage(camera, board, placement, image, None)
-    corners = row.numbers("corners", boards[board].rows * boards[board].columns, 2)
-    return BoardImage(camera, board, placement, None, corners)
+    image = _inside(path, row.text("image", "a file's name"))
+    return BoardImage(camera, board, row.whole("placement"), image)

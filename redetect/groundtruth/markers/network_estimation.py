@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera import Camera
-from camera.boards.board import Board
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
@@ -22,7 +20,7 @@ from redetect.groundtruth.markers.adjustment import (
     PosePrior,
     adjust_bundle,
 )
-from redetect.groundtruth.markers.boards import FIRST, SECOND, BoardView, DoubleBoard
+from redetect.groundtruth.markers.boards import FIRST, SECOND, WORLD, BoardsFile, BoardView
 from redetect.groundtruth.markers.pairs import chained_poses, spanning_tree
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
@@ -42,48 +40,40 @@ class NetworkEstimate:
 
 
 def estimate_network(
-    cameras: Mapping[str, Camera],
-    boards: Mapping[str, Board],
-    world_from_board: Mapping[str, FloatArray],
-    double: DoubleBoard | None,
-    shots: Sequence[Sequence[BoardView]],
-    settings: NetworkSettings,
+    setup: BoardsFile, shots: Sequence[Sequence[BoardView]], settings: NetworkSettings
 ) -> NetworkEstimate:
     """Estimate where the cameras are.
 
     Parameters
     ----------
-    world_from_board : mapping of str to (4, 4) array
-        Boards that are fixed in the world.
-    double : DoubleBoard or None
-        None if all cameras see boards of the world.
+    setup : BoardsFile
+        The cameras, the boards, and where these are; its images are not read.
     shots : sequence of sequences of BoardView
-        Markers seen at one time.
+        Boards seen at one time.
 
     Raises
     ------
     GroundTruthError
         If a camera is not connected to the world, or the offset cannot be estimated.
     """
-    names = tuple(sorted(cameras))
-    seen = [[(view, _camera_from_board(view, cameras, boards)) for view in shot] for shot in shots]
+    names = tuple(sorted(setup.cameras))
+    seen = [[(view, _camera_from_board(view, setup)) for view in shot] for shot in shots]
     offset = None
-    parts = dict(world_from_board)
-    if double is not None:
-        offset = double.offset if double.offset is not None else _estimated_offset(seen)
-        parts[FIRST], parts[SECOND] = np.eye(4), offset
-    poses, bodies = _chained(names, seen, world_from_board, parts)
-    bundle, views = _bundle(
-        cameras, boards, world_from_board, parts, double, seen, (poses, bodies), settings
-    )
+    parts = {WORLD: setup.world_from_board}
+    if setup.double is not None:
+        offset = setup.double.offset
+        offset = _estimated_offset(seen) if offset is None else offset
+        parts |= {FIRST: np.eye(4), SECOND: offset}
+    poses, bodies = _chained(names, seen, parts)
+    bundle, views = _bundle(setup, parts, seen, poses, bodies, settings.corner_sigma_px)
     try:
         adjusted = adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
         )
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
-    if double is not None:
-        offset = adjusted.bundle.body_from_part[sorted(parts).index(SECOND)]
+    if setup.double is not None:
+        offset = adjusted.bundle.body_from_part[list(parts).index(SECOND)]
     return NetworkEstimate(
         names,
         adjusted.bundle.world_from_camera,
@@ -97,13 +87,10 @@ def estimate_network(
 _Seen = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
-def _camera_from_board(
-    view: BoardView, cameras: Mapping[str, Camera], boards: Mapping[str, Board]
-) -> FloatArray:
+def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:
+    points = setup.boards[view.board].points
     try:
-        return solve_camera(
-            cameras[view.camera], boards[view.board].points, view.corners, "iterative"
-        )[0]
+        return solve_camera(setup.cameras[view.camera], points, view.corners, "iterative")[0]
     except GeometryError as error:
         raise GroundTruthError(f"camera {view.camera}, board {view.board}: {error}") from None
 
@@ -148,10 +135,7 @@ def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _chained(
-    names: tuple[str, ...],
-    seen: _Seen,
-    world_from_board: Mapping[str, FloatArray],
-    parts: Mapping[str, FloatArray],
+    names: tuple[str, ...], seen: _Seen, parts: Mapping[str, FloatArray]
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
     """Cameras (C, 4, 4), and the double board of each shot, in the world; from camera to camera."""
     # Estimates of one frame in another: the world is number 0, the cameras follow.
@@ -160,9 +144,8 @@ def _chained(
     for number, shot in enumerate(seen):
         for view, pose in shot:
             camera = 1 + names.index(view.camera)
-            if view.board in world_from_board:
-                world_from_camera = world_from_board[view.board] @ inverse(pose)
-                estimates.setdefault((0, camera), []).append(world_from_camera)
+            if view.board == WORLD:
+                estimates.setdefault((0, camera), []).append(parts[WORLD] @ inverse(pose))
             else:
                 here = held.setdefault(number, [])
                 here.append((camera, pose @ inverse(parts[view.board])))
@@ -193,23 +176,21 @@ def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
 
 
 def _bundle(
-    cameras: Mapping[str, Camera],
-    boards: Mapping[str, Board],
-    world_from_board: Mapping[str, FloatArray],
+    setup: BoardsFile,
     parts: Mapping[str, FloatArray],
-    double: DoubleBoard | None,
     seen: _Seen,
-    placed: tuple[FloatArray, Mapping[int, FloatArray]],
-    settings: NetworkSettings,
+    poses: FloatArray,
+    bodies: Mapping[int, FloatArray],
+    corner_sigma_px: float,
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
-    names, (poses, bodies) = sorted(cameras), placed
-    order = sorted(parts)
-    body_index = {number: 1 + i for i, number in enumerate(sorted(bodies))}
+    """The bundle of all boards seen; its first body is the world, the others the double boards."""
+    names, order = sorted(setup.cameras), list(parts)
+    body_index = {number: 1 + i for i, number in enumerate(bodies)}
     views = [view for shot in seen for view, _ in shot]
     rows = [
         (
             names.index(view.camera),
-            0 if view.board in world_from_board else body_index[number],
+            0 if view.board == WORLD else body_index[number],
             order.index(view.board),
         )
         for number, shot in enumerate(seen)
@@ -221,24 +202,24 @@ def _bundle(
         camera,
         body,
         part,
-        np.concatenate([boards[view.board].points for view in views]),
+        np.concatenate([setup.boards[view.board].points for view in views]),
         np.concatenate([view.corners for view in views]),
-        np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
+        np.tile(corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
-    free = np.arange(len(names) + len(order) + 1 + len(bodies)) != len(names) + len(order)
-    free[len(names) : len(names) + len(order)] = False
+    free = np.ones(len(names) + len(order) + 1 + len(bodies), dtype=np.bool_)
+    free[len(names) : len(names) + len(order) + 1] = False
     priors: tuple[PosePrior, ...] = ()
+    double = setup.double
     if double is not None and any(view.board == SECOND for view in views):
         second = len(names) + order.index(SECOND)
         free[second] = double.offset is None or bool(np.any(double.covariance))
         if free[second] and double.offset is not None:
             # Exactly known poses beside uncertain ones are held to a micrometre.
             priors = (PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),)
-    of_bodies = [np.eye(4), *(bodies[number] for number in sorted(bodies))]
     bundle = Bundle(
-        tuple(cameras[name] for name in names),
+        tuple(setup.cameras[name] for name in names),
         len(order),
-        np.stack([*poses, *(parts[name] for name in order), *of_bodies]),
+        np.stack([*poses, *parts.values(), np.eye(4), *bodies.values()]),
         free,
         points,
         np.repeat(np.arange(len(views)), counts),

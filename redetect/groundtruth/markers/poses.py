@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -40,7 +39,7 @@ _RANSAC_PX = 4.0
 
 
 def solve_camera(
-    camera: Camera, points: FloatArray, pixels: FloatArray, solver: Solver = "sqpnp"
+    camera: Camera, points: FloatArray, pixels: FloatArray, solver: str = "sqpnp"
 ) -> list[FloatArray]:
     """Pose of points seen by one camera.
 
@@ -54,8 +53,7 @@ def solve_camera(
     solver : str
         `sqpnp` (Terzakis & Lourakis 2020), `epnp` (Lepetit et al. 2009; of points in one plane it
         may give the mirror image), `iterative` (DLT or homography, then least squares), `ippe`
-        (Collins & Bartoli 2014: both solutions that a square has), or `pycolmap` (RANSAC, then
-        least squares).
+        (Collins & Bartoli 2014: both solutions that a square has).
 
     Returns
     -------
@@ -73,12 +71,8 @@ def solve_camera(
     normalised = camera.undistort(pixels)
     if not np.all(np.isfinite(normalised)):
         raise GeometryError("a corner lies where the lens sees nothing")
-    if solver == "pycolmap":
-        poses = _pycolmap(camera, points, normalised)
-    else:
-        poses = _opencv(points, normalised, solver)
     return _best_first(
-        poses,
+        _opencv(points, normalised, solver),
         lambda pose: _rms(camera.project(apply(pose, points)) - pixels),
         f"{solver} found no pose with all points in front of the camera",
     )
@@ -87,15 +81,15 @@ def solve_camera(
 def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
     """Pose of a robot seen by one or several cameras.
 
-    `pycolmap` works on all cameras at once; the others on one camera, so there is a solution for
-    each camera, and for `ippe` two for each marker in each image.
+    `pycolmap` (RANSAC, then least squares) works on all cameras at once; the others on one camera,
+    so there is a solution for each camera, and for `ippe` two for each marker in each image.
 
-    `solver`: as in `solve_camera`. Returns `world_from_robot`, those with the least residuals over
-    all cameras first. Solutions in which a corner is behind its camera are left out.
+    `solver`: else as in `solve_camera`. Returns `world_from_robot`, those with the least residuals
+    over all cameras first. Solutions in which a corner is behind its camera are left out.
     """
     used = np.unique(problem.seen.camera)
-    if solver == "pycolmap" and len(used) > 1:
-        poses = _pycolmap_cameras(problem)
+    if solver == "pycolmap":
+        poses = _pycolmap(problem)
     elif solver == "ippe":
         poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     else:
@@ -153,7 +147,7 @@ def _rms(residuals: FloatArray) -> float:
     return value if np.isfinite(value) else float("inf")
 
 
-def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[FloatArray]:
+def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[FloatArray]:
     flags = {
         "sqpnp": cv2.SOLVEPNP_SQPNP,
         "epnp": cv2.SOLVEPNP_EPNP,
@@ -177,56 +171,40 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: Solver) -> list[
     return [pose for pose in poses if np.all(np.isfinite(pose))]
 
 
-def _pycolmap(camera: Camera, points: FloatArray, normalised: FloatArray) -> list[FloatArray]:
-    found = pycolmap.estimate_and_refine_absolute_pose(
-        normalised * camera.scale_x,
-        points,
-        _pinhole(camera),
-        estimation_options=pycolmap.AbsolutePoseEstimationOptions(ransac=_ransac()),
-    )
-    return [] if found is None else [_matrix(found["cam_from_world"])]
-
-
-def _pycolmap_cameras(problem: PoseProblem) -> list[FloatArray]:
+def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
     used, index = np.unique(problem.seen.camera, return_inverse=True)
+    lenses = [problem.network.cameras[camera] for camera in used]
     pixels = np.empty_like(problem.seen.pixels)
-    for camera in used:
+    for lens, camera in zip(lenses, used):
         chosen = problem.seen.camera == camera
-        lens = problem.network.cameras[camera]
         pixels[chosen] = lens.undistort(problem.seen.pixels[chosen]) * lens.scale_x
     if not np.all(np.isfinite(pixels)):
         raise GeometryError("a corner lies where the lens sees nothing")
+    # Cameras without distortion whose pixels are about those of the images.
+    pinholes = [
+        pycolmap.Camera(
+            model="SIMPLE_PINHOLE",
+            width=lens.width,
+            height=lens.height,
+            params=[lens.scale_x, 0.0, 0.0],
+        )
+        for lens in lenses
+    ]
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
         pixels,
         problem.robot_points,
         index.tolist(),
         [pycolmap.Rigid3d(inverse(problem.network.world_from_camera[c])[:3]) for c in used],
-        [_pinhole(problem.network.cameras[camera]) for camera in used],
-        estimation_options=_ransac(),
+        pinholes,
+        # One thread and a seed: the same corners give the same pose.
+        estimation_options=pycolmap.RANSACOptions(
+            max_error=_RANSAC_PX, min_num_trials=100, random_seed=0, num_threads=1
+        ),
     )
-    return [] if found is None else [_matrix(found["rig_from_world"])]
-
-
-def _ransac() -> Any:
-    # One thread and a seed: the same corners give the same pose.
-    return pycolmap.RANSACOptions(
-        max_error=_RANSAC_PX, min_num_trials=100, random_seed=0, num_threads=1
-    )
-
-
-def _pinhole(camera: Camera) -> Any:
-    """A camera without distortion whose pixels are about those of `camera`."""
-    return pycolmap.Camera(
-        model="SIMPLE_PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[camera.scale_x, 0.0, 0.0],
-    )
-
-
-def _matrix(rigid: Any) -> FloatArray:
-    matrix = np.asarray(rigid.matrix(), dtype=np.float64)
-    return transform(matrix[:, :3], matrix[:, 3])
+    if found is None:
+        return []
+    matrix = np.asarray(found["rig_from_world"].matrix(), dtype=np.float64)
+    return [transform(matrix[:, :3], matrix[:, 3])]
 
 
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
@@ -250,11 +228,10 @@ class PoseCandidate(RefinedPose):
 class PoseEstimate:
     """Pose estimate from the corners of one time."""
 
-    # The best first; several if the markers are ambiguous or contradict each other.
+    # The best first; several if the markers are ambiguous.
     candidates: tuple[PoseCandidate, ...]
     # Natural logarithm of how much likelier the first is than each candidate: 0 for the first
     log_odds: tuple[float, ...]
-    contradiction: bool  # Equally many markers support poses that exclude each other
 
     @property
     def ambiguous(self) -> bool:
@@ -265,7 +242,8 @@ class PoseEstimate:
 def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     """All poses of a robot that its markers' corners allow.
 
-    Raises `GeometryError` if there is no view, or no pose explains any of them.
+    Raises `GeometryError` if there is no view, no pose explains any of them, or equally many
+    support poses that exclude each other.
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
@@ -275,24 +253,18 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     if not (found and _all_agree(found[0], settings)):
         found = _refined(problem, _starts(problem) + _own_poses(problem))
     if found and _all_agree(found[0], settings):
-        sets, contradiction = [(everything, found)], False
+        views = everything
     else:
-        sets, contradiction = _consensus(problem)
-    candidates: list[PoseCandidate] = []
-    for views, refined in sets:
-        alone = problem.only(views)
-        starts = _starts(alone)[:1] + _mirrored(alone)
-        minima = _distinct(refined + _refined(alone, starts))
-        candidates += [
-            PoseCandidate(**vars(pose), views=views) for pose in _likely(minima, settings)
-        ]
-    if contradiction:
-        # Different views were explained: their costs are not comparable.
-        return PoseEstimate(tuple(candidates), (0.0,) * len(candidates), True)
+        views, refined = _consensus(problem)
+        found = [refined]
+    alone = problem.only(views)
+    starts = _starts(alone)[:1] + _mirrored(alone)
+    likely = _likely(_distinct(found + _refined(alone, starts)), settings)
+    candidates = tuple(PoseCandidate(**vars(pose), views=views) for pose in likely)
     best = candidates[0]
     inflation = _inflation(best)
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
-    return PoseEstimate(tuple(candidates), log_odds, False)
+    return PoseEstimate(candidates, log_odds)
 
 
 def _all_agree(refined: RefinedPose, settings: PoseSettings) -> bool:
@@ -376,10 +348,8 @@ def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
     return bool(apart @ np.linalg.solve(best.covariance, apart) < 4.0)
 
 
-def _consensus(
-    problem: PoseProblem,
-) -> tuple[list[tuple[BoolArray, list[RefinedPose]]], bool]:
-    """The largest sets of views that agree, and whether there are several of one size."""
+def _consensus(problem: PoseProblem) -> tuple[BoolArray, RefinedPose]:
+    """The largest set of views that agree, and their pose."""
     count = problem.views
     found: dict[bytes, tuple[BoolArray, RefinedPose]] = {}
     # A larger marker is the better hypothesis.
@@ -403,9 +373,9 @@ def _consensus(
     best = [entry for entry in found.values() if int(entry[0].sum()) == largest]
     best.sort(key=lambda entry: entry[1].cost)
     # Sets that share most of their views are the same story with another doubtful view.
-    apart = [entry for entry in best if 2 * int((entry[0] & best[0][0]).sum()) <= largest]
-    kept = [best[0], *apart]
-    return [(views, [refined]) for views, refined in kept], len(kept) > 1
+    if any(2 * int((views & best[0][0]).sum()) <= largest for views, _ in best):
+        raise GeometryError(f"groups of {largest} markers exclude each other")
+    return best[0]
 
 
 def _explained(

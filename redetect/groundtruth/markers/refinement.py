@@ -31,7 +31,7 @@ from redetect.groundtruth.markers.adjustment import (
 )
 from redetect.groundtruth.markers.session import Network, Rig, View
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import apply, exp_se3, roll_pitch
+from redetect.groundtruth.trajectories.transforms import apply, exp_se3
 from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
@@ -150,7 +150,7 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
         pose,
         inverted_information(_linearised(problem, pose).normal),
         _cost(problem, pose, _covariance(problem, here, np.ones(problem.views))),
-        len(here.residuals) + (3 if problem.settings.floor else 0) - 6,
+        len(here.residuals) - 6,
         _view_errors(problem, here),
         np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
     )
@@ -172,10 +172,6 @@ def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
     covariance = _covariance(problem, here, _view_weights(problem, here))
     stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
     products = stacked.T @ np.linalg.solve(covariance, stacked)
-    if problem.settings.floor:
-        missing, by_pose = floor_residuals(pose, problem.settings)
-        of_floor = np.concatenate([missing[:, None], -by_pose], axis=1)
-        products += of_floor.T @ of_floor
     normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
     return _Linearised(float(products[0, 0]), products[1:, 0], normal, covariance)
 
@@ -242,10 +238,7 @@ def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> flo
     residuals = (problem.seen.pixels - problem.pixels(pose)).ravel()
     if not np.all(np.isfinite(residuals)):
         return np.inf
-    cost = float(squared_mahalanobis(residuals, covariance))
-    if problem.settings.floor:
-        cost += float(np.sum(floor_residuals(pose, problem.settings)[0] ** 2))
-    return cost
+    return float(squared_mahalanobis(residuals, covariance))
 
 
 def _normalised_rms(residuals: FloatArray, covariance: FloatArray) -> float:
@@ -268,25 +261,6 @@ def _view_weights(problem: PoseProblem, here: _Corners) -> FloatArray:
     if loss == "huber":
         return np.asarray(1.0 / np.maximum(relative, 1.0))
     return np.asarray(1.0 / (1.0 + relative**2))
-
-
-def floor_residuals(pose: FloatArray, floor: PoseSettings) -> tuple[FloatArray, FloatArray]:
-    """Deviation of a pose from the floor's z, roll, pitch: (3,) normalised, and (3, 6) Jacobian.
-
-    The Jacobian is that of the normalised z, roll and pitch by the pose's right perturbation.
-    """
-    tilt = np.radians(floor.floor_sigma_tilt_deg)
-    sigmas = np.array([floor.floor_sigma_z_m, tilt, tilt])
-    roll, pitch = roll_pitch(pose)
-    missing = np.array([floor.floor_z_m - pose[2, 3], -roll, -pitch])
-    up = pose[2, :3]  # the world's vertical in the robot's axes; it turns by up x w
-    jacobian = np.zeros((3, 6))
-    jacobian[0, :3] = up
-    by_rotation = np.array([[0, -up[2], up[1]], [up[2], 0, -up[0]], [-up[1], up[0], 0]])
-    across = up[1] ** 2 + up[2] ** 2
-    jacobian[1, 3:] = (up[2] * by_rotation[1] - up[1] * by_rotation[2]) / across
-    jacobian[2, 3:] = -by_rotation[0] / np.sqrt(across)
-    return missing / sigmas, jacobian / sigmas[:, None]
 
 
 def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> ChainPoints:

@@ -34,21 +34,22 @@ from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings, RigSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import inverse, mean_pose, planar_transform
+from redetect.groundtruth.trajectories.transforms import inverse, mean_pose
 
+# Exactly known poses are held to a micrometre and a microradian.
+_EXACT = 1e-12
 # Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
 _WRONG_PX = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """A rig in the frame of one of its markers, and what it was made from."""
+    """A rig and what it was made from."""
 
-    # `robot_from_marker` is `reference_from_marker` here; the covariance is scaled by the residuals
-    # where those are larger than the corners' covariances say.
+    # In the robot's frame if markers were known in it, else in that of the reference; the
+    # covariance is scaled by the residuals where those are larger than the corners' say.
     rig: Rig
-    reference: int  # The marker whose frame it is
+    reference: int  # The marker from which the others were chained
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
     adjusted: AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
@@ -59,13 +60,13 @@ class RigEstimate:
 def estimate_rig(
     groups: Sequence[Sequence[MarkerFrame]],
     network: Network,
-    dictionary: str,
-    widths_m: Mapping[int, float],
+    width_m: float,
     settings: RigSettings,
     *,
     reference: int | None = None,
+    known: Rig | None = None,
 ) -> RigEstimate:
-    """Estimate a rig.
+    """Estimate a rig, in the frame of one of its markers or in that in which some are known.
 
     Parameters
     ----------
@@ -74,18 +75,28 @@ def estimate_rig(
     network : Network
         The cameras; their places mean nothing where they are not calibrated to each other. If it
         has a covariance, that is a prior of the cameras' adjustment.
-    widths_m : mapping of int to float
-        Widths of the markers that may be in the rig, by ID.
+    width_m : float
+        Width of the markers.
     reference : int, optional
         The marker whose frame is the rig's; by default the one with the most support.
+    known : Rig, optional
+        One or more of the markers in the robot's frame, which is the rig's then; their
+        covariances, apart from each other, are those of priors.
 
     Raises
     ------
     GroundTruthError
-        If no two markers were seen together often enough, or the reference was not.
+        If markers of several dictionaries or of none were found, no two markers were seen together
+        often enough, the reference was not, or none of the known markers is in the rig.
     """
-    ids = tuple(sorted(widths_m))
-    candidates = _bare_rig(dictionary, ids, widths_m)
+    markers = [marker for group in groups for frame in group for marker in frame.markers]
+    dictionaries = sorted({marker.dictionary for marker in markers})
+    if len(dictionaries) != 1:
+        raise GroundTruthError(
+            f"markers of the dictionaries {dictionaries}: expected markers of one dictionary"
+        )
+    ids = tuple(sorted({marker.id for marker in markers}))
+    candidates = _bare_rig(dictionaries[0], ids, width_m)
     seen = [rig_views(group, candidates) for group in groups]
     solved = [
         [(v, _solutions(v, candidates, network, settings)) for v in views]
@@ -113,18 +124,16 @@ def estimate_rig(
     relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
     start = chained_poses(relative, tree, renumbered[root])
     kept_ids = tuple(ids[i] for i in kept)
-    rig = _bare_rig(dictionary, kept_ids, widths_m)
-    bundle, views, times = _bundle(
-        solved, rig, renumbered, start, network, renumbered[root], settings
-    )
+    rig = _bare_rig(dictionaries[0], kept_ids, width_m)
+    priors: tuple[PosePrior, ...] = ()
+    if known is not None:
+        start, priors = _in_known_frame(kept_ids, start, known, len(network.cameras))
+    bundle, views, times = _bundle(solved, rig, renumbered, start, network, settings)
+    free = bundle.free.copy()
+    free[len(network.cameras) + renumbered[root]] = known is not None
+    bundle = replace(bundle, free=free, priors=priors)
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
-    adjusted, rig = _adjusted(bundle, rig, settings)
-    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
-
-
-def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[AdjustedBundle, Rig]:
-    """The bundle at its minimum, and the rig that it makes."""
     try:
         adjusted = adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
@@ -133,15 +142,33 @@ def _adjusted(bundle: Bundle, rig: Rig, settings: RigSettings) -> tuple[Adjusted
         raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
     covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
     poses = adjusted.bundle.body_from_part
-    return adjusted, replace(rig, robot_from_marker=poses, covariance=covariance)
+    rig = replace(rig, robot_from_marker=poses, covariance=covariance)
+    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
 
 
-def _bare_rig(dictionary: str, ids: tuple[int, ...], widths_m: Mapping[int, float]) -> Rig:
+def _in_known_frame(
+    ids: Sequence[int], rig_from_marker: FloatArray, known: Rig, cameras: int
+) -> tuple[FloatArray, tuple[PosePrior, ...]]:
+    """Markers (M, 4, 4) moved to where some are known, and priors of these behind the cameras."""
+    common = [marker for marker in ids if marker in known.ids]
+    if not common:
+        raise GroundTruthError(f"the rig has markers {list(ids)}, none of {list(known.ids)}")
+    priors, starts = [], []
+    for marker in common:
+        i, j = ids.index(marker), known.ids.index(marker)
+        covariance = _block(known.covariance, j) + _EXACT * np.eye(6)
+        priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
+        starts.append(known.robot_from_marker[j] @ inverse(rig_from_marker[i]))
+    robot_from_rig, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+    return robot_from_rig @ rig_from_marker, tuple(priors)
+
+
+def _bare_rig(dictionary: str, ids: tuple[int, ...], width_m: float) -> Rig:
     count = len(ids)
     return Rig(
         dictionary,
         ids,
-        np.array([widths_m[marker] for marker in ids]),
+        np.full(count, width_m),
         np.tile(np.eye(4), (count, 1, 1)),
         np.zeros((6 * count, 6 * count)),
     )
@@ -209,7 +236,7 @@ def _reasons(
     reasons = {}
     for index, marker in enumerate(ids):
         alone = sum(any(v.rig_index == index for v in views) for views in seen)
-        if parents[index] < 0 and alone:
+        if parents[index] < 0:
             reasons[marker] = (
                 f"seen at {alone} times, but not {settings.least_support} times in agreement with "
                 "a marker of the rig"
@@ -223,7 +250,6 @@ def _bundle(
     renumbered: Mapping[int, int],
     start: FloatArray,
     network: Network,
-    root: int,
     settings: RigSettings,
 ) -> tuple[Bundle, tuple[View, ...], int]:
     """The bundle, its views, and the number of times, each of which is a body."""
@@ -246,13 +272,11 @@ def _bundle(
         poses.append(pose)
     points = chain_points(views, rig, settings.corner_floor_px)
     cameras = len(network.cameras)
-    free = np.arange(cameras + len(start) + len(poses)) >= cameras
-    free[cameras + root] = False
     bundle = Bundle(
         network.cameras,
         len(start),
         np.concatenate([network.world_from_camera, start, poses]),
-        free,
+        np.arange(cameras + len(start) + len(poses)) >= cameras,
         replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
         np.repeat(np.arange(len(views)), 4),
     )
@@ -267,7 +291,7 @@ def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     priors = tuple(
         PosePrior(int(c), bundle.poses[c], _block(covariance, c) + _EXACT * np.eye(6)) for c in seen
     )
-    return replace(bundle, free=free, priors=priors)
+    return replace(bundle, free=free, priors=(*bundle.priors, *priors))
 
 
 def _block(covariance: FloatArray, index: int) -> FloatArray:
@@ -296,97 +320,3 @@ def _best_start(
             if total < least:
                 best, least = pose, total
     return best
-
-
-# Exactly known poses are held to a micrometre and a microradian.
-_EXACT = 1e-12
-# Assumed deviations of a reference pose without covariance (m, rad), and of any one's level.
-_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.005, 0.005
-
-
-def rig_by_known_markers(estimate: RigEstimate, known: Rig, settings: RigSettings) -> RigEstimate:
-    """Put a rig into the frame in which some of its markers are known.
-
-    `known` has one or more of its markers in the robot's frame; their covariances, apart from each
-    other, are their priors'. Raises `GroundTruthError` if the rig has none of them.
-    """
-    ids = estimate.rig.ids
-    common = [marker for marker in ids if marker in known.ids]
-    if not common:
-        raise GroundTruthError(f"the rig has markers {list(ids)}, none of {list(known.ids)}")
-    priors, starts = [], []
-    for marker in common:
-        i, j = ids.index(marker), known.ids.index(marker)
-        covariance = _block(known.covariance, j) + _EXACT * np.eye(6)
-        cameras = len(estimate.adjusted.bundle.cameras)
-        priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
-        starts.append(known.robot_from_marker[j] @ inverse(estimate.rig.robot_from_marker[i]))
-    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
-    return _readjusted(estimate, start, tuple(priors), settings)
-
-
-def rig_by_reference_poses(
-    estimate: RigEstimate, reference: PlanarPoses, settings: RigSettings
-) -> tuple[RigEstimate, int]:
-    """Put a rig into the frame of a robot whose poses, standing level, are known at some times.
-
-    The estimate was made with a network, whose world is that of the poses. Returns how many times
-    have a known pose as well; raises `GroundTruthError` if none has one.
-    """
-    bundle = estimate.adjusted.bundle
-    body_of_view = bundle.seen.body[np.searchsorted(bundle.view, np.arange(len(estimate.views)))]
-    priors, starts = [], []
-    for body in range(len(bundle.world_from_body)):
-        times = [view.frame.time_s for view, b in zip(estimate.views, body_of_view) if b == body]
-        k = int(np.argmin(np.abs(reference.times_s - np.mean(times))))
-        if abs(reference.times_s[k] - float(np.mean(times))) > settings.time_tolerance_s:
-            continue
-        x, y, theta = reference.poses[k]
-        pose = planar_transform(float(x), float(y), float(theta))
-        covariance = _reference_covariance(reference, k, pose)
-        priors.append(PosePrior(bundle.shared + body, pose, covariance))
-        starts.append(inverse(pose) @ bundle.world_from_body[body])
-    if not priors:
-        raise GroundTruthError(
-            "no images show two markers of the rig at the time of any reference pose"
-        )
-    start, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
-    return _readjusted(estimate, start, tuple(priors), settings), len(priors)
-
-
-def _reference_covariance(reference: PlanarPoses, k: int, pose: FloatArray) -> FloatArray:
-    """(6, 6) covariance of a known pose's right perturbation."""
-    covariance = np.diag(np.square([_REFERENCE_SIGMA_M] * 3 + [_REFERENCE_SIGMA_RAD] * 3))
-    if reference.covariances is not None:
-        turn = np.eye(3)
-        turn[:2, :2] = pose[:2, :2].T
-        planar = turn @ reference.covariances[k] @ turn.T
-        covariance[np.ix_([0, 1, 5], [0, 1, 5])] = planar + _EXACT * np.eye(3)
-    return covariance
-
-
-def _readjusted(
-    estimate: RigEstimate,
-    robot_from_rig: FloatArray,
-    priors: tuple[PosePrior, ...],
-    settings: RigSettings,
-) -> RigEstimate:
-    bundle = estimate.adjusted.bundle
-    cameras = len(bundle.cameras)
-    free = bundle.free.copy()
-    free[cameras : bundle.shared] = True
-    free[bundle.shared :] = np.isin(np.arange(len(bundle.world_from_body)), bundle.seen.body)
-    moved = replace(
-        bundle,
-        poses=np.concatenate(
-            [
-                bundle.world_from_camera,
-                robot_from_rig @ bundle.body_from_part,
-                bundle.world_from_body @ inverse(robot_from_rig),
-            ]
-        ),
-        free=free,
-        priors=(*(p for p in bundle.priors if p.index < cameras), *priors),
-    )
-    adjusted, rig = _adjusted(moved, estimate.rig, settings)
-    return replace(estimate, rig=rig, adjusted=adjusted)

@@ -7,7 +7,6 @@ each camera; both may say how uncertain that is (see docs/groundtruth.md).
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,10 +200,6 @@ def _joint_covariance(
 
 
 DETECTED_NAME = "detected.markers"
-NETWORK_NAME = "network.json"
-RIG_NAME = "rig.json"
-
-_IMAGE_SUFFIX = re.compile(r"\.(?:jpe?g|png|p[gp]m|tiff?|bmp)\Z", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -226,26 +221,20 @@ class View:
     rig_index: int
 
 
-def find_runs(paths: Sequence[Path], network_path: Path | None) -> tuple[list[Path], Path]:
-    """The run folders and the network file that a command line means.
+def find_runs(session: Path) -> list[Path]:
+    """The run folders of a session that have found markers.
 
-    `paths`: a session (a folder with one run folder per camera), or the run folders themselves.
-    `network_path`: by default ``network.json`` in the session, or beside the run folders. Returns
-    run folders; for a session all that have found markers. the network file.
+    Raises `GroundTruthError` if there are none.
     """
-    for path in paths:
-        if not path.is_dir():
-            raise GroundTruthError(f"{path}: no such folder: expected a session or a run folder")
-    if len(paths) == 1 and not (paths[0] / DETECTED_NAME).is_file():
-        runs = sorted(p for p in paths[0].iterdir() if (p / DETECTED_NAME).is_file())
-        if not runs:
-            raise GroundTruthError(
-                f"{paths[0]}: no {DETECTED_NAME} in it or in its folders: "
-                "run `detect markers` on each camera's folder first"
-            )
-        return runs, network_path if network_path is not None else paths[0] / NETWORK_NAME
-    beside = paths[0].resolve().parent / NETWORK_NAME
-    return list(paths), network_path if network_path is not None else beside
+    if not session.is_dir():
+        raise GroundTruthError(f"{session}: no such folder: expected a session")
+    runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())
+    if not runs:
+        raise GroundTruthError(
+            f"{session}: no {DETECTED_NAME} in its folders: run `detect markers` on each camera's "
+            "folder first"
+        )
+    return runs
 
 
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
@@ -255,14 +244,14 @@ def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[Ma
     they need not be `timed`.
     """
     times_path = run / f"{run.resolve().name}.times"
-    times = _times_by_name(times_path) if timed else {}
+    times = read_times(times_path) if timed else {}
     frames = []
     for number, frame in enumerate(read_frames(run / DETECTED_NAME)):
-        name = _image_name(frame.step.prefix)
-        if timed and name not in times:
-            raise GroundTruthError(f"{times_path}: no time of image {frame.step.prefix}")
-        time_s = times[name] if timed else float(number)
-        frames.append(MarkerFrame(camera, frame.step.prefix, time_s, frame.markers))
+        prefix = frame.step.prefix
+        if timed and prefix not in times:
+            raise GroundTruthError(f"{times_path}: no time of image {prefix}")
+        time_s = times[prefix] if timed else float(number)
+        frames.append(MarkerFrame(camera, prefix, time_s, frame.markers))
     return frames
 
 
@@ -292,24 +281,3 @@ def rig_views(group: Sequence[MarkerFrame], rig: Rig) -> list[View]:
         for marker in frame.markers
         if marker.dictionary == rig.dictionary and marker.id in index
     ]
-
-
-def _times_by_name(path: Path) -> dict[str, float]:
-    """Times of images by their names without folder and ending, all of them different."""
-    times: dict[str, float] = {}
-    prefixes: dict[str, str] = {}
-    for prefix, time_s in read_times(path).items():
-        name = _image_name(prefix)
-        if name in prefixes:
-            raise GroundTruthError(
-                f"{path}: images {excerpt(prefixes[name])} and {excerpt(prefix)} are both "
-                f"called {excerpt(name)} without folder and ending: expected different names"
-            )
-        prefixes[name], times[name] = prefix, time_s
-    return times
-
-
-def _image_name(prefix: str) -> str:
-    """An image's name without folder and ending, by which rows and times belong together."""
-    name = prefix.strip('"').replace("\\", "/").rsplit("/", 1)[-1]
-    return _IMAGE_SUFFIX.sub("", name)

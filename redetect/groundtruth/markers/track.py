@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -134,7 +134,6 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     if estimate is not None:
         chosen = estimate.candidates[(choice.candidate or 0) if choice is not None else 0]
         entry["ambiguous"] = estimate.ambiguous
-        entry["contradiction"] = estimate.contradiction
         if choice is not None and estimate.ambiguous:
             entry["margin"] = round(choice.margin, 3)
         entry["candidates"] = [
@@ -183,16 +182,12 @@ def _estimated(
 
 
 def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
-    estimate = tracked.estimate
-    assert estimate is not None
-    kind = "contradicting markers" if estimate.contradiction else "planar ambiguity"
-    reason = ""
-    if choice.status == "rejected":
-        reason = "does not fit the times before and after"
-    elif choice.status == "resolved":
-        reason = f"{kind}, decided by the neighbours"
-    elif choice.status == "unresolved":
-        reason = f"{kind}, not decided by the neighbours"
+    reasons = {
+        "rejected": "does not fit the times before and after",
+        "resolved": "planar ambiguity, decided by the neighbours",
+        "unresolved": "planar ambiguity, not decided by the neighbours",
+    }
+    reason = reasons.get(choice.status, "")
     return replace(tracked, status=choice.status, choice=choice, reason=reason)
 
 
@@ -218,9 +213,13 @@ def choose_candidates(
     times_s: Sequence[float], estimates: Sequence[PoseEstimate], settings: PoseSettings
 ) -> list[Choice]:
     """Decide between the candidates of each frame by its neighbours; times ascend."""
-    through, without = _cheapest_paths(times_s, estimates, settings)
+    if not estimates:
+        return []
+    frame = np.repeat(np.arange(len(estimates)), [len(e.candidates) for e in estimates])
+    begins = np.searchsorted(frame, np.arange(len(estimates)))
+    through, without = _cheapest_paths(_steps(times_s, estimates, frame, settings), frame, begins)
     choices = []
-    for estimate, costs, left_out in zip(estimates, through, without):
+    for estimate, costs, left_out in zip(estimates, np.split(through, begins[1:]), without):
         if left_out < costs.min():
             choices.append(Choice(None, "rejected", float(costs.min() - left_out)))
             continue
@@ -235,78 +234,55 @@ def choose_candidates(
     return choices
 
 
-def _cheapest_paths(
-    times_s: Sequence[float], estimates: Sequence[PoseEstimate], settings: PoseSettings
-) -> tuple[list[FloatArray], FloatArray]:
-    """Cost of the cheapest sequence through each candidate, and of that without each frame."""
-    count = len(estimates)
-    sizes = [len(estimate.candidates) for estimate in estimates]
-    steps = {
-        skipped: _step_costs(times_s, estimates, skipped + 1, settings)
-        for skipped in range(_MOST_LEFT_OUT + 1)
-    }
-    ahead = _cheapest_before(sizes, steps)
-    backward = {
-        skipped: [costs.T for costs in reversed(of_steps)] for skipped, of_steps in steps.items()
-    }
-    back = _cheapest_before(sizes[::-1], backward)[::-1]
-    through = [a + b for a, b in zip(ahead, back)]
-    without = np.full(count, _REJECT_COST * count)
-    for i in range(count):
-        if i > 0:  # the sequence ends before this frame
-            without[i] = min(without[i], float(ahead[i - 1].min()) + _REJECT_COST * (count - i))
-        if i < count - 1:  # or begins after it
-            without[i] = min(without[i], float(back[i + 1].min()) + _REJECT_COST * (i + 1))
-    for skipped, costs in steps.items():
-        for j in range(count - skipped - 1):
-            if skipped:
-                over = ahead[j][:, None] + costs[j] + back[j + skipped + 1][None, :]
-                cost = float(over.min()) + _REJECT_COST * skipped
-                inside = slice(j + 1, j + skipped + 1)
-                without[inside] = np.minimum(without[inside], cost)
-    return through, without
+_Step = tuple[int, int, float]
 
 
-def _cheapest_before(
-    sizes: Sequence[int], steps: Mapping[int, Sequence[FloatArray]]
-) -> list[FloatArray]:
-    """Costs of the cheapest sequences that lead to each candidate of each frame.
-
-    `sizes` are the numbers of candidates, `steps` the costs of moving on from each frame, by how
-    many frames are left out.
-    """
-    costs = [np.full(size, _REJECT_COST * i) for i, size in enumerate(sizes)]
-    for i in range(len(sizes)):
-        for skipped, of_steps in steps.items():
-            if (j := i - skipped - 1) >= 0:
-                came = costs[j][:, None] + of_steps[j] + _REJECT_COST * skipped
-                costs[i] = np.minimum(costs[i], came.min(axis=0))
-    return costs
-
-
-def _step_costs(
+def _steps(
     times_s: Sequence[float],
     estimates: Sequence[PoseEstimate],
-    distance: int,
+    frame: IntArray,
     settings: PoseSettings,
-) -> list[FloatArray]:
-    """For each frame i, the costs (K_i, K_j) of moving to the candidates of frame i + distance."""
-    sizes = [len(estimate.candidates) for estimate in estimates]
-    shapes = list(zip(sizes[:-distance], sizes[distance:]))
-    if not shapes:
-        return []
-    start = np.concatenate([[0], np.cumsum(sizes)])[:-1]
-    # Every candidate of one frame with every one of the other.
-    grids = [np.indices(shape).reshape(2, -1) for shape in shapes]
-    first = np.concatenate([start[i] + grid[0] for i, grid in enumerate(grids)])
-    second = np.concatenate([start[i + distance] + grid[1] for i, grid in enumerate(grids)])
-    apart = np.subtract(times_s[distance:], times_s[:-distance])
-    seconds = np.repeat(apart, [grid.shape[1] for grid in grids])
+) -> list[_Step]:
+    """Steps between candidates of neighbouring frames, each with its cost, by where they lead.
+
+    `frame` (K,): which frame each candidate, counted over all frames, is of.
+    """
+    nearest = np.searchsorted(frame, frame)
+    farthest = np.searchsorted(frame, frame - 1 - _MOST_LEFT_OUT)
+    second = np.repeat(np.arange(len(frame)), nearest - farthest)
+    first = np.concatenate([np.arange(*part) for part in zip(farthest, nearest)])
     poses = np.stack([c.world_from_robot for e in estimates for c in e.candidates])
     covariances = np.stack([c.covariance for e in estimates for c in e.candidates])
+    at = np.asarray(times_s)[frame]
+    seconds = at[second] - at[first]
     costs = _motion_costs(poses, covariances, first, second, seconds, settings)
-    split = np.cumsum([a * b for a, b in shapes])[:-1]
-    return [part.reshape(shape) for part, shape in zip(np.split(costs, split), shapes)]
+    costs += _REJECT_COST * (frame[second] - frame[first] - 1)
+    return list(zip(first.tolist(), second.tolist(), costs.tolist()))
+
+
+def _cheapest_paths(
+    steps: Sequence[_Step], frame: IntArray, begins: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Cost of the cheapest sequence through each candidate (K,), and without each frame (N,).
+
+    `frame` (K,) is each candidate's frame, `begins` (N,) each frame's first candidate.
+    """
+    count = len(begins)
+    ahead, back = _REJECT_COST * frame, _REJECT_COST * (count - 1 - frame)
+    for a, b, cost in steps:
+        ahead[b] = min(ahead[b], ahead[a] + cost)
+    for a, b, cost in reversed(steps):
+        back[a] = min(back[a], back[b] + cost)
+    without = np.full(count, _REJECT_COST * count)
+    left_out = _REJECT_COST * np.arange(1, count)
+    # The sequence ends before the frame, begins after it, or leads past it.
+    before, after = (np.minimum.reduceat(costs, begins) for costs in (ahead, back))
+    without[1:] = np.minimum(without[1:], before[:-1] + left_out[::-1])
+    without[:-1] = np.minimum(without[:-1], after[1:] + left_out)
+    for a, b, cost in steps:
+        past = slice(frame[a] + 1, frame[b])
+        without[past] = np.minimum(without[past], ahead[a] + cost + back[b])
+    return ahead + back, without
 
 
 def _motion_costs(

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +12,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_json, read_text
+from redetect.groundtruth.files import read_json
 from redetect.groundtruth.fusion.clock import ClockModel, PtpdLog, read_clock, read_ptpd
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.trajectories.streams import (
@@ -45,19 +41,8 @@ STREAMS = {"laser": "laser", "camera": "cameras", "filtered": "filter alone", "f
 PICTURES = ("aligned.png", "validation/errors.png", "validation/scans.png")
 
 _GAP_S = 5.0
-_MOST_LINES_BYTES = 1 << 28
 _MOST_PICTURE_BYTES = 1 << 24
 _PNG = b"\x89PNG\r\n\x1a\n"
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A time in which the laser's track was not determined."""
-
-    status: str
-    from_s: float
-    to_s: float
-    sets: int
 
 
 @dataclass
@@ -74,9 +59,6 @@ class Inputs:
     clock: ClockModel | None = None
     # Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`
     documents: dict[str, dict[str, Any]] = field(default_factory=dict)
-    sets: dict[str, int] = field(default_factory=dict)  # Numbers of sets of scans by status
-    # Where the laser's track was not determined within visits
-    intervals: list[Interval] = field(default_factory=list)
     pictures: dict[str, bytes] = field(default_factory=dict)  # By the names in `PICTURES` (PNG)
     # What was measured in the building by tape
     dimensions: list[Dimension] = field(default_factory=list)
@@ -118,10 +100,6 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         if document is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
-    lines = _read(inputs, session / "laser.jsonl", _sets_of_scans)
-    if lines is not None:
-        inputs.sets, inputs.intervals = lines
-        inputs.intervals = [i for i in inputs.intervals if _within(i, inputs.visits)]
     for name in PICTURES:
         picture = _read(inputs, session / name, _picture)
         if picture is not None:
@@ -171,26 +149,6 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
     return _read(inputs, path, read_building)
 
 
-def _sets_of_scans(path: Path) -> tuple[dict[str, int], list[Interval]]:
-    """How many sets there are of each status, and stretches of those that are not determined."""
-    entries: list[tuple[str, float]] = []
-    lines = read_text(path, _MOST_LINES_BYTES, "lines of JSON").splitlines()
-    for number, line in enumerate(lines, 1):
-        try:
-            entry = json.loads(line)
-            entries.append((str(entry["status"]), float(entry["t"])))
-        except (ValueError, TypeError, KeyError, RecursionError):
-            raise GroundTruthError(
-                f"{path}:{number}: expected an object with t and status"
-            ) from None
-    intervals = []
-    for status, stretch in groupby(entries, key=itemgetter(0)):
-        times = [time for _, time in stretch]
-        if status not in ("ok", "reacquired"):
-            intervals.append(Interval(status, times[0], times[-1], len(times)))
-    return dict(Counter(status for status, _ in entries)), intervals
-
-
 def _picture(path: Path) -> bytes:
     content = read_content(path, _MOST_PICTURE_BYTES, "picture", GroundTruthError)
     if not content.startswith(_PNG):
@@ -210,10 +168,6 @@ def _visits(inputs: Inputs) -> list[tuple[float, float]]:
     times = np.sort(np.concatenate([stream.times_s for stream in measured]))
     parts = [times[s] for s in segments_between_gaps(times, _GAP_S)]
     return [(float(part[0]), float(part[-1])) for part in parts]
-
-
-def _within(interval: Interval, visits: list[tuple[float, float]]) -> bool:
-    return any(a < interval.from_s and interval.to_s < b for a, b in visits)
 
 
 def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:

@@ -398,28 +398,12 @@ def _clock(inputs: Inputs) -> list[Part]:
 
 def _rejected(inputs: Inputs) -> list[Part]:
     content: list[Part] = []
-    if inputs.sets:
-        counts = ", ".join(f"{number} {status}" for status, number in sorted(inputs.sets.items()))
-        content.append(
-            Part("text", f"Sets of scans: {counts}. Lost includes the pauses between visits.")
-        )
-    if inputs.intervals:
-        longest = sorted(inputs.intervals, key=lambda i: (i.from_s - i.to_s, i.from_s))
-        rows = [
-            (f"{i.from_s:.3f}", f"{i.to_s:.3f}", str(i.sets), i.status)
-            for i in sorted(longest[:_MOST_ROWS], key=lambda i: i.from_s)
-        ]
-        caption = (
-            f"Within visits the laser's track was not determined {len(inputs.intervals)} times"
-        )
-        if len(inputs.intervals) > _MOST_ROWS:
-            caption += f"; the {_MOST_ROWS} longest"
-        content.append(table(caption, ("from / s", "to / s", "sets", "status"), rows, text=(3,)))
-    suspects = [
-        str(s.get("name"))
-        for s in _entries(inputs.documents.get("laser.json", {}), "scanners")
-        if s.get("suspect")
-    ]
+    laser = inputs.documents.get("laser.json", {})
+    if sets := _entry(laser, "sets", dict):
+        counts = ", ".join(f"{_value(number)} {status}" for status, number in sets.items())
+        words = f"Sets of scans: {counts}. Lost includes the pauses between visits."
+        content.append(Part("text", words))
+    suspects = [str(s.get("name")) for s in _entries(laser, "scanners") if s.get("suspect")]
     if suspects:
         words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
         content.append(Part("problem", words))
@@ -448,16 +432,11 @@ def _rejected(inputs: Inputs) -> list[Part]:
 
 
 def _settings(inputs: Inputs, version: str) -> list[Part]:
-    rows = []
+    content = []
     for name, document in inputs.documents.items():
         # A file of scanners has the version of its form there.
-        rows.append((name, "version", _value(document.get("version"))))
-        for key, value in _flat(_entry(document, "settings", dict)):
-            rows.append((name, key, _value(value)))
-    content = []
-    if rows:
-        caption = "Effective settings of what the page shows"
-        content.append(table(caption, ("file", "setting", "value"), rows, text=(1, 2)))
+        words = f"{name}: version {_value(document.get('version'))}, "
+        content.append(Part("text", words + f"settings {_value(document.get('settings'))}."))
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
 
@@ -471,14 +450,6 @@ def _entry(document: dict[str, Any], key: str, kind: type) -> Any:
     """An entry of a file that others may have written, or an empty one of the kind expected."""
     value = document.get(key)
     return value if isinstance(value, kind) else kind()
-
-
-def _flat(settings: dict[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, dict) and value and above.count(".") < 8:
-            yield from _flat(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
 
 
 def _value(value: Any) -> str:

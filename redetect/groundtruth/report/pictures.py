@@ -362,19 +362,13 @@ _OF_A_WALL_M = 0.2
 _BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
-def draw_errors(
-    errors: ReferenceErrors, score: PoseScore, building: FloatArray | None = None
-) -> bytes:
-    """Draw errors with bounds by their covariances; returns a PNG's bytes.
+def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
+    """Draw errors, at least one, with bounds by their covariances; returns a PNG's bytes.
 
-    The same input gives the same bytes.
-
-    `errors`: at least one. `score`: of the errors. `building` (S, 4): walls to draw on the map
-    (m).
+    `score` is that of the errors. The same input gives the same bytes.
     """
     with figure_file((13.5, 6.4), "png") as (figure, content):
-        grid = figure.add_gridspec(2, 2, width_ratios=[1.25, 1.0])
-        linear, angular = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
+        linear, angular = figure.subplots(2, 1)
         names = [str(reference.index) for reference in errors.references]
         at = np.arange(len(names))
         x, y, theta = errors.error.T
@@ -419,24 +413,6 @@ def draw_errors(
             axes.set_ylim(low, high + 0.22 * (high - low))  # space for the legend
             axes.legend(loc="upper center", ncols=4, fontsize=8, framealpha=0.9)
 
-        where = figure.add_subplot(grid[:, 1])
-        if building is not None:
-            draw_walls(where, building)
-        poses = errors.reference_poses.poses
-        span = float(np.ptp(poses[:, :2], axis=0).max()) if len(poses) > 1 else 1.0
-        factor = _round_factor(0.12 * max(span, 1.0) / max(score.position_max_m, 1e-6))
-        where.quiver(
-            poses[:, 0], poses[:, 1], factor * x, factor * y, angles="xy",
-            scale_units="xy", scale=1.0, color=_BLUE, width=0.004, zorder=3,
-        )  # fmt: skip
-        ahead = poses[:, :2] + 0.2 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-        ends = np.stack([poses[:, :2], ahead])
-        where.plot(ends[:, :, 0], ends[:, :, 1], color="0.2", lw=1.2, zorder=2)
-        where.plot(poses[:, 0], poses[:, 1], "o", color="0.2", ms=3, zorder=2)
-        for name, pose in zip(names, poses):
-            where.annotate(name, pose[:2], xytext=(4, 4), textcoords="offset points", fontsize=7)
-        low, high = poses[:, :2].min(axis=0) - 1.5, poses[:, :2].max(axis=0) + 1.5
-        _frame(where, low, high, f"errors, drawn {factor:g} times as long", fontsize=10)
     return content.getvalue()
 
 
@@ -448,7 +424,7 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
     """
     kept = [i for i, r in enumerate(errors.references) if r.still is not None]
     refined = np.stack([errors.references[i].pose for i in kept])
-    distances = np.stack([errors.references[i].distances.candidates[0] for i in kept])
+    distances = np.stack([errors.references[i].distances.pose for i in kept])
     clouds = [still.robot_points() for i in kept if (still := errors.references[i].still)]
     sets = {
         "poses by distances": distances,
@@ -472,9 +448,3 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
             rms = 1e3 * float(np.sqrt(np.mean(near**2))) if len(near) else math.nan
             _frame(axes, low, high, f"{title}: {rms:.1f} mm rms from the walls", fontsize=10)
     return content.getvalue()
-
-
-def _round_factor(wanted: float) -> float:
-    """The largest of 1, 2, 5, 10, ... that is at most `wanted`; 1 if that is below 1."""
-    power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))

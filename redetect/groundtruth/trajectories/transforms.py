@@ -45,12 +45,6 @@ def quaternion_xyzw(transforms: ArrayLike) -> FloatArray:
     return np.asarray(q.reshape(*t.shape[:-2], 4))
 
 
-def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
-    """(4, 4) pose of a robot standing level on the floor at x, y with heading theta."""
-    c, s = np.cos(theta_rad), np.sin(theta_rad)
-    return transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
-
-
 def inverse(transforms: ArrayLike) -> FloatArray:
     """Inverses of (..., 4, 4) transforms."""
     t = np.asarray(transforms, dtype=np.float64)
@@ -113,14 +107,6 @@ def heading(transforms: ArrayLike) -> FloatArray:
     """(...) headings theta (rad): angles of the x axes of (..., 4, 4) poses in the world."""
     t = np.asarray(transforms, dtype=np.float64)
     return np.asarray(np.arctan2(t[..., 1, 0], t[..., 0, 0]))
-
-
-def roll_pitch(transforms: ArrayLike) -> FloatArray:
-    """(..., 2) roll about x and pitch about y (rad) of (..., 4, 4) poses, as in yaw-pitch-roll."""
-    t = np.asarray(transforms, dtype=np.float64)
-    roll = np.arctan2(t[..., 2, 1], t[..., 2, 2])
-    pitch = np.arcsin(np.clip(-t[..., 2, 0], -1.0, 1.0))
-    return np.stack([roll, pitch], axis=-1)
 
 
 def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:

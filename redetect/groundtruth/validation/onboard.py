@@ -2,8 +2,8 @@
 
 The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
 fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls leave a direction undetermined or the results disagree. If distances leave several poses, the
-walls decide. From all of them follow the errors of ranges, and where the scanners are mounted.
+walls leave a direction undetermined or the results disagree. From all of them follow the errors of
+ranges, and where the scanners are mounted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.special import chdtrc
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
-from redetect.groundtruth.lasers.alignment import StillScan, WallFit, fit_to_walls, still_scan
+from redetect.groundtruth.lasers.alignment import StillScan, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.trajectories.streams import pose_differences
@@ -29,13 +29,10 @@ from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
 from redetect.plane import apply, compose, rotation
 
-ScanStatus = Literal["used", "undetermined", "disagrees", "moved", "no scans", "not asked"]
+ScanStatus = Literal["used", "undetermined", "disagrees", "no scans", "not asked"]
 
-# The robot is at rest for this long before and after the distances' time; it has moved if a quarter
-# of the beams change by more than this within that time. Along a corridor only the beams to its
-# ends change; a passer-by hides fewer.
+# The robot is at rest for this long before and after the distances' time.
 _STILL_S = 0.5
-_MOVED_M, _MOVED_SHARE = 0.03, 0.25
 # The first gate of the fit to the walls, how it narrows, to three times as much, and how well the
 # walls must determine each direction (m).
 _GATE_M = 0.2
@@ -43,9 +40,6 @@ _NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
 _WEAK_SIGMA_M = 0.05
 # Distances and walls disagree if right ones would by as much in less than this share.
 _DISAGREEMENT_PROBABILITY = 1e-4
-# The walls decide among several poses if at least this share of the points is on a wall, and the
-# share at the next pose is smaller by at least this fraction.
-_LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +74,9 @@ class ReferencePose:
     pose: FloatArray  # (3,): x, y (m), theta (rad)
     covariance: FloatArray  # (3, 3)
     # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
-    # `moved`: the robot was not at rest; `no scans`: too few readings are on walls; `not asked`.
+    # `no scans`: too few readings are on walls; `not asked`.
     scans: ScanStatus
-    note: str  # Remarks
+    note: str  # Why the scans are not used
     points: int = 0  # Points of the scans on walls that count
     rms_m: float = math.nan  # Of their distances from the walls; NaN without.
     still: StillScans | None = None  # What the scanners on board saw, at rest
@@ -135,89 +129,44 @@ def reference_poses(
     references: list[ReferencePose] = []
     refused: list[Refused] = []
     for d in distances:
-        reference, reason = None, d.reason
-        if d.status in ("ok", "ambiguous") and onboard and segments is not None:
+        if d.status != "ok":
+            refused.append(Refused(d.index, d.time_s, d.status, d.reason))
+        elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            reason = f"{d.reason}; the walls do not decide"
-            try:
-                reference = refine_pose(d, still_scans(onboard, time), segments)
-            except GeometryError as error:
-                if d.status == "ok":
-                    reference = _unrefined(d, "moved", str(error))
-        elif d.status == "ok":
-            reference = _unrefined(d, "not asked")
-        if reference is None:
-            refused.append(Refused(d.index, d.time_s, d.status, reason))
+            references.append(refine_pose(d, still_scans(onboard, time), segments))
         else:
-            references.append(reference)
+            references.append(_unrefined(d, "not asked"))
     return references, refused
 
 
 def _unrefined(
-    d: DistancePose,
-    scans: ScanStatus,
-    reason: str = "",
-    chosen: int = 0,
-    still: StillScans | None = None,
+    d: DistancePose, scans: ScanStatus, reason: str = "", still: StillScans | None = None
 ) -> ReferencePose:
     """The pose by distances alone."""
-    note = "; ".join(part for part in (d.reason, reason) if part)
-    pose, covariance = d.candidates[chosen], d.covariances[chosen]
-    return ReferencePose(d, pose, covariance, scans, note, still=still)
+    return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
 
 
 def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
-    """Average the readings of the on-board scanners about a time.
-
-    `time_s`: on the robot's clock. Raises `GeometryError` if the robot moved then.
-    """
-    scans, changes = [], [np.zeros(0)]
+    """Average the readings of the on-board scanners about a time on the robot's clock."""
+    scans = []
     for board in onboard:
-        ranges = board.scans.ranges_mm[np.abs(board.scans.times_s - time_s) <= _STILL_S]
-        scans.append(still_scan(board.scanner, ranges))
-        half = len(ranges) // 2
-        if half >= 2:
-            metres = np.where(board.scanner.has_return(ranges), 1e-3 * ranges, np.nan)
-            changes.append(np.abs(_median(metres[half:]) - _median(metres[:half])))
-    change = np.concatenate(changes)
-    change = change[np.isfinite(change)]
-    if len(change) and (typical := float(np.quantile(change, 1.0 - _MOVED_SHARE))) > _MOVED_M:
-        raise GeometryError(
-            f"moved: a quarter of the beams change by more than {typical:.3f} m: expected a robot "
-            f"at rest for {2.0 * _STILL_S:g} s"
-        )
+        during = np.abs(board.scans.times_s - time_s) <= _STILL_S
+        scans.append(still_scan(board.scanner, board.scans.ranges_mm[during]))
     return StillScans(tuple(board.scanner for board in onboard), tuple(scans))
 
 
-def _median(metres: FloatArray) -> FloatArray:
-    """(readings,) medians of each beam's returns; NaN where most scans had none."""
-    enough = np.mean(np.isfinite(metres), axis=0) >= 0.5
-    middle = np.full(metres.shape[1], np.nan)
-    middle[enough] = np.nanmedian(metres[:, enough], axis=0)
-    return middle
-
-
-def refine_pose(
-    distances: DistancePose, still: StillScans, segments: FloatArray
-) -> ReferencePose | None:
-    """Combine what distances and walls (S, 4) (m) say of a pose.
-
-    If distances are `ambiguous`, the walls decide; None if they do not.
-    """
-    chosen = 0
-    if distances.status == "ambiguous":
-        decided = _decided(distances, still, segments)
-        if decided is None:
-            return None
-        chosen = decided
-    prior, covariance = distances.candidates[chosen], distances.covariances[chosen]
+def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
+    """Combine what distances and walls (S, 4) (m) say of a pose."""
+    prior, covariance = distances.pose, distances.covariance
     try:
-        found = _by_walls(still, segments, prior)
+        found = fit_to_walls(
+            still.scans, still.mounts, segments, prior, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
+        )
     except GeometryError as error:
-        return _unrefined(distances, "no scans", str(error), chosen)
+        return _unrefined(distances, "no scans", str(error))
     if found.open_directions:
         reason = "the walls leave a direction open"
-        return _unrefined(distances, "undetermined", reason, chosen, still)
+        return _unrefined(distances, "undetermined", reason, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
     apart = pose_differences(found.pose, prior)
@@ -227,38 +176,14 @@ def refine_pose(
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
             "from the pose by distances, more than both allow"
         )
-        return _unrefined(distances, "disagrees", reason, chosen, still)
+        return _unrefined(distances, "disagrees", reason, still)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
     # Joseph's form stays symmetric and positive.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return ReferencePose(
-        distances, pose, combined, "used", distances.reason, found.used, found.rms_m, still
-    )
-
-
-def _by_walls(still: StillScans, segments: FloatArray, start: FloatArray) -> WallFit:
-    return fit_to_walls(
-        still.scans, still.mounts, segments, start, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
-    )
-
-
-def _decided(distances: DistancePose, still: StillScans, segments: FloatArray) -> int | None:
-    """Which candidate's points are on walls, if those of one only are."""
-    count = sum(len(scan.range_m) for scan in still.scans)
-    shares = []
-    for pose in distances.candidates:
-        try:
-            shares.append(_by_walls(still, segments, pose).used / count)
-        except GeometryError:
-            shares.append(0.0)
-    order = np.argsort(shares)[::-1]
-    best, next_best = shares[order[0]], shares[order[1]]
-    if best < _LEAST_SHARE or next_best > (1.0 - _LEAST_SHARE) * best:
-        return None
-    return int(order[0])
+    return ReferencePose(distances, pose, combined, "used", "", found.used, found.rms_m, still)
 
 
 #: Readings farther from the wall that their beam meets are of something else (m).
@@ -334,8 +259,8 @@ def refine_mounts(
     stills = [r.still for r in used if r.still is not None]
     if len(stills) < 3:
         return None
-    priors = np.stack([r.distances.candidates[0] for r in used])
-    roots = whitening(np.stack([r.distances.covariances[0] for r in used]))
+    priors = np.stack([r.distances.pose for r in used])
+    roots = whitening(np.stack([r.distances.covariance for r in used]))
     mounts = stills[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
     along = segments[:, 2:] - segments[:, :2]

@@ -5,7 +5,7 @@
 
 All minima are searched, from starts all round: distances to two points, or to points on a line, fit
 mirrored poses as well. A pose is accepted only if it is determined, no other fits nearly as well,
-and its distances agree within their noise, except for gross errors that can be identified.
+and its distances agree within their noise.
 
 What was measured in the building by tape is held against the drawing: ``dimensions.csv`` has the
 head ``name,x1_m,y1_m,x2_m,y2_m,measured_m`` and a row for each distance between two points of the
@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, known_name, read_table
 from redetect.landmarks import wrap_angle
@@ -100,14 +100,13 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
-_HEADINGS = 24
+# Bearings, and headings, that the search begins from.
+_DIRECTIONS = 12
 _SAME_M = 1e-4
 # Steps of the descent, and when they are as good as none (m, rad).
 _STEPS, _SETTLED = 60, 1e-10
-# Distances that fit less well than this share of right ones hold a gross error; at most two of a
-# pose are left out.
+# Distances that fit less well than this share of right ones contradict each other.
 _GROSS_PROBABILITY = 1e-4
-_MOST_GROSS = 2
 # Another pose within this squared normalised misfit of the best makes it ambiguous.
 _AMBIGUITY_CHI2 = 20.0
 # A pose known less well than this is undetermined.
@@ -124,13 +123,15 @@ class DistancePose:
     # pose fits.
     status: Status
     reason: str  # What is wrong, if anything
-    # (C, 3): poses x, y (m), theta (rad) that fit, the best first; one if the status is `ok`.
-    candidates: FloatArray
-    covariances: FloatArray  # (C, 3, 3): from the distances' standard deviation
-    residuals_m: FloatArray  # (K,): measured distances minus those of the best candidate
-    used: BoolArray  # (K,): false for gross errors
-    chi2: float  # Squared normalised residuals of those used, with `freedom` degrees of freedom
-    freedom: int
+    pose: FloatArray  # (3,): x, y (m), theta (rad) that fit best; NaN without three distances
+    covariance: FloatArray  # (3, 3): from the distances' standard deviation
+    residuals_m: FloatArray  # (K,): measured distances minus those of the pose
+    chi2: float  # Squared normalised residuals, with K - 3 degrees of freedom
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom."""
+        return len(self.residuals_m) - 3
 
 
 def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[DistancePose]:
@@ -138,13 +139,7 @@ def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[
     by_pose: dict[int, list[Distance]] = {}
     for distance in distances:
         by_pose.setdefault(distance.pose, []).append(distance)
-    found = []
-    for index, rows in sorted(by_pose.items()):
-        fiducials = np.array([survey.fiducials[row.fiducial] for row in rows])
-        levers = np.array([survey.robot_points[row.point] for row in rows])
-        lengths = np.array([row.distance_m for row in rows])
-        time = float(np.median([row.time_s for row in rows]))
-        found.append(_solve(index, time, Measured(fiducials, levers, lengths, survey.sigma_m)))
+    found = [_solve(index, rows, survey) for index, rows in by_pose.items()]
     return sorted(found, key=lambda pose: (pose.time_s, pose.index))
 
 
@@ -156,17 +151,11 @@ class Measured(NamedTuple):
     distances_m: FloatArray  # (K,)
     sigma_m: float
 
-    def only(self, kept: BoolArray) -> Measured:
-        """Some of the distances."""
-        chosen = (self.fiducials[kept], self.levers[kept], self.distances_m[kept])
-        return Measured(*chosen, self.sigma_m)
-
 
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    Levenberg-Marquardt from all starts at once: where, for headings all round, two circles about
-    fiducial points meet.
+    Levenberg-Marquardt from all starts at once: all round, in all headings.
     """
     poses = _starts(measured)
     damping = np.full(len(poses), 1e-3)
@@ -202,39 +191,41 @@ def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray
     return measured.distances_m - length, -np.concatenate([along, turn[..., None]], axis=-1)
 
 
-def _solve(index: int, time_s: float, measured: Measured) -> DistancePose:
-    count = len(measured.distances_m)
-    used = np.ones(count, dtype=np.bool_)
-    if count < 3:
-        reason, nothing = f"{count} distances: expected 3 or more", np.zeros((0, 3))
+def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose:
+    time_s = float(np.median([row.time_s for row in rows]))
+    if len(rows) < 3:
+        reason, open_ = f"{len(rows)} distances: expected 3 or more", np.full((3, 3), np.inf)
+        nothing = np.full(len(rows), np.nan)
         return DistancePose(
-            index, time_s, "undetermined", reason, nothing, np.zeros((0, 3, 3)),
-            np.full(count, np.nan), used, math.nan, count - 3,
-        )  # fmt: skip
-    status: Status = "ok"
+            index, time_s, "undetermined", reason, np.full(3, np.nan), open_, nothing, math.nan
+        )
+    measured = Measured(
+        np.array([survey.fiducials[row.fiducial] for row in rows]),
+        np.array([survey.robot_points[row.point] for row in rows]),
+        np.array([row.distance_m for row in rows]),
+        survey.sigma_m,
+    )
     poses, costs = distance_minima(measured)
-    reason = ""
-    if _improbable(costs[0], count - 3):
-        kept, reason = _without_gross(measured)
-        if kept is None:
-            status = "inconsistent"
-        else:
-            used = kept
-            poses, costs = distance_minima(measured.only(used))
-    candidates = poses[costs < costs[0] + _AMBIGUITY_CHI2]
-    residuals, jacobians = distance_residuals(candidates, measured)
-    covariances = np.stack([_covariance(j[used], measured.sigma_m) for j in jacobians])
-    if status == "ok":
-        status, fault = _determined(candidates, covariances)
-        reason = "; ".join(part for part in (fault, reason) if part)
+    residuals, jacobian = distance_residuals(poses[0], measured)
+    covariance, freedom = _covariance(jacobian, survey.sigma_m), len(rows) - 3
+    if freedom > 0 and float(chdtrc(freedom, costs[0])) < _GROSS_PROBABILITY:
+        status: Status = "inconsistent"
+        worst = int(np.argmax(np.abs(residuals)))
+        reason = (
+            "the distances contradict each other: farthest off, by "
+            f"{1e3 * residuals[worst]:+.0f} mm, is that of {rows[worst].point} from "
+            f"{rows[worst].fiducial}"
+        )
+    else:
+        status, reason = _determined(poses[costs < costs[0] + _AMBIGUITY_CHI2], covariance)
     return DistancePose(
-        index, time_s, status, reason, candidates, covariances, residuals[0], used,
-        float(costs[0]), int(used.sum()) - 3,
-    )  # fmt: skip
+        index, time_s, status, reason, poses[0], covariance, residuals, float(costs[0])
+    )
 
 
-def _determined(candidates: FloatArray, covariances: FloatArray) -> tuple[Status, str]:
-    sigma = np.sqrt(np.diagonal(covariances[0]))
+def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
+    """Whether a pose is known, of (C, 3) that fit, the best first, with its covariance (3, 3)."""
+    sigma = np.sqrt(np.diagonal(covariance))
     place, turn = float(np.hypot(sigma[0], sigma[1])), math.degrees(sigma[2])
     # NaN and infinity fail these comparisons too.
     if not (place < _LARGEST_SIGMA_M and turn < _LARGEST_SIGMA_DEG):
@@ -250,33 +241,6 @@ def _determined(candidates: FloatArray, covariances: FloatArray) -> tuple[Status
     return "ok", ""
 
 
-def _without_gross(measured: Measured) -> tuple[BoolArray | None, str]:
-    """Which distances to keep so that the rest agrees, or None, and what there is to say."""
-    used = np.ones(len(measured.distances_m), dtype=np.bool_)
-    for removed in range(1, _MOST_GROSS + 1):
-        # With less than one degree of freedom left anything fits.
-        if int(used.sum()) - 1 < 4:
-            break
-        trials = []
-        for k in np.flatnonzero(used).tolist():
-            kept = used.copy()
-            kept[k] = False
-            trials.append((float(distance_minima(measured.only(kept))[1][0]), k))
-        trials.sort()
-        used[trials[0][1]] = False
-        freedom = int(used.sum()) - 3
-        if not _improbable(trials[0][0], freedom):
-            if len(trials) > 1 and not _improbable(trials[1][0], freedom):
-                return None, "the distances contradict each other, and it is not clear which errs"
-            plural = "s" if removed > 1 else ""
-            return used, f"{removed} gross error{plural} left out"
-    return None, "the distances contradict each other"
-
-
-def _improbable(cost: float, freedom: int) -> bool:
-    return freedom > 0 and float(chdtrc(freedom, cost)) < _GROSS_PROBABILITY
-
-
 def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
     """(3, 3); infinite where the distances leave a direction open."""
     information = jacobian.T @ jacobian / sigma_m**2
@@ -287,25 +251,11 @@ def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
 
 
 def _starts(measured: Measured) -> FloatArray:
-    """(S, 3) poses at which, for a heading, two of the distances are right."""
-    fiducials, levers, distances_m, _ = measured
-    pairs = _wide_pairs(fiducials)
-    starts = []
-    for heading in np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS):
-        c, s = np.cos(heading), np.sin(heading)
-        centres = fiducials - levers @ np.array([[c, s], [-s, c]])
-        for k, m in pairs:
-            across = centres[m] - centres[k]
-            apart = max(float(np.hypot(*across)), 1e-9)
-            unit = across / apart
-            along = (apart**2 + distances_m[k] ** 2 - distances_m[m] ** 2) / (2.0 * apart)
-            # Noise, or the wrong heading, keeps circles apart: then the place nearest to both.
-            along = float(np.clip(along, -distances_m[k], distances_m[k]))
-            up = math.sqrt(max(distances_m[k] ** 2 - along**2, 0.0))
-            for side in (up, -up):
-                place = centres[k] + along * unit + side * np.array([-unit[1], unit[0]])
-                starts.append((place[0], place[1], heading))
-    return np.array(starts)
+    """(S, 3) poses in all headings, all round the fiducial of the first distance."""
+    angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
+    bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
+    point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
+    return np.column_stack([point - rotation(heading) @ measured.levers[0], heading])
 
 
 def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
@@ -317,19 +267,6 @@ def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
         if not np.any(apart.max(axis=1, initial=0.0) < closer):
             kept.append(i)
     return kept
-
-
-def _wide_pairs(fiducials: FloatArray) -> list[tuple[int, int]]:
-    """Two pairs of far fiducials that share no distance, so that one gross error spoils one."""
-    apart = np.hypot(*(fiducials[:, None] - fiducials[None]).transpose(2, 0, 1))
-    pairs = []
-    for _ in range(2):
-        k, m = (int(i) for i in np.unravel_index(int(np.argmax(apart)), apart.shape))
-        if k != m:
-            pairs.append((k, m))
-            apart[[k, m], :] = -1.0
-            apart[:, [k, m]] = -1.0
-    return pairs or [(0, 1)]
 
 
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"

@@ -5,6 +5,7 @@ A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,24 +33,67 @@ _FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
-class PoseScore:
-    """How far poses are from the truth."""
+class ErrorFigures:
+    """Figures of the errors of poses, absolute or relative ones; sigmas are with N - 1."""
 
-    poses: int  # Poses compared with the truth
-    unmatched: int  # Poses without truth at their time
-    position_mean_m: float  # Of the distances from the truth; sigma with N - 1
+    position_mean_m: float  # Of the distances from the truth
     position_sigma_m: float
+    position_median_m: float
     position_rmse_m: float
     position_max_m: float
     angle_mean_rad: float  # Of the signed differences of heading
     angle_sigma_rad: float
-    angle_max_rad: float  # Without sign
-    angle_abs_mean_rad: float  # Mean of the differences without sign
-    position_median_m: float
+    angle_rmse_rad: float
+    angle_abs_mean_rad: float  # Of the differences without sign
+    angle_max_rad: float
+
+
+def _figures(error: FloatArray) -> dict[str, float]:
+    """The `ErrorFigures` of (N, 3) errors x, y (m), theta (rad)."""
+    distance, turn = np.hypot(error[:, 0], error[:, 1]), error[:, 2]
+    figures = ErrorFigures(
+        float(distance.mean()),
+        sigma_of(distance),
+        float(np.median(distance)),
+        float(np.sqrt(np.mean(distance**2))),
+        float(distance.max()),
+        float(turn.mean()),
+        sigma_of(turn),
+        float(np.sqrt(np.mean(turn**2))),
+        float(np.abs(turn).mean()),
+        float(np.abs(turn).max()),
+    )
+    return vars(figures)
+
+
+@dataclass(frozen=True)
+class PoseScore(ErrorFigures):
+    """How far poses are from the truth."""
+
+    poses: int  # Poses compared with the truth
+    unmatched: int  # Poses without truth at their time
     normalised: int  # Poses whose covariance could be inverted
     # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
     # right. NaN without covariances.
     normalised_error: float
+
+    def lines(self) -> list[str]:
+        """The figures to print."""
+        nees = "none: no covariance that can be inverted"
+        if self.normalised:
+            low, high = normalised_band(self.normalised)
+            nees = (
+                f"{self.normalised_error:.3f} over {self.normalised} poses; 95 % of right, "
+                f"independent ones between {low:.3f} and {high:.3f}"
+            )
+        return [
+            f"position error     mean {1e3 * self.position_mean_m:.2f} mm, sigma "
+            f"{1e3 * self.position_sigma_m:.2f}, rmse {1e3 * self.position_rmse_m:.2f}, max "
+            f"{1e3 * self.position_max_m:.2f}",
+            f"angle error        mean {math.degrees(self.angle_mean_rad):+.3f} deg, sigma "
+            f"{math.degrees(self.angle_sigma_rad):.3f}, max {math.degrees(self.angle_max_rad):.3f}",
+            f"normalised error squared / dof  {nees}",
+        ]
 
 
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
@@ -57,24 +101,14 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
 
     If the truth has covariances, they count in the normalised error. `unmatched` is handed through.
     """
-    error = pose_differences(poses.poses, truth.poses)
-    distance = np.hypot(error[:, 0], error[:, 1])
     normalised = normalised_errors(poses, truth)
     normalised = normalised[np.isfinite(normalised)]
     return PoseScore(
-        len(poses),
-        unmatched,
-        float(distance.mean()),
-        sigma_of(distance),
-        float(np.sqrt(np.mean(distance**2))),
-        float(distance.max()),
-        float(error[:, 2].mean()),
-        sigma_of(error[:, 2]),
-        float(np.abs(error[:, 2]).max()),
-        float(np.abs(error[:, 2]).mean()),
-        float(np.median(distance)),
-        len(normalised),
-        float(normalised.mean()) if len(normalised) else float("nan"),
+        **_figures(pose_differences(poses.poses, truth.poses)),
+        poses=len(poses),
+        unmatched=unmatched,
+        normalised=len(normalised),
+        normalised_error=float(normalised.mean()) if len(normalised) else float("nan"),
     )
 
 
@@ -117,19 +151,11 @@ class Relations:
 
 
 @dataclass(frozen=True)
-class RelativeScore:
-    """Relative errors."""
+class RelativeScore(ErrorFigures):
+    """Relative errors: of the translations and rotations truth^-1 * estimate."""
 
     pairs: int  # Pairs of times compared with the truth
     unmatched: int  # Pairs that one side has no pose for, or that are too far apart
-    position_mean_m: float  # Of the lengths of the errors' translations; sigma with N - 1
-    position_sigma_m: float
-    position_median_m: float
-    position_rmse_m: float
-    position_max_m: float
-    angle_rmse_rad: float  # Of the errors' rotations
-    angle_abs_mean_rad: float
-    angle_max_rad: float
 
 
 def read_relations(path: str | os.PathLike[str]) -> Relations:
@@ -192,19 +218,7 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
     if not len(truth):
         raise GroundTruthError("no two times with poses to compare relative to each other")
     error = between(truth, estimates)
-    length = np.hypot(error[:, 0], error[:, 1])
-    return RelativeScore(
-        len(error),
-        unmatched,
-        float(length.mean()),
-        sigma_of(length),
-        float(np.median(length)),
-        float(np.sqrt(np.mean(length**2))),
-        float(length.max()),
-        float(np.sqrt(np.mean(error[:, 2] ** 2))),
-        float(np.abs(error[:, 2]).mean()),
-        float(np.abs(error[:, 2]).max()),
-    )
+    return RelativeScore(**_figures(error), pairs=len(error), unmatched=unmatched)
 
 
 def _at(

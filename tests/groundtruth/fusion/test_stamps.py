@@ -43,8 +43,6 @@ def test_a_measurement_written_twice_counts_once() -> None:
     )
     once, found = fuse(odometry, {"laser": laser}), fuse(odometry, {"laser": twice})
     np.testing.assert_array_equal(found.poses.covariances, once.poses.covariances)
-    assert found.repeated == {"laser": len(laser)}
-    assert once.repeated == {"laser": 0}
     assert found.used == once.used
 
 

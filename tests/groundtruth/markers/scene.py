@@ -16,10 +16,10 @@ from redetect.groundtruth.trajectories.transforms import (
     apply,
     exp_se3,
     inverse,
-    planar_transform,
     transform,
 )
 from redetect.landmarks import MarkerCorner, MarkerLandmark
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.track import choose_candidates
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import exp_se3, planar_transform
+from redetect.groundtruth.trajectories.transforms import exp_se3
 from tests.groundtruth.markers.scene import hall_cameras, pose_problem
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ def estimate(*poses: FloatArray, odds: float = 0.5) -> PoseEstimate:
         PoseCandidate(pose, COVARIANCE, 2.0, 2, np.ones(1), np.ones(1), np.ones(1, dtype=np.bool_))
         for pose in poses
     )
-    return PoseEstimate(candidates, tuple(odds * i for i in range(len(poses))), False)
+    return PoseEstimate(candidates, tuple(odds * i for i in range(len(poses))))
 
 
 def driving(i: int) -> FloatArray:

@@ -17,7 +17,6 @@ from redetect.groundtruth.markers.adjustment import (
 )
 from redetect.groundtruth.markers.poses import SOLVERS, solve_camera, solve_robot
 from redetect.groundtruth.markers.refinement import (
-    floor_residuals,
     predicted_errors,
     refine_pose,
 )
@@ -31,7 +30,6 @@ from redetect.groundtruth.trajectories.transforms import (
     log_se3,
     planar_covariance,
     planar_jacobian,
-    roll_pitch,
 )
 from tests.groundtruth.markers.scene import (
     LEAST_SQUARES,
@@ -84,19 +82,15 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
             np.testing.assert_allclose(analytic[..., k], numeric, rtol=1e-5, atol=2e-3)
 
 
-def test_the_floors_and_the_planes_jacobians_are_derivatives() -> None:
+def test_the_planes_jacobians_are_derivatives() -> None:
     generator = np.random.default_rng(3)
-    floor = PoseSettings(floor_z_m=0.02, floor_sigma_z_m=0.01, floor_sigma_tilt_deg=0.3)
     step = 1e-6
     for _ in range(20):
         pose = exp_se3(generator.normal(0.0, 0.4, 6))
-        _, by_pose = floor_residuals(pose, floor)
         to_plane = planar_jacobian(pose)
         for k in range(6):
             ahead = pose @ exp_se3(step * np.eye(6)[k])
             behind = pose @ exp_se3(-step * np.eye(6)[k])
-            missing = floor_residuals(ahead, floor)[0] - floor_residuals(behind, floor)[0]
-            np.testing.assert_allclose(-missing / (2 * step), by_pose[:, k], atol=1e-5)
             numeric = (planar(ahead) - planar(behind)) / (2 * step)
             np.testing.assert_allclose(numeric, to_plane[:, k], atol=1e-8)
 
@@ -177,7 +171,7 @@ def test_what_is_no_pose_is_refused() -> None:
 
 
 def normalised_errors(
-    draws: int, *, seed: int, calibration_sigma: float, floor: bool, cameras: int
+    draws: int, *, seed: int, calibration_sigma: float, cameras: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Normalised errors squared of the poses (6 dof) and of x, y, theta (3 dof); costs / dof."""
     generator = np.random.default_rng(seed)
@@ -191,7 +185,6 @@ def normalised_errors(
     squares, plane, costs = [], [], []
     for _ in range(draws):
         truth = robot_pose(generator)
-        stance = replace(LEAST_SQUARES, floor=floor, floor_sigma_tilt_deg=float(np.degrees(0.01)))
         true = pose_problem(truth, cameras=cameras, noise=generator, sigma_px=0.15)
         moved_rig = rig.robot_from_marker @ exp_se3(
             (marker_factor @ generator.normal(size=36)).reshape(6, 6)
@@ -203,7 +196,7 @@ def normalised_errors(
             true,
             network=network_of(moved_cameras, camera_covariance),
             rig=replace(rig, robot_from_marker=moved_rig, covariance=marker_covariance),
-            settings=stance,
+            settings=LEAST_SQUARES,
         )
         result = refine_pose(believed, truth)
         error = log_se3(inverse(truth) @ result.world_from_robot)
@@ -218,15 +211,15 @@ def normalised_errors(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("calibration_sigma", "floor", "cameras"),
-    [(0.0, False, 4), (0.0, True, 1), (2e-3, False, 2), (5e-3, False, 4), (3e-3, True, 2)],
+    ("calibration_sigma", "cameras"),
+    [(0.0, 4), (0.0, 1), (2e-3, 2), (5e-3, 4), (3e-3, 2)],
 )
 def test_the_normalised_error_is_that_of_its_distribution(
-    calibration_sigma: float, floor: bool, cameras: int
+    calibration_sigma: float, cameras: int
 ) -> None:
     draws = 50
     squares, plane, costs = normalised_errors(
-        draws, seed=7, calibration_sigma=calibration_sigma, floor=floor, cameras=cameras
+        draws, seed=7, calibration_sigma=calibration_sigma, cameras=cameras
     )
     for values, dof in ((squares, 6), (plane, 3)):
         low, high = chi2.ppf([0.005, 0.995], dof * draws) / draws
@@ -278,24 +271,6 @@ def test_a_robust_loss_gives_a_bad_view_little_say(loss: str) -> None:
         return float(np.linalg.norm(log_se3(inverse(truth) @ result.world_from_robot)))
 
     assert error(loss) < 0.5 * error("linear")
-
-
-def test_the_floor_holds_what_a_far_marker_cannot() -> None:
-    generator = np.random.default_rng(11)
-    rig = box_rig()
-    truth = np.eye(4)
-    truth[:2, 3] = 0.3, 0.2
-    known = replace(LEAST_SQUARES, floor=True, floor_sigma_z_m=3e-4, floor_sigma_tilt_deg=0.017)
-    free: list[float] = []
-    held: list[float] = []
-    for _ in range(30):
-        for settings, kept in ((LEAST_SQUARES, free), (known, held)):
-            problem = pose_problem(
-                truth, cameras=1, pairs=[(0, 2)], noise=generator, settings=settings, rig=rig
-            )
-            pose = refine_pose(problem, truth).world_from_robot
-            kept.append(np.abs(roll_pitch(pose)).max())
-    assert np.median(held) < 0.2 * np.median(free)
 
 
 def test_cameras_are_where_the_scene_says() -> None:

@@ -19,19 +19,15 @@ from redetect.groundtruth.markers.pairs import (
 from redetect.groundtruth.markers.rig_estimation import (
     RigEstimate,
     estimate_rig,
-    rig_by_known_markers,
-    rig_by_reference_poses,
 )
 from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.settings import RigSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import (
     exp_se3,
     inverse,
     log_se3,
     mean_pose,
-    planar_transform,
 )
 from tests.groundtruth.markers.scene import (
     box_rig,
@@ -44,6 +40,7 @@ from tests.groundtruth.markers.scene import (
     points_of,
     visible,
 )
+from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 
@@ -86,14 +83,15 @@ def estimated(
     rig: Rig,
     scale_px: float = 900.0,
     reference: int | None = None,
+    known: Rig | None = None,
 ) -> RigEstimate:
     return estimate_rig(
         groups,
         network_of(np.eye(4)[None], scale_px=scale_px),
-        rig.dictionary,
-        dict(zip(rig.ids, rig.widths_m.tolist())),
+        float(rig.widths_m[0]),
         RigSettings(corner_floor_px=0.0),
         reference=reference,
+        known=known,
     )
 
 
@@ -274,8 +272,7 @@ def test_cameras_of_a_network_see_the_rig_together() -> None:
     estimate = estimate_rig(
         groups,
         network_of(hall_cameras(4)),
-        rig.dictionary,
-        dict(zip(rig.ids, rig.widths_m.tolist())),
+        float(rig.widths_m[0]),
         RigSettings(corner_floor_px=0.0),
     )
     assert (0, 2) in estimate.pairs  # front and back: no single camera sees both
@@ -297,66 +294,32 @@ def frame_error(estimate: RigEstimate, rig: Rig, known: tuple[int, ...] = ()) ->
 
 def test_the_frame_follows_from_known_markers() -> None:
     rig = box_rig()
-    estimate = estimated(walk_round(rig, 25, seed=12), rig)
     exact = Rig("rawseeds", (33,), rig.widths_m[2:3], rig.robot_from_marker[2:3], np.zeros((6, 6)))
-    moved = rig_by_known_markers(estimate, exact, RigSettings())
+    groups = walk_round(rig, 25, seed=12)
+    moved = estimated(groups, rig, known=exact)
     np.testing.assert_allclose(moved.rig.robot_from_marker[2], rig.robot_from_marker[2], atol=1e-5)
     assert frame_error(moved, rig, (33,)) < 2.0
-    # What was the frame before is as unsure now as anything else.
+    # What the others were chained to is as unsure as anything else.
+    assert moved.reference != 33
     sigmas = np.sqrt(np.diagonal(moved.adjusted.part_covariance)).reshape(6, 6)
-    assert sigmas[rig.ids.index(estimate.reference)].min() > 1e-5
+    assert sigmas[rig.ids.index(moved.reference)].min() > 1e-5
     other = Rig("rawseeds", (77,), rig.widths_m[:1], rig.robot_from_marker[:1], np.zeros((6, 6)))
     with pytest.raises(GroundTruthError, match="none of \\[77\\]"):
-        rig_by_known_markers(estimate, other, RigSettings())
+        estimated(groups, rig, known=other)
 
 
 def test_several_measured_markers_define_the_frame_together() -> None:
     rig = box_rig()
     generator = np.random.default_rng(13)
     sigmas = np.array([2e-3] * 3 + [5e-3] * 3)
-    estimate = estimated(walk_round(rig, 40, seed=13), rig)
+    groups = walk_round(rig, 40, seed=13)
     measured = replace(
         rig,
         robot_from_marker=rig.robot_from_marker @ exp_se3(sigmas * generator.normal(size=(6, 6))),
         covariance=np.diag(np.tile(sigmas**2, 6)),
     )
-    moved = rig_by_known_markers(estimate, measured, RigSettings())
+    moved = estimated(groups, rig, known=measured)
     assert frame_error(moved, rig) < 2.0
-
-
-@pytest.mark.long
-def test_the_frame_follows_from_reference_poses() -> None:
-    rig = box_rig()
-    generator = np.random.default_rng(14)
-    times = np.arange(0.0, 120.0, 10.0)
-    planar = np.column_stack(
-        [generator.uniform(-1, 1, (12, 2)), generator.uniform(-np.pi, np.pi, 12)]
-    )
-    poses = np.stack([planar_transform(*map(float, row)) for row in planar])
-    frames = frames_of(times, poses, rig=rig)
-    sigmas = np.array([1e-3] * 6)
-    believed = hall_cameras(4) @ exp_se3(sigmas * generator.normal(size=(4, 6)))
-    estimate = estimate_rig(
-        [tuple(f for f in frames if f.time_s == t) for t in times],
-        network_of(believed, np.diag(np.tile(sigmas**2, 4))),
-        rig.dictionary,
-        dict(zip(rig.ids, rig.widths_m.tolist())),
-        RigSettings(corner_floor_px=0.0),
-    )
-    measured = planar + generator.normal(0, 0.002, planar.shape)
-    covariances = np.tile(np.eye(3) * 0.002**2, (12, 1, 1))
-    moved, used = rig_by_reference_poses(
-        estimate, PlanarPoses(times, measured, covariances), RigSettings()
-    )
-    assert used == 12
-    error = log_se3(inverse(rig.robot_from_marker) @ moved.rig.robot_from_marker)
-    assert np.abs(error).max() < 8e-3
-    assert frame_error(moved, rig) < 2.0
-    _, used = rig_by_reference_poses(estimate, PlanarPoses(times[:5], planar[:5]), RigSettings())
-    assert used == 5
-    late = PlanarPoses(np.asarray(times + 3.0), planar)
-    with pytest.raises(GroundTruthError, match="at the time of any reference pose"):
-        rig_by_reference_poses(estimate, late, RigSettings())
 
 
 # -- parts ----------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 
 from redetect.groundtruth.cli import main
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.report.inputs import Inputs, Interval, gather
+from redetect.groundtruth.report.inputs import Inputs, gather
 from redetect.groundtruth.report.page import report_page, table
 from redetect.groundtruth.report.pictures import (
     Series,
@@ -172,7 +172,7 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
         "refused": [{"index": HOSTILE, "status": HOSTILE, "reason": HOSTILE}, HOSTILE],
         "rejected": [{"stream": HOSTILE, "time_s": 1e999, "squared_innovation": HOSTILE}, 5],
         "used": {HOSTILE: HOSTILE}, "restarts_s": HOSTILE,
-        "scanners": [{"name": HOSTILE, "suspect": 1}, None],
+        "scanners": [{"name": HOSTILE, "suspect": 1}, None], "sets": {HOSTILE: HOSTILE},
     }  # fmt: skip
     for name in ("fused.json", "laser.json", "aligned.json", "validation/validation.json"):
         (session / name).write_text(json.dumps(hostile))
@@ -183,7 +183,6 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
     }  # fmt: skip
     document = {"segments": [segment], "ptpd": {HOSTILE: HOSTILE}}
     (session / "clock.json").write_text(json.dumps(document))
-    (session / "laser.jsonl").write_text(json.dumps({"t": 5.0, "status": HOSTILE}) + "\n")
     (session / "camera.csv").write_text("1,2,<script>alert(1)</script>,4\n")
     (session / "validation" / "errors.png").write_bytes(b"<svg onload=alert(1)>")
     assert main(["report", str(session)]) == 0
@@ -217,11 +216,9 @@ def test_files_larger_than_the_bounds_are_not_read(
 ) -> None:
     (session / "validation").mkdir()
     (session / "validation" / "errors.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    (session / "laser.jsonl").write_text('{"t": 1, "status": "ok"}\n' * 10)
     (session / "laser.json").write_text(json.dumps({"settings": "x" * 100}))
     assert not gather(session).problems
     for module, name in (
-        ("report.inputs", "_MOST_LINES_BYTES"),
         ("report.inputs", "_MOST_PICTURE_BYTES"),
         ("files", "_LARGEST_FILE_BYTES"),
     ):
@@ -229,12 +226,10 @@ def test_files_larger_than_the_bounds_are_not_read(
     inputs = gather(session)
     for place, kind in (
         ("validation/errors.png", "picture"),
-        ("laser.jsonl", "file"),
         ("laser.json", "file"),
     ):
         assert f"{place}: cannot be read as a {kind}: larger than 64 bytes" in inputs.problems
     assert not inputs.pictures
-    assert not inputs.sets
 
 
 def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -257,7 +252,6 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     (session / "fused.json").write_text("[" * 100_000)
     (session / "laser.json").write_text("[1]")
     (session / "clock.json").write_text('{"segments": []}')
-    (session / "laser.jsonl").write_text('{"t": 1, "status": "ok"}\nnonsense\n')
     (session / "building.csv").write_text("1,2,3\n")
     output = session / "page.html"
     assert main(["report", str(session), "-o", str(output)]) == 0
@@ -265,7 +259,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     assert_harmless(page)
     warnings = capsys.readouterr().err
     for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected a JSON",
-                  "clock.json: segm", "laser.jsonl:2: expected", "building.csv:1:"):  # fmt: skip
+                  "clock.json: segm", "building.csv:1:"):  # fmt: skip
         assert words in page.text
         assert words in warnings
     assert "cameras" in page.text
@@ -329,21 +323,6 @@ def test_odometry_is_brought_to_the_truth(session: Path) -> None:
     odometry = gather(session).odometry
     assert odometry is not None
     assert compare_streams(odometry, truth).position_max_m < 1e-5
-
-
-def test_stretches_without_a_pose_are_counted(session: Path) -> None:
-    status = ["lost", "ok", "ok", "coasting", "coasting", "ok", "undetermined", "reacquired"]
-    lines = [json.dumps({"t": 1.0 + k, "status": name}) for k, name in enumerate(status)]
-    (session / "laser.jsonl").write_text("\n".join(lines) + "\n")
-    inputs = gather(session)
-    assert inputs.sets == {"lost": 1, "ok": 3, "coasting": 2, "undetermined": 1, "reacquired": 1}
-    assert inputs.intervals == [
-        Interval("lost", 1.0, 1.0, 1),
-        Interval("coasting", 4.0, 5.0, 2),
-        Interval("undetermined", 7.0, 7.0, 1),
-    ]
-    page = Page(report_page(inputs, "1"))
-    assert "was not determined 3 times" in page.text
 
 
 def test_ellipses_are_three_sigma() -> None:

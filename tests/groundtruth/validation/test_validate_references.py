@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.validation.onboard import Onboard, refine_pose, still_scans
 from redetect.groundtruth.validation.reference_poses import (
@@ -93,17 +92,14 @@ def cast(pose: FloatArray, mounted: Scanner, walls: FloatArray) -> FloatArray:
     return np.asarray(np.where(hit, distance, np.inf).min(axis=1))
 
 
-def onboard(
-    pose: FloatArray, walls: FloatArray, rng: np.random.Generator, drift_m: float = 0.0
-) -> list[Onboard]:
-    """A second of scans of a robot that stands, or is pushed along x by `drift_m`."""
+def onboard(pose: FloatArray, walls: FloatArray, rng: np.random.Generator) -> list[Onboard]:
+    """A second of scans of a robot that stands."""
     boards = []
     times = np.arange(4.5, 5.5, 0.02)
     for mounted in (scanner("front", (0.3, 0.0, 0.0)), scanner("rear", (-0.4, 0.0, math.pi))):
         ranges = []
-        for k in range(len(times)):
-            moved = pose + np.array([drift_m * k / len(times), 0.0, 0.0])
-            exact = cast(moved, mounted, walls)
+        exact = cast(pose, mounted, walls)
+        for _ in times:
             noisy = exact + mounted.sigma_m * rng.normal(size=len(exact))
             ranges.append(np.where(np.isfinite(noisy), np.rint(1e3 * noisy), 0).astype(np.uint16))
         boards.append(Onboard(mounted, Scans(times, np.stack(ranges))))
@@ -115,10 +111,9 @@ def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -
     survey = survey_of()
     found = solved(measured((x, y, theta), survey), survey)
     assert found.status == "ok"
-    np.testing.assert_allclose(found.candidates[0, :2], [x, y], atol=1e-7)
-    assert abs(float(wrap_angle(found.candidates[0, 2:] - theta)[0])) < 1e-7
+    np.testing.assert_allclose(found.pose[:2], [x, y], atol=1e-7)
+    assert abs(float(wrap_angle(found.pose[2:] - theta)[0])) < 1e-7
     assert found.freedom == 9
-    assert found.used.all()
 
 
 @pytest.mark.long
@@ -129,9 +124,9 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     squared, costs = [], []
     for _ in range(50):
         found = solved(measured(truth, survey, rng), survey)
-        error = found.candidates[0] - truth
+        error = found.pose - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
-        squared.append(error @ np.linalg.solve(found.covariances[0], error))
+        squared.append(error @ np.linalg.solve(found.covariance, error))
         costs.append(found.chi2)
     low, high = chi2.ppf([0.001, 0.999], 150)
     assert low < sum(squared) < high
@@ -161,13 +156,13 @@ def test_points_in_a_line_leave_the_mirror_image_and_it_is_said() -> None:
     found = solved(measured((3.0, 2.0, 0.4), survey), survey)
     assert found.status == "ambiguous"
     assert "2 poses fit" in found.reason
-    signs = sorted(np.sign(found.candidates[:, 1]).tolist())
-    assert signs == [-1.0, 1.0]
+    assert "(3.00, 2.00, 23 deg)" in found.reason
+    assert "(3.00, -2.00, -23 deg)" in found.reason
     # Three points that are not in a line fit one side only.
     survey = survey_of(line)
     found = solved(measured((3.0, 2.0, 0.4), survey), survey)
     assert found.status == "ok"
-    np.testing.assert_allclose(found.candidates[0], [3.0, 2.0, 0.4], atol=1e-7)
+    np.testing.assert_allclose(found.pose, [3.0, 2.0, 0.4], atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -186,20 +181,16 @@ def test_too_little_for_a_pose_is_said(keep: object, message: str) -> None:
     assert message in found.reason
 
 
-def test_a_gross_error_is_found_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gross_error_is_named() -> None:
     rng = np.random.default_rng(3)
     survey = survey_of()
     rows = measured((6.0, 3.0, -2.0), survey, rng)
     wrong = rows[7]
     rows[7] = Distance(0, 5.0, wrong.point, wrong.fiducial, wrong.distance_m + 0.5)
     found = solved(rows, survey)
-    assert found.status == "ok"
-    assert np.flatnonzero(~found.used).tolist() == [7]
-    assert "1 gross error" in found.reason
-    np.testing.assert_allclose(found.candidates[0], [6.0, 3.0, -2.0], atol=0.03)
-    assert found.residuals_m[7] == pytest.approx(0.5, abs=0.03)
-    monkeypatch.setattr("redetect.groundtruth.validation.reference_poses._MOST_GROSS", 0)
-    assert poses_from_distances(survey, rows)[0].status == "inconsistent"
+    assert found.status == "inconsistent"
+    assert np.argmax(found.residuals_m) == 7
+    assert f"that of {wrong.point} from {wrong.fiducial}" in found.reason
 
 
 def test_distances_that_contradict_each_other_are_refused() -> None:
@@ -225,33 +216,14 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
         prior = solved(measured(truth, survey, rng), survey)
         refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
-        assert refined is not None
         assert refined.scans == "used", refined.note
         error = refined.pose - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
         total += float(error @ np.linalg.solve(refined.covariance, error))
         assert math.hypot(error[0], error[1]) < 0.003
-        assert np.all(np.linalg.eigvalsh(prior.covariances[0] - refined.covariance) > 0)
+        assert np.all(np.linalg.eigvalsh(prior.covariance - refined.covariance) > 0)
     low, high = chi2.ppf([0.001, 0.999], 60)
     assert low < total < high
-
-
-def test_walls_decide_between_mirror_images() -> None:
-    rng = np.random.default_rng(5)
-    survey = survey_of(
-        {"a": (0.0, 3.0), "b": (4.0, 3.0), "c": (10.0, 3.0)},
-        {"front": (0.3, 0.0), "back": (-0.4, 0.0)},
-    )
-    truth = np.array([4.0, 1.9, 0.7])
-    prior = solved(measured(truth, survey, rng), survey)
-    assert prior.status == "ambiguous"
-    refined = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
-    assert refined is not None
-    assert refined.scans == "used"
-    np.testing.assert_allclose(refined.pose, truth, atol=0.005)
-    # Walls that no reading lies on decide nothing.
-    points = still_scans(onboard(truth, ROOM, rng), 5.0)
-    assert refine_pose(prior, points, ROOM + 300.0) is None
 
 
 def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
@@ -261,9 +233,8 @@ def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
     truth = np.array([4.0, 1.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
     refined = refine_pose(prior, still_scans(onboard(truth, corridor, rng), 5.0), corridor)
-    assert refined is not None
     assert refined.scans == "undetermined"
-    np.testing.assert_array_equal(refined.pose, prior.candidates[0])
+    np.testing.assert_array_equal(refined.pose, prior.pose)
 
 
 def test_walls_elsewhere_disagree_and_distances_stand() -> None:
@@ -273,13 +244,11 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     prior = solved(measured(truth, survey, rng), survey)
     points = still_scans(onboard(truth, ROOM, rng), 5.0)
     refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
-    assert refined is not None
     assert refined.scans == "disagrees"
     assert "more than both allow" in refined.note
-    np.testing.assert_array_equal(refined.pose, prior.candidates[0])
+    np.testing.assert_array_equal(refined.pose, prior.pose)
     # No readings at all about the time.
     nothing = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 99.0), ROOM)
-    assert nothing is not None
     assert nothing.scans == "no scans"
 
 
@@ -294,16 +263,7 @@ def test_an_unsure_mount_makes_the_pose_unsure() -> None:
     mounted = tuple(replace(one, covariance=sigma) for one in points.scanners)
     loose = points._replace(scanners=mounted)
     unsure = refine_pose(prior, loose, ROOM)
-    assert sure is not None
-    assert unsure is not None
     assert unsure.scans == "used"
     # Two mounts, each 1 cm unsure, share the pose: somewhere about 7 mm.
     assert 0.003 < math.sqrt(unsure.covariance[0, 0]) < 0.015
     assert sure.covariance[0, 0] < 0.1 * unsure.covariance[0, 0]
-
-
-def test_a_robot_that_moves_is_noticed() -> None:
-    rng = np.random.default_rng(9)
-    truth = np.array([4.0, 2.5, 0.2])
-    with pytest.raises(GeometryError, match=r"^moved: a quarter"):
-        still_scans(onboard(truth, ROOM, rng, drift_m=0.2), 5.0)

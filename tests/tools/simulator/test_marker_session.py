@@ -20,11 +20,11 @@ from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     log_se3,
-    planar_transform,
     transform_from_quaternion,
 )
 from redetect.landmarks.times import read_times
 from tools.simulator.__main__ import main
+from tools.simulator.driving import planar_transform
 from tools.simulator.markers.calibration_set import (
     DOUBLE,
     WORLD,
@@ -352,5 +352,5 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), grey_image(light, 1.0, imaging, np.random.default_rng(0)))
         truth = camera.project(apply(camera_from_board, board.points))
-        found = find_boards(BoardImage("a", "b", 0, path, None), same, camera)
+        found = find_boards(BoardImage("a", "b", 0, path), same, camera)
         assert np.abs(found.corners - truth).max() < 0.5

@@ -7,9 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from redetect.groundtruth.trajectories.transforms import planar_transform
 from redetect.slam.models import disc_in_robot
-from tools.simulator.driving import tilted_camera
+from tools.simulator.driving import planar_transform, tilted_camera
 from tools.simulator.ray_kernels import NOTHING, nearest_quad, points_visible
 from tools.simulator.renderer import Light, render_light, smeared
 from tools.simulator.scene import (

@@ -21,9 +21,9 @@ from redetect.groundtruth.files import write_json
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
-    planar_transform,
     quaternion_xyzw,
 )
+from tools.simulator.driving import planar_transform
 from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (

@@ -15,7 +15,8 @@ from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
 from redetect.array_types import FloatArray
 from redetect.groundtruth.markers.session import Rig
-from redetect.groundtruth.trajectories.transforms import planar_transform, transform
+from redetect.groundtruth.trajectories.transforms import transform
+from tools.simulator.driving import planar_transform
 from tools.simulator.markers.surface import (
     Surface,
     Texture,
