@@ -45,8 +45,7 @@ class PickedFrames:
     """Selects the frames of a run."""
 
     every: int = 1  #: Only every n-th frame.
-    #: Only the frames of these images, by their names.
-    frames: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()  #: Only the frames of these images, by their names.
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def perform(options: Tune) -> int:
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
-    _, selection = select_frames(run.frames, options.frames, options.every)
+    _, selection = select_frames(run.frames, options.images, options.every)
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 

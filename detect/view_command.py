@@ -40,7 +40,7 @@ def perform(options: View) -> int:
     source = open_rows(run, options.files)
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.frames, options.every)
+    expected, selection = select_frames(run.frames, options.images, options.every)
     radius_m = source.circle_settings.radius_m
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")

@@ -92,7 +92,7 @@ class RowFiles:
 class RowsFlags(RunFlags):
     """Options of all commands that show frames of a run."""
 
-    source: SourceOptions = field(default_factory=SourceOptions)
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
 
 
 @dataclass(frozen=True, kw_only=True)

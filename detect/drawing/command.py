@@ -39,7 +39,7 @@ def perform(options: Draw) -> int:
         )
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.frames, options.every)
+    expected, selection = select_frames(run.frames, options.images, options.every)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 

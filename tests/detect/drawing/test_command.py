@@ -239,7 +239,7 @@ def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path
     (small_run / "detected.markers").write_text(
         f"STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_M rawseeds 5 0.9 {corners}\n"
     )
-    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "s.0000"]) == 0
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--images", "s.0000"]) == 0
     picture = cv2.imread(str(tmp_path / "d" / "s.0000.png"))
     assert picture is not None
     green = np.abs(picture[50, 110:150].astype(int) - (60, 220, 60)).sum(axis=1)
@@ -253,7 +253,7 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run], small_run, "--video", capsys)
     assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
     assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
-    assert_refused(["draw", run, "-o", out, "--frames", "x"], small_run, "'x'", capsys)
+    assert_refused(["draw", run, "-o", out, "--images", "x"], small_run, "'x'", capsys)
     video = tmp_path / "v.mp4"
     video.write_bytes(b"mine")
     assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)
