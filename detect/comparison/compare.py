@@ -154,6 +154,7 @@ def compare_frames(
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
         bins=tuple(_distance_bin(part, sides, pairs, lean is not None) for part in ranges),
+        extra_beyond=_beyond(extra.xy, second.xy),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
@@ -162,6 +163,12 @@ def compare_frames(
         lean=lean,
         pairs=pairs,
     )
+
+
+def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
+    """How many positions are farther away than all of those that are known."""
+    farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
+    return int((np.linalg.norm(xy, axis=1) > farthest).sum())
 
 
 def compare_line_frames(

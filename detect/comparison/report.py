@@ -120,11 +120,12 @@ def summary_rows(c: Comparison) -> dict[str, str]:
     if on_lookalikes is not None:
         of = f"{on_lookalikes} of {c.detected} detected rows"
         rows["look-alikes"] = f"{of}: on things known to look like a disc"
-    of, nothing = f"{c.extra - (on_lookalikes or 0)} of {c.detected} detected rows", "nothing known"
-    if on_lookalikes is None:
-        unknown = " (look-alikes are not known)" if isinstance(c, DiscComparison) else ""
-        nothing = f"no reference row{unknown}"
-    rows["clutter"] = f"{of}: on {nothing}"
+        clutter = c.extra - on_lookalikes
+        rows["clutter"] = f"{clutter} of {c.detected} detected rows: on nothing known"
+    else:
+        rows["extra"] = f"{c.extra} of {c.detected} detected rows: on no reference row"
+        if isinstance(c, DiscComparison) and c.extra_beyond:
+            rows["extra"] += f", {c.extra_beyond} of them farther away than any that is on one"
     if c.set_aside:
         kind = "discs" if isinstance(c, DiscComparison) else "lines"
         what = "what has no ID or is not listed" if only else f"{kind} in view that are not listed"
@@ -156,8 +157,8 @@ def _disc_rows(c: DiscComparison) -> dict[str, str]:
     if c.reference_levelled or c.detected_levelled:
         how = "at the pixels where they were seen" if c.in_image else "on the floor"
         rows["levelled"] = (
-            f"{c.reference_levelled} frames of the reference, {c.detected_levelled} detected ones: "
-            f"compared {how}"
+            f"reference rows of {c.reference_levelled} frames, detected rows of "
+            f"{c.detected_levelled}: compared {how}"
         )
     if c.in_image:
         same = f"in the image, within half the disc's image or {LEAST_GATE_PX:g} px"
@@ -199,7 +200,8 @@ def _normalised_error(error: NormalisedError, unusable: str) -> str:
     text = number(error.per_dof, 3)
     if error.band is not None:
         low, high = error.band
-        text += f" squared per degree of freedom (95 % band {low:.3f} to {high:.3f})"
+        text += f" squared per degree of freedom (95 % band {low:.3f} to {high:.3f}),"
+        text += " as if the reference had no errors"
     left_out = f"; {error.left_out} {unusable} left out" if error.left_out else ""
     return text + left_out
 

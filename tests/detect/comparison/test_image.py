@@ -139,7 +139,7 @@ def test_a_lean_is_a_difference_on_the_floor_not_missed_rows(published_camera: C
     assert far.after is not None
     assert abs(far.after.along_m or 0.0) < 0.02
     text = format_text(found)
-    assert "levelled 0 frames of the reference, 60 detected ones: compared at the pixels" in (
+    assert "levelled reference rows of 0 frames, detected rows of 60: compared at the pixels" in (
         " ".join(text.split())
     )
     told = json.loads(found.to_json())

@@ -239,7 +239,7 @@ def test_text_shows_the_figures_plainly() -> None:
     assert lines[:4] == [
         "found 4 of 5 reference rows",
         "missed 1 of 5 reference rows",
-        "clutter 1 of 5 detected rows: on no reference row",
+        "extra 1 of 5 detected rows: on no reference row",
         "recall 0.8000",
     ]
     assert "same line within 0.5 deg or 2 sigma" in lines
