@@ -219,10 +219,8 @@ class TutorialPhotographs:
         robot_from_board = np.diag([-1.0, -1.0, 1.0])
         robot_from_camera = np.asarray(camera.robot_from_camera)
         camera_from_robot = robot_from_camera[:, :3].T
-        origin = np.array([*FLOOR_ORIGIN, 0.0]) - robot_from_camera[:, 3]
-        image = render_board(
-            rays, ON_FLOOR, camera_from_robot @ robot_from_board, camera_from_robot @ origin
-        )
+        origin = camera_from_robot @ (np.array([*FLOOR_ORIGIN, 0.0]) - robot_from_camera[:, 3])
+        image = render_board(rays, ON_FLOOR, camera_from_robot @ robot_from_board, origin)
         cv2.imwrite(str(self.output / "floor.png"), image)
         print(f"{boards}: {self.count} photographs of a board")
         print(f"{self.output / 'floor.png'}: it lies {-FLOOR_ORIGIN[1]:g} m ahead")
