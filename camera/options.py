@@ -42,7 +42,8 @@ class Calibrate(BoardFlags):
     Parameters
     ----------
     output : Path
-        The .cam file. Beside it: pictures of residuals and coverage.
+        The .cam file. Beside it: .json with what it was made from and how well that fits, and
+        pictures of residuals and coverage.
     """
 
     images: Positional[tuple[Path, ...]]  #: Photographs, folders of them, or a video.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -19,6 +20,7 @@ from camera.calibration.calibrate import (
     calibrate,
     calibrate_freely,
 )
+from camera.calibration.consensus import view_rms
 from camera.calibration.floor import file_name, write_picture
 from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
@@ -29,7 +31,7 @@ from camera.model import PARAMETERS, Camera
 from camera.options import Calibrate
 from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
 from redetect.array_types import GreyImage
-from redetect.storage import demand_place, write_bytes
+from redetect.storage import __version__, demand_place, write_bytes
 
 #: How many pictures are looked through for the true size of a checkerboard, and how many agree.
 _COUNTED_PICTURES, _VOTES = 8, 2
@@ -47,7 +49,10 @@ def perform(options: Calibrate) -> int:
     kinds = ("residuals", "coverage")
     names = {kind: output.with_name(f"{output.stem}.{kind}.png") for kind in kinds}
     # Checked first, not after minutes of work.
-    for path in (output, *names.values()):
+    report = output.with_suffix(".json")
+    if report == output:
+        raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
+    for path in (output, report, *names.values()):
         demand_place(path, overwrite=options.force)
     board = board_of(options)
     settings = CalibrationSettings(
@@ -83,8 +88,35 @@ def perform(options: Calibrate) -> int:
     for name, path in names.items():
         write_bytes(path, drawn[name], overwrite=options.force)
     write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
-    print(f"written: {output}, {', '.join(path.name for path in names.values())}")
+    write_bytes(report, report_text(options, calibration).encode(), overwrite=options.force)
+    print(f"written: {output}, {', '.join(p.name for p in (report, *names.values()))}")
     return 0
+
+
+def report_text(options: Calibrate, calibration: Calibration) -> str:
+    """What the calibration was made from, and how well that fits, as JSON."""
+    adjusted, points = calibration.adjusted, calibration.points
+    rms = view_rms(adjusted.residuals, points).tolist()
+    views = zip(calibration.names, points.counts.tolist(), rms, strict=True)
+    content = {
+        "version": __version__,
+        "options": vars(options),
+        "intrinsics": dict(zip(INTRINSICS, calibration.intrinsics.tolist())),
+        "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
+        "lens": str(calibration.lens),
+        "rms_px": adjusted.rms_px,
+        "holdout_rms_px": {
+            str(lens): error if np.isfinite(error) else None
+            for lens, error in calibration.holdout_px.items()
+        },
+        "views": [dict(zip(("name", "points", "rms_px"), view)) for view in views],
+        "left_out": [
+            {"name": name, "rms_px": error if np.isfinite(error) else None}
+            for name, error in calibration.outliers
+        ],
+        "warnings": calibration.warnings,
+    }
+    return json.dumps(content, indent=1, allow_nan=False, default=str) + "\n"
 
 
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from camera.cli import main
 from camera.errors import CalibrationError
 from camera.rotations import rotation_of
 from camera.uncertainty import covariance_of
+from redetect.storage import __version__
 from tests.camera.conftest import BOARD, PICTURES
 from tools.evaluation.boards import Rays, projection_difference, render_board
 from tools.evaluation.calibration import BOARDS, calibrate_rendered
@@ -79,6 +81,14 @@ def test_from_pictures_to_a_placed_camera(
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=0.005)
     for name in ("residuals", "coverage"):
         assert cv2.imread(str(tmp_path / f"lens.{name}.png")) is not None
+    report = json.loads((tmp_path / "lens.json").read_text())
+    assert report["options"]["square_m"] == 0.04
+    assert report["version"] == __version__
+    assert len(report["views"]) + len(report["left_out"]) >= PICTURES - 2
+    errors = np.array([view["rms_px"] for view in report["views"]])
+    points = np.array([view["points"] for view in report["views"]])
+    assert np.sqrt(points @ errors**2 / points.sum()) == pytest.approx(report["rms_px"], rel=0.05)
+    assert report["rms_px"] < 0.2
     # The same from known places: a table instead of a picture.
     places = on_floor(BOARD.points, (0.03, -0.75), math.pi)
     rows = [
