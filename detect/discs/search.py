@@ -179,7 +179,9 @@ class Fits(NamedTuple):
     rim_step: NDArray[np.float64]
     """(K,) grey levels across that rim; 0 where the fit places the disc."""
     fate: NDArray[np.int8]
+    """(K,) and the next: as of `Looks`."""
     log_odds: NDArray[np.float64]
+    """(K,)"""
 
 
 def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
@@ -205,7 +207,7 @@ def search_discs(scene: Scene, centres: Centres, weakest: float) -> FoundDiscs:
 def _search(
     scene: Scene, centres: Centres, weakest: float, space: NDArray[Any]
 ) -> tuple[Fits, float]:
-    """Fits of discs, those that are some in their places; the radius that they seem to have."""
+    """Fits of all candidates, discs placed by their edges; the radius that discs seem to have."""
     search, work = scene.search, space[0]
     fits = candidates_of(scene, centres, weakest)
     _fit(scene, centres, fits, work)

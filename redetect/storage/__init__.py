@@ -4,6 +4,7 @@ All packages write their files with `write_whole`, or `write_bytes` where the co
 """
 
 from redetect.storage.parts import OutputExistsError as OutputExistsError
+from redetect.storage.parts import demand_free as demand_free
 from redetect.storage.parts import demand_place as demand_place
 from redetect.storage.parts import demand_writable as demand_writable
 from redetect.storage.parts import write_bytes as write_bytes

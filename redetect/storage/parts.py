@@ -13,7 +13,7 @@ import fcntl
 import io
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -59,6 +59,14 @@ def demand_writable(path: Path) -> None:
     effective = os.access in os.supports_effective_ids
     if not os.access(above, os.W_OK | os.X_OK, effective_ids=effective):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+
+def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
+    """Refuse before the work what could not be written after it; folders may yet be made."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise OutputExistsError(path)
+        demand_writable(path)
 
 
 class PartFile(AbstractContextManager["PartFile"]):

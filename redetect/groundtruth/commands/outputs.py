@@ -15,20 +15,17 @@ from rich.progress import track
 
 from redetect.groundtruth import __version__
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage import OutputExistsError, demand_writable
+from redetect.storage import demand_free
 
 T = TypeVar("T")
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Refuse to begin where an output exists, unless it may be replaced, or two are one file."""
+    given = [path for path in paths if path is not None]
+    demand_free(given, overwrite=force)
     places: set[Path] = set()
-    for path in paths:
-        if path is None:
-            continue
-        if path.exists() and not force:
-            raise OutputExistsError(path)
-        demand_writable(path)
+    for path in given:
         if path.resolve() in places:
             raise GroundTruthError(
                 f"{path}: two of the outputs would be written there: expected another name or "

@@ -18,7 +18,6 @@ from redetect.slam.association.run import RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
 from redetect.slam.commands.files import (
     camera_xy_of,
-    demand_free,
     files_of,
     recordings_of,
     write_json,
@@ -27,6 +26,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
 from redetect.slam.recording import UNKNOWN_ID, Recording, joined
+from redetect.storage import demand_free
 from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 
 #: Of each kind's rows those before and those after the map level.

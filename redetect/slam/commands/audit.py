@@ -13,12 +13,13 @@ from camera import Camera
 from redetect import slam
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
-from redetect.slam.commands.files import camera_of_run, demand_free, recording_of
+from redetect.slam.commands.files import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import Recording, landmark_files
+from redetect.storage import demand_free
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (

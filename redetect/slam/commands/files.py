@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +17,7 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, landmark_files, read_recording
-from redetect.storage import OutputExistsError, demand_writable, write_bytes
+from redetect.storage import write_bytes
 
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
@@ -88,14 +87,6 @@ def default_output(run: Path, name: str = "") -> Path:
 
 
 MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
-
-
-def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
-    """Refuse before the work what could not be written after it."""
-    for path in paths:
-        if path.exists() and not overwrite:
-            raise OutputExistsError(path)
-        demand_writable(path)
 
 
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -30,7 +30,6 @@ from redetect.slam.commands.files import (
     PATH_NAME,
     camera_xy_of,
     default_output,
-    demand_free,
     flags_of,
     recording_of,
     write_json,
@@ -42,6 +41,7 @@ from redetect.slam.filters.localizer import Localizer, MapErrors
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
+from redetect.storage import demand_free
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 
 ERROR_PICTURE = "errors.png"

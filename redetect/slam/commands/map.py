@@ -21,7 +21,6 @@ from redetect.slam.commands.files import (
     PATH_NAME,
     camera_of_run,
     default_output,
-    demand_free,
     flags_of,
     recordings_of,
     write_json,
@@ -39,6 +38,7 @@ from redetect.slam.mapping.run_map import (
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
+from redetect.storage import demand_free
 from redetect.storage.bounds import ABOVE_0, FINITE, demand
 
 TABLE_NAME = "table.json"
