@@ -49,18 +49,14 @@ class CircleSettings:
     #: From one centre to the next along a row: this share of the distance between the outlines, in
     #: pixels as long as one down the image, rounded up; 0: every pixel is a centre.
     stride: NotNegative = 0.0
-    threshold: ShareAbove0 = 0.5  #: Least quality (between-class / total variance), 0 to 1.
+    #: Without a fit: least quality (between-class / total variance), 0 to 1.
+    threshold: ShareAbove0 = 0.5
     #: Centres keep this distance from the image's border, pixels.
     border_px: Annotated[int, whole(0)] = 6
     #: Centres are so near that the floor moves at most this share of the radius per image row;
     #: infinite: however far.
     far_limit: Limit = 1.2
     polarity: Polarity = "any"  #: Which discs to detect: lighter than the floor, darker, or both.
-    #: If detections are fitted (`verify` and `refine`), rows of centres are skipped, as long as
-    #: each row of a disc is at most this share of the distance between the disc's edge and the
-    #: nearer outline from an evaluated row, and centres along a row, up to half of that; 0: every
-    #: centre is evaluated.
-    rows_apart: Share = 0.75
     #: Without a fit: the mean grey values of the outlines differ by more than this.
     least_contrast: NotNegative = 0.0
     #: Least contrast between the outlines, in standard deviations of the image's noise (or in grey
@@ -69,15 +65,11 @@ class CircleSettings:
     #: Of detections closer than this on the floor, in radii, only the best is reported; 0 reports
     #: all.
     separation: NotNegative = 1.4
-    #: Fit a disc to the grey values at each candidate and drop those without evidence of a disc.
-    #: Without this and `refine` nothing is fitted.
-    verify: bool = True
-    #: Least evidence (log-odds, see `detect.discs.evidence`).
-    evidence: Annotated[float, FINITE] = 0.6
-    #: Standard deviation of the optics' blur along u, pixels. Blurred edges are evidence against a
-    #: disc unless the camera blurs everything: the data set's own does, by about 6.
-    blur_px: NotNegative = 1.0
-    refine: bool = True  #: Report the fitted position and its covariance instead of the pixel's.
+    #: Find discs by their rims, and fit their positions; otherwise they are the pixels of the
+    #: highest quality, as published.
+    refine: bool = True
+    #: Least evidence of a disc that is found by its rim, log-odds (`detect.discs.judgement`).
+    evidence: Annotated[float, FINITE] = 0.0
     #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
     #: Error of a calibration that does not state its covariance, pixels: added to a refined
@@ -129,7 +121,6 @@ PUBLISHED = CircleSettings(
     least_contrast=5.0,
     noise_floor=0.0,
     separation=2.0,
-    verify=False,
     refine=False,
     calibration_px=0.0,
 )
@@ -141,7 +132,6 @@ REPORT = CircleSettings(
     far_limit=0.5,
     noise_floor=0.0,
     separation=0.0,
-    verify=False,
     refine=False,
     calibration_px=0.0,
 )

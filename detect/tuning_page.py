@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_table
 from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
@@ -32,7 +32,6 @@ from detect.seen import circle_on_floor, ellipses
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
-from lut import cached_disc_table
 from redetect.array_types import GreyImage
 from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
@@ -82,7 +81,7 @@ class TuningSession:
         """The discs of a frame under some settings, and the candidates that are none."""
         settings = checked_settings("circles", values, CircleSettings)
         image, camera = self.image(number), self.run.camera
-        table = cached_disc_table(camera, disc_shape(settings))
+        table = disc_table(camera, settings)
         found = detect_circles(image, camera, table, settings)
         if settings.refine:
             found = with_common(found, camera, settings.calibration_px, by_verticals=False)
@@ -107,11 +106,11 @@ class TuningSession:
                 "v": candidate.v,
                 "stage": candidate.stage,
                 "reason": candidate.reason(),
-                "quality": candidate.quality,
+                "votes": candidate.votes,
                 "outline": self._outline((candidate.x_m, candidate.y_m), settings.radius_m),
             }
             for candidate in explained.candidates
-            if not candidate.is_disc
+            if candidate.stage != "disc"
         ]
         return {"discs": discs, "rejected": rejected, "suggestions": list(explained.suggestions)}
 

@@ -27,13 +27,14 @@ import numpy as np
 from camera import Camera
 from lut.outlines import DiscShape, DiscTable, build_disc_table
 from lut.verticals import VerticalTable, build_vertical_table
+from lut.votes import VoteShape, VoteTable, build_vote_table
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 14
+TABLE_VERSION = 15
 
-Table = TypeVar("Table", DiscTable, VerticalTable)
+Table = TypeVar("Table", DiscTable, VerticalTable, VoteTable)
 
 _log = logging.getLogger("redetect")
 
@@ -60,6 +61,11 @@ def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = No
     return _cached(DiscTable, "discs", (camera, shape), build_disc_table, folder)
 
 
+def cached_vote_table(camera: Camera, shape: VoteShape, folder: Path | None = None) -> VoteTable:
+    """The table of votes of a camera, equal to `lut.build_vote_table`'s; as above."""
+    return _cached(VoteTable, "votes", (camera, shape), build_vote_table, folder)
+
+
 def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
     """The table of verticals of a camera, equal to `lut.build_vertical_table`'s; as above."""
     return _cached(VerticalTable, "verticals", (camera,), build_vertical_table, folder)
@@ -81,7 +87,7 @@ def _cached(
     return table
 
 
-def _key(camera: Camera, shape: DiscShape | None = None) -> str:
+def _key(camera: Camera, shape: DiscShape | VoteShape | None = None) -> str:
     values = () if shape is None else astuple(shape)
     numbers = [float(value).hex() for value in values]
     parts = [str(TABLE_VERSION), camera.content_hash, *numbers]
@@ -129,10 +135,11 @@ def _digest(path: Path, payload: bytes) -> bytes:
     return digest.digest()
 
 
-def _keep(path: Path, table: DiscTable | VerticalTable) -> None:
+def _keep(path: Path, table: DiscTable | VerticalTable | VoteTable) -> None:
     buffer = io.BytesIO()
+    names = table._fields if isinstance(table, VoteTable) else [f.name for f in fields(table)]
     # NumPy before 2.1 would take `allow_pickle` for an array; these are numbers all.
-    np.savez(buffer, **{field.name: getattr(table, field.name) for field in fields(table)})
+    np.savez(buffer, **{name: getattr(table, name) for name in names})
     payload = buffer.getvalue()
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

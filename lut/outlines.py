@@ -6,9 +6,7 @@ the calibration alone, so it is computed ahead of time (DLR Spatial Cognition da
 circle detection).
 
 A centre is usable if enough of each outline's samples are inside the image, it keeps its distance
-from the border, and the floor there moves by no more than a given length per image row. Where discs
-are large, neighbouring centres see nearly the same: then only some rows, and some centres in each,
-are tested.
+from the border, and the floor there moves by no more than a given length per image row.
 """
 
 from __future__ import annotations
@@ -58,9 +56,6 @@ class DiscShape:
     #: is tested. If samples are counted in pairs, those are left out that are nearer than this to a
     #: usable one, in pixels as long as one down the image, rounded up. 0: none is.
     stride_m: NotNegative = 0.0
-    #: Rows are left out as long as no centre in them is farther than this from a row that is
-    #: tested, on the floor across the row; 0: none is.
-    rows_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         demand_fields(self, TableError)
@@ -126,24 +121,29 @@ def floor_positions(camera: Camera) -> FloatArray:
     return camera.floor_from_pixel(np.stack([u, v], axis=-1))
 
 
+def demand_above_floor(camera: Camera) -> None:
+    """Raise a TableError for a camera that is not above the floor."""
+    if not camera.centre[2] > 0.0:
+        raise TableError(
+            f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0; "
+            "`camera floor` says where it is"
+        )
+
+
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """Compute the outlines' pixels around the centres that are tested.
 
     A camera that sees no usable floor (looking up, say) gets a table without centres; one that is
     not above the floor raises a TableError.
     """
-    if not camera.centre[2] > 0.0:
-        raise TableError(
-            f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0; "
-            "`camera floor` says where it is"
-        )
+    demand_above_floor(camera)
     floor_xy = floor_positions(camera)
     down = _size_down(camera, floor_xy, shape)
-    candidate = _within_limits(down, shape)
+    candidate = pixels_within(down, shape.border_px, shape.far_limit_m_per_px)
     step = _columns_apart(floor_xy, down, shape)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
     samples, pixels = [np.zeros((0, shape.samples, 2), np.uint32)], [np.zeros((0, 2), np.int32)]
-    for row in _rows_tested(floor_xy, candidate, shape.rows_m):
+    for row in np.flatnonzero(candidate.any(axis=1)).tolist():
         across = np.flatnonzero(candidate[row])
         seen = _sample_pixels(camera, floor_xy[row, across], down[row, across], shape)
         inside = np.count_nonzero(seen < camera.height * camera.width, axis=1).min(axis=1)
@@ -252,6 +252,11 @@ def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatA
         v, u = np.mgrid[0 : camera.height, 0 : camera.width]
         by_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
         return np.hypot(by_row[..., 0], by_row[..., 1])
+    return size_down(floor_xy)
+
+
+def size_down(floor_xy: FloatArray) -> FloatArray:
+    """(H, W) how far the floor moves per image row, metres, from (H, W, 2) positions."""
     by_row = _gradient(floor_xy, 0)
     return np.hypot(by_row[..., 0], by_row[..., 1])
 
@@ -263,14 +268,13 @@ def _gradient(floor_xy: FloatArray, axis: int) -> FloatArray:
     return np.asarray(np.gradient(floor_xy, axis=axis))
 
 
-def _within_limits(down: FloatArray, shape: DiscShape) -> BoolArray:
-    """Pixels far enough from the border and near enough on the floor."""
+def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> BoolArray:
+    """(H, W) pixels far enough from the border and near enough on the floor (`size_down`)."""
     height, width = down.shape
     u, v = np.arange(width), np.arange(height)
-    border = shape.border_px
     inside_u = (u >= border) & (u <= width - border)
     inside_v = (v >= border) & (v <= height - border)
-    near = down <= shape.far_limit_m_per_px
+    near = down <= far_limit_m_per_px
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
 
 
@@ -298,27 +302,3 @@ def _strided(columns: IntArray, step: IntArray) -> list[int]:
             kept.append(k)
             last, following = column, column + apart
     return kept
-
-
-def _rows_tested(floor_xy: FloatArray, candidate: BoolArray, apart_m: float) -> list[int]:
-    """Rows with candidates, so close that no candidate between them is far from one of them.
-
-    How far a row is from its neighbour, as it sees the floor, is the area of a pixel there over its
-    length along the row; the pixel that is smallest so decides.
-    """
-    if apart_m == 0.0:
-        return np.flatnonzero(candidate.any(axis=1)).tolist()
-    by_u, by_v = _gradient(floor_xy, 1), _gradient(floor_xy, 0)
-    area = np.abs(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
-    across = area / np.hypot(by_u[..., 0], by_u[..., 1])
-    largest = np.where(candidate & np.isfinite(across), across, 0.0).max(axis=1)
-    # Between two rows tested, the middle one is half as far from either.
-    rows = [0]
-    while rows[-1] < len(largest) - 1:
-        row, apart = rows[-1], 1
-        while row + apart + 1 < len(largest) and (
-            (apart + 1) * largest[row + 1 : row + apart + 2].max() <= 2.0 * apart_m
-        ):
-            apart += 1
-        rows.append(row + apart)
-    return [row for row in rows if candidate[row].any()]

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.quality import Centres
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
@@ -91,93 +90,6 @@ def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> 
             kept[count], x[count], y[count] = i, floor_xy[i, 0], floor_xy[i, 1]
             count += 1
     return kept[:count]
-
-
-@kernel()
-def best_apart(floor_xy: FloatArray, score: FloatArray, separation: float) -> NDArray[np.int64]:
-    """Those of some positions that have no better one nearer than this, the best first.
-
-    Those of a score of minus infinity are left out; of equal ones the first is the best.
-    """
-    # NumPy's sorting takes seconds to compile.
-    order, count = np.empty(len(score), np.int64), 0
-    for i in range(len(score)):
-        if score[i] > -np.inf:
-            k = count
-            while k > 0 and score[order[k - 1]] < score[i]:
-                order[k] = order[k - 1]
-                k -= 1
-            order[k] = i
-            count += 1
-    return apart(floor_xy, order[:count], separation)
-
-
-@kernel()
-def strong_and_alone(
-    centres: Centres, floor_xy: NDArray[np.float32], weakest: float, separation: float
-) -> NDArray[np.int64]:
-    """Which centres have at least the contrast `weakest`, and no better one nearby: the best first.
-
-    Parameters
-    ----------
-    centres : Centres
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    weakest : float
-        Grey levels.
-    separation : float
-        What is nearby, metres.
-
-    Returns
-    -------
-    (M,) int64
-        Indices.
-    """
-    count = len(centres.quality)
-    place, score = np.empty((count, 2)), np.empty(count)
-    for i in range(count):
-        u, v = centres.pixels[i, 0], centres.pixels[i, 1]
-        place[i, 0], place[i, 1] = floor_xy[v, u, 0], floor_xy[v, u, 1]
-        score[i] = centres.quality[i] if abs(centres.contrast[i]) >= weakest else -np.inf
-    return best_apart(place, score, separation)
-
-
-@kernel()
-def middles(
-    centres: Centres, keep: NDArray[np.int64], floor_xy: NDArray[np.float32], weakest: float,
-    separation: float,
-) -> NDArray[np.int64]:  # fmt: skip
-    """(M, 2) pixels in the middle of those centres of the same disc as each of the best.
-
-    A large disc has many good centres, and which of them is the very best is up to the noise: a fit
-    that starts beside the disc's middle may be given up. So fits start at the mean of the centres
-    of at least the contrast `weakest`, and of the same sign, within the separation.
-
-    Parameters
-    ----------
-    centres, floor_xy, weakest, separation
-        As in `strong_and_alone`.
-    keep : (M,) int64
-        What that returned.
-    """
-    pixels, contrast = centres.pixels, centres.contrast
-    middle = np.empty((len(keep), 2), np.int64)
-    for k in range(len(keep)):
-        best = keep[k]
-        here = floor_xy[pixels[best, 1], pixels[best, 0]]
-        total = sum_u = sum_v = 0.0
-        for i in range(len(contrast)):
-            there = floor_xy[pixels[i, 1], pixels[i, 0]]
-            dx, dy = there[0] - here[0], there[1] - here[1]
-            if dx * dx + dy * dy < separation * separation and abs(contrast[i]) >= weakest:
-                weight = centres.quality[i] ** 4 * contrast[i] * np.sign(contrast[best])
-                if weight > 0.0:
-                    total += weight
-                    sum_u += weight * pixels[i, 0]
-                    sum_v += weight * pixels[i, 1]
-        middle[k, 0] = round(sum_u / total) if total > 0.0 else pixels[best, 0]
-        middle[k, 1] = round(sum_v / total) if total > 0.0 else pixels[best, 1]
-    return middle
 
 
 @kernel()

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detect.discs.evidence import LEAST_EXPLAINED, evidence_of
 from detect.discs.least_squares import (
     BACKGROUND,
     UNKNOWNS,
@@ -41,7 +40,7 @@ from detect.discs.model import (
     chord_shares,
     edge_shares,
 )
-from detect.discs.patch import CAPACITY, CHORDS_ALONG_V, EDGE, PATCH, SECTORS, FitSettings, Gathered
+from detect.discs.patch import CAPACITY, CHORDS_ALONG_V, EDGE, PATCH, FitSettings, Gathered
 from redetect.compiled import kernel
 
 #: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
@@ -57,8 +56,8 @@ _SHORT = 0.05
 #: After this number of evaluations, the step after one that made it worse is damped at least this
 #: much: mostly it was the blur of a sharp edge, which the grey values hardly determine.
 _EARLY, _LATE_DAMPING = 3, 0.2
-#: What the first step of a fit promises may be this much less evidence than is needed.
-_FIRST_STEP_SLACK = 2.0
+#: A descent ends after this number of evaluations.
+_MOST_EVALUATIONS = 15
 
 _SQUARE = (np.float64, (ROWS, ROWS))
 #: What the fits of one image work in, from one to the next. What is left there does not matter.
@@ -73,22 +72,9 @@ WORK = np.dtype(
         # The unknowns, and the background without a disc.
         ("values", np.float64, UNKNOWNS),
         ("bare", np.float64, UNKNOWNS),
-        ("sector_sums", np.float32, (SECTORS + 1, 8)),
         ("by_sector", np.float32, (9, CAPACITY)),  # the rows of `detect.discs.placing`
     ]
 )
-
-
-class Hope(NamedTuple):
-    """When a fit is given up: as soon as a step promises less than this."""
-
-    least_share: float  # share of the variance that the disc explains
-    least_evidence: float  # evidence, as far as it is known by then: for an even outline
-    optics_px: float  # blur of the camera's optics, for the evidence
-
-
-#: Never give up.
-PATIENT = Hope(-math.inf, -math.inf, 1.0)
 
 
 class Descent(NamedTuple):
@@ -173,8 +159,7 @@ def moved(best: Disc, contrast: float, log_most: float, work: Any) -> Disc:
 
 @kernel(forceinline=True)
 def descend(
-    gathered: Gathered, start: Disc, settings: FitSettings, most_blur: float,
-    most_evaluations: int, hope: Hope, work: Any,
+    gathered: Gathered, start: Disc, settings: FitSettings, most_blur: float, work: Any
 ) -> Descent:  # fmt: skip
     """Levenberg-Marquardt steps from `start` (see `detect.discs.fit.fit_disc`).
 
@@ -210,7 +195,6 @@ def descend(
         _add_ridge(BACKGROUND, UNKNOWNS, gathered.fitted, work)
         if not factor_rows(products, 0, BY_BLUR, factor):
             break
-        without = left_over(products, factor, BACKGROUND)
         residual = left_over(products, factor, BY_BLUR)
         variance_now = max(residual / freedom, noise_2)
         prior_blur = (disc.log_blur - math.log(settings.blur_px)) / settings.blur_sigma
@@ -246,28 +230,13 @@ def descend(
                 width_per_px = blur_width(patch, n, best, blur) / _sigma(best)
             sigma = _sigma(disc)
             width = width_per_px * sigma
-            share = 1.0 - max(cost - promised, 0.0) / max(without, 1e-9)
-            if _is_hopeless(share, disc.radius, width, evaluations == 1, hope):
-                break
             longest = max(
                 math.hypot(disc.x - best.x, disc.y - best.y), abs(disc.radius - best.radius)
             )
             short = longest < _SHORT * width and abs(sigma - _sigma(best)) < _SHORT * sigma
-            done = promised <= _CONVERGED * variance or short or evaluations == most_evaluations
+            done = promised <= _CONVERGED * variance or short or evaluations == _MOST_EVALUATIONS
         if done:
             if better:
                 return Descent(True, best, contrast, variance)
             disc = best
     return Descent(False, best, contrast, variance)
-
-
-@kernel(forceinline=True)
-def _is_hopeless(share: float, radius: float, width: float, first: bool, hope: Hope) -> bool:
-    """Whether what a step promises, the explained share and the radius, is too little."""
-    if share < hope.least_share:
-        return True
-    if hope.least_evidence == -math.inf:
-        return False
-    slack = _FIRST_STEP_SLACK if first else 0.0
-    promise = evidence_of(share, radius, 0.0, 1.0, 1.0, width / radius, hope.optics_px)
-    return bool(share < LEAST_EXPLAINED or promise < hope.least_evidence - slack)

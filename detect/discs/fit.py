@@ -1,9 +1,9 @@
-"""Is it a disc, and where exactly: the fit of a disc through the camera to the grey values.
+"""Where a disc is exactly: the fit of a disc through the camera to the grey values.
 
-Around each candidate a blurred disc on an unevenly lit background is fitted: pixels are gathered
+A blurred disc on an unevenly lit background is fitted: pixels are gathered
 (`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
 residuals say how far the fit can be trusted (`detect.discs.least_squares`). It gives the position
-with its covariance, and the evidence that there is a disc at all.
+with its covariance, and the share of the grey values that the disc explains.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from detect.discs.descent import (
     MOST_BLUR,
     WORK,
     Descent,
-    Hope,
-    blur_of,
     descend,
     moved,
     solve_step,
@@ -29,15 +27,13 @@ from detect.discs.descent import (
 from detect.discs.least_squares import (
     BACKGROUND,
     UNKNOWNS,
-    blur_width,
     correlated_area,
     factor_rows,
-    outline_statistics,
     residuals,
     solution,
 )
 from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
-from detect.discs.patch import EDGE, Candidate, Effort, FitSettings, Gathered, gather
+from detect.discs.patch import EDGE, Candidate, FitSettings, Gathered, gather
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
@@ -59,18 +55,14 @@ _MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
 
 #: Result of a fit. The centre, its covariance and the radius are in metres; the blur is a standard
 #: deviation, in pixels; the contrast is the grey level inside minus outside. `explained` is the
-#: share of the variance about the background that the disc explains; `sectors_good` that of 16
-#: sectors whose step at the edge has the sign, and 0.4 of the size, of the disc's;
-#: `outline_deviation` the root mean square over the sectors of how far the edge is from the circle,
-#: in radii; `middle_step` the step of the disc's middle, relative to the contrast, 1 where the
-#: middle is less than two pixels; `relative_blur` the width of the blur across the edge, in radii.
-#: A blur of `blur_bound` is the most that the patch allowed.
+#: share of the variance about the background that the disc explains. A blur of `blur_bound` is the
+#: most that the patch allowed.
 RESULT = np.dtype(
     [
         (name, np.float64)
         for name in (
             "x", "y", "radius", "blur", "contrast", "explained", "cov_xx", "cov_xy", "cov_yy",
-            "sectors_good", "outline_deviation", "middle_step", "relative_blur", "blur_bound",
+            "blur_bound",
         )
     ]
 )  # fmt: skip
@@ -83,8 +75,6 @@ def fit_disc(
     candidate: Candidate,
     settings: FitSettings,
     start: Disc,
-    effort: Effort,
-    hope: Hope,
     work: Any,
     result: Any,
 ) -> bool:
@@ -99,9 +89,6 @@ def fit_disc(
     settings : FitSettings
     start : Disc
         Where to start.
-    effort : Effort
-    hope : Hope
-        When to give up.
     work : WORK
         Working space.
     result : RESULT
@@ -114,40 +101,34 @@ def fit_disc(
     """
     patch, radius = work.patch, candidate.radius
     _clear(result)
-    gathered = gather(image, floor_xy, candidate, settings, start, effort.look, patch)
+    gathered = gather(image, floor_xy, candidate, settings, start, patch)
     most_blur = MOST_BLUR
     if gathered.shape != EDGE:
         most_blur = min(_MOST_GROWTH * candidate.blur + _MOST_GROWTH_PX, MOST_BLUR)
     result.blur_bound = most_blur
     if gathered.fitted - UNKNOWNS < 4:
         return False
-    descent = descend(gathered, start, settings, most_blur, effort.evaluations, hope, work)
+    descent = descend(gathered, start, settings, most_blur, work)
     if not descent.arrived or not _solve_last_step(descent, settings, most_blur, work):
         return False
     # The last step is taken as the linear model has it, and so are its residuals.
     disc = moved(descent.best, descent.contrast, math.log(most_blur), work)
     residual, near, near_total = residuals(patch, gathered.n, work.values, work.bare)
-    blur = blur_of(gathered.shape, math.exp(disc.log_blur), settings.blur_ratio)
     result.x = floor_xy[candidate.v, candidate.u, 0] + disc.x * radius
     result.y = floor_xy[candidate.v, candidate.u, 1] + disc.y * radius
     result.radius = disc.radius * radius
     result.blur = math.exp(disc.log_blur)
     result.contrast = work.values[SHARE]
     result.explained = 1.0 - min(near / max(near_total, 1e-12), 1.0)
-    result.relative_blur = blur_width(patch, gathered.n, disc, blur) / disc.radius
-    result.sectors_good = 1.0
-    result.middle_step = 1.0
-    if not effort.look:
-        variance = max(residual / (gathered.fitted - UNKNOWNS), settings.noise**2)
-        _judge(gathered, disc, radius, variance, work, result)
+    variance = max(residual / (gathered.fitted - UNKNOWNS), settings.noise**2)
+    _find_covariance(gathered, radius, variance, work, result)
     return True
 
 
 @kernel(forceinline=True)
 def _clear(result: Any) -> None:
     result.x = result.y = result.radius = result.blur = result.contrast = result.explained = 0.0
-    result.cov_xx = result.cov_xy = result.cov_yy = result.sectors_good = 0.0
-    result.outline_deviation = result.middle_step = result.relative_blur = 0.0
+    result.cov_xx = result.cov_xy = result.cov_yy = 0.0
 
 
 @kernel(forceinline=True)
@@ -166,10 +147,10 @@ def _solve_last_step(descent: Descent, settings: FitSettings, most_blur: float, 
 
 
 @kernel(forceinline=True)
-def _judge(
-    gathered: Gathered, disc: Disc, radius: float, variance: float, work: Any, result: Any
+def _find_covariance(
+    gathered: Gathered, radius: float, variance: float, work: Any, result: Any
 ) -> None:
-    """Covariance and outline of a fit, from the factor and the residuals in the working space.
+    """Covariance of a fit, from the factor and the residuals in the working space.
 
     `variance` is that of the residuals. x and y are the last unknowns: their covariance is the
     inverse of the factor's last two rows.
@@ -181,10 +162,6 @@ def _judge(
     result.cov_xx = scale * per_xx * per_xx * (1.0 + (xy * per_yy) ** 2)
     result.cov_xy = -scale * per_xx * per_yy * per_yy * xy
     result.cov_yy = scale * per_yy * per_yy
-    outline = outline_statistics(patch, gathered.n, disc, contrast, work.sector_sums)
-    result.sectors_good = outline.good
-    result.outline_deviation = outline.deviation
-    result.middle_step = outline.middle
 
 
 def fit_settings(noise: float, blur_ratio: float) -> FitSettings:

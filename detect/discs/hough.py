@@ -8,9 +8,9 @@ and g the gradient in the image, the centre is
 
 and X - r n for a dark disc. Every pixel with a strong gradient votes for one centre, by the share
 of the rim that it sees, norm(B g) / norm(g) of 2 pi r; so whatever hides or lights a part of a disc
-takes its own share of the votes and no more. Votes are counted in cells of a quarter of the radius
-across, and of at least a pixel ahead. A score is that of three by three cells, relative to the mean
-of all cells as far ahead, where texture and distance make all scores higher.
+takes its own share of the votes and no more. Votes are counted in cells (`lut.votes`). A score is
+that of three by three cells, relative to the mean of all cells as far ahead, where texture and
+distance make all scores higher.
 
 Source: C. Kimme, D. Ballard and J. Sklansky, Finding Circles by an Array of Accumulators,
 CACM 18 (1975).
@@ -19,54 +19,26 @@ CACM 18 (1975).
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
 from detect.discs.candidates import suppress_neighbours
-from lut import DiscTable
+from lut import VoteTable
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
-#: Width of a cell, radii, and at least ahead, pixels.
-_CELL_RADII, _CELL_PX = 0.25, 0.8
-#: Steps in which it is looked up how far ahead a cell is, for each radius.
-_STEPS_PER_RADIUS = 16.0
-#: Where every disc is this wide (pixels), columns are added in pairs; where it is this high, every
-#: second row votes, and so on.
-_WIDE_PX, _HIGH_PX = 9.0, 6.0
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.45
-#: Least score of a candidate, and how many an image may have, at most, and before suppression.
-_LEAST_SCORE, _MOST, _MOST_PEAKS = 1.45, 80, 1000
+#: Least score of a candidate; of those below a clear one, how many an image may have; and how many
+#: of all before suppression.
+_LEAST_SCORE, _CLEAR_SCORE, _MOST_DOUBTFUL, _MOST_PEAKS = 1.7, 3.0, 80, 4000
 #: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
 _APART = 0.6
 #: Sobel's kernel multiplies a step per pixel by this.
 _SOBEL_GAIN = 8.0
-
-
-class Grid(NamedTuple):
-    """Which pixels vote, and the cells in which their votes are counted; lengths in metres."""
-
-    paired: bool  # columns of the image are added in pairs
-    image_row: NDArray[np.int64]  # (R,) rows of the image that vote
-    #: (R, W, 6) of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r)
-    #: by rows; all 0 where no floor is seen
-    pixel: NDArray[np.float32]
-    row_of_step: NDArray[np.int64]  # (S,) row of cells at each step ahead
-    ahead: FloatArray  # (M,) middle of each row of cells
-    first: NDArray[np.int64]  # (M,) columns of cells between which each row is in view
-    last: NDArray[np.int64]
-    columns: int
-    cell: float  # width of cells,
-    step: float  # of steps ahead,
-    left: float  # and where column 0 begins
-    foot: FloatArray  # (2,) of the camera
-    turn: FloatArray  # (2, 2) the directions across and ahead
 
 
 class HoughCandidates(NamedTuple):
@@ -74,48 +46,60 @@ class HoughCandidates(NamedTuple):
 
     floor_xy: FloatArray  # (N, 2) metres
     score: FloatArray  # (N,)
+    sign: FloatArray  # (N,) 1 of light discs, -1 of dark ones
 
 
 def hough_candidates(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    table: DiscTable,
-    radius: float,
-    sign: float,
-    least_step: float,
+    image: NDArray[np.uint8], table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Centres of discs of one radius (m) by the votes of the edges, the best first.
+    """Centres of discs of one radius by the votes of the edges.
 
-    The sign is 1 for light discs, -1 for dark ones; edges have gradients of at least `least_step`
-    grey levels per pixel.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    table : VoteTable
+    radius : float
+        For which that is, metres.
+    sign : int
+        1 for light discs, -1 for dark ones, 0 for both.
+    least_step : float
+        Gradient of an edge, grey levels per pixel.
     """
-    grid = grid_of(camera, table, radius)
-    if grid is None:
-        return HoughCandidates(np.empty((0, 2)), np.empty(0))
-    place, score = _peaks(count_votes(image, grid, sign * radius, least_step), grid)
-    alone = suppress_neighbours(place, score, _APART * radius)
-    place, score = place[alone], score[alone]
-    best = np.argsort(-score, kind="stable")[:_MOST]
-    return HoughCandidates(place[best] @ grid.turn + grid.foot, score[best])
+    if not len(table.image_row):
+        return HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
+    signs = np.array([sign] if sign else [1.0, -1.0], np.float64)
+    places, scores = [], []
+    for votes in count_votes(image, table, radius * signs, least_step):
+        place, score = _peaks(votes, table)
+        alone = suppress_neighbours(place, score, _APART * radius)
+        place, score = place[alone], score[alone]
+        most = max(_MOST_DOUBTFUL, int((score >= _CLEAR_SCORE).sum()))
+        best = np.argsort(-score, kind="stable")[:most]
+        places.append(place[best] @ table.turn + table.foot)
+        scores.append(score[best])
+    number = [len(score) for score in scores]
+    return HoughCandidates(np.concatenate(places), np.concatenate(scores), np.repeat(signs, number))
 
 
 @kernel()
 def count_votes(
-    image: NDArray[np.uint8], grid: Grid, radius: float, least_step: float
+    image: NDArray[np.uint8], table: VoteTable, radius: FloatArray, least_step: float
 ) -> NDArray[np.float32]:
-    """(M, columns) votes for each cell, shares of a rim; the radius is negative for dark discs."""
-    votes = np.zeros((len(grid.ahead), grid.columns), np.float32)
-    width = grid.pixel.shape[1]
-    across, ahead = np.float32(radius / grid.cell), np.float32(radius / grid.step)
-    least = np.float32((_SOBEL_GAIN * (1.0 + grid.paired) * least_step) ** 2)
+    """(S, M, columns) votes for each cell, shares of a rim, for S radii: of dark discs negative."""
+    votes = np.zeros((len(radius), len(table.ahead), table.columns), np.float32)
+    width = table.pixel.shape[1]
+    across, ahead = np.empty(len(radius), np.float32), np.empty(len(radius), np.float32)
+    for s in range(len(radius)):
+        across[s], ahead[s] = radius[s] / table.cell, radius[s] / table.step
+    least = np.float32((_SOBEL_GAIN * (1.0 + table.paired) * least_step) ** 2)
     lines = np.empty((3, width), np.int16)
     along_u = np.empty(width, np.float32)
     along_v = np.empty(width, np.float32)
     square = np.empty(width, np.float32)
-    for k in range(len(grid.image_row)):
+    for k in range(len(table.image_row)):
         for i in range(3):
-            row, line = image[grid.image_row[k] + i - 1], lines[i]
-            if grid.paired:
+            row, line = image[table.image_row[k] + i - 1], lines[i]
+            if table.paired:
                 for j in range(width):
                     line[j] = np.int16(row[2 * j]) + np.int16(row[2 * j + 1])
             else:
@@ -131,28 +115,29 @@ def count_votes(
         for j in range(1, width - 1):
             if square[j] < least:
                 continue
-            pixel = grid.pixel[k, j]
+            pixel = table.pixel[k, j]
             x = pixel[2] * along_u[j] + pixel[3] * along_v[j]
             y = pixel[4] * along_u[j] + pixel[5] * along_v[j]
             length = math.sqrt(x * x + y * y)
             if not length > 0.0:
                 continue
-            column = int(pixel[0] + across * x / length)
-            step = int(pixel[1] + ahead * y / length)
-            if 0 <= column < grid.columns and 0 <= step < len(grid.row_of_step):
-                votes[grid.row_of_step[step], column] += length / math.sqrt(square[j])
+            x, y, share = x / length, y / length, length / math.sqrt(square[j])
+            for s in range(len(radius)):
+                column, step = int(pixel[0] + across[s] * x), int(pixel[1] + ahead[s] * y)
+                if 0 <= column < table.columns and 0 <= step < len(table.row_of_step):
+                    votes[s, table.row_of_step[step], column] += share
     return votes
 
 
 @kernel(fastmath={"reassoc", "nsz"})
-def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArray]:
+def _peaks(votes: NDArray[np.float32], table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Places (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     score = np.zeros((rows, columns), np.float32)
     column = np.empty(columns, np.float32)
     for i in range(1, rows - 1):
         # One cell more to either side; sliced row by row, so that several are added at a time.
-        left, right = grid.first[i] - 1, grid.last[i] + 1
+        left, right = table.first[i] - 1, table.last[i] + 1
         before, same = votes[i - 1, left:right], votes[i, left:right]
         after = votes[i + 1, left:right]
         around = np.float32(0.0)
@@ -160,13 +145,13 @@ def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArr
             column[j] = before[j] + same[j] + after[j]
             around += column[j]
         scale = np.float32(1.0) / np.float32(_BACKGROUND + 3.0 * around / len(same))
-        row = score[i, grid.first[i] : grid.last[i]]
+        row = score[i, table.first[i] : table.last[i]]
         for j in range(len(row)):
             row[j] = scale * (column[j] + column[j + 1] + column[j + 2])
     place, height = np.empty((_MOST_PEAKS, 2)), np.empty(_MOST_PEAKS)
     n = 0
     for i in range(1, rows - 1):
-        for j in range(grid.first[i], grid.last[i]):
+        for j in range(table.first[i], table.last[i]):
             value = score[i, j]
             if value < _LEAST_SCORE or n == _MOST_PEAKS:
                 continue
@@ -180,84 +165,8 @@ def _peaks(votes: NDArray[np.float32], grid: Grid) -> tuple[FloatArray, FloatArr
                 for b in range(j - 1, j + 2):
                     total += votes[a, b]
                     x += votes[a, b] * (b + 0.5)
-                    y += votes[a, b] * grid.ahead[a]
-            place[n, 0], place[n, 1] = grid.left + grid.cell * x / total, y / total
+                    y += votes[a, b] * table.ahead[a]
+            place[n, 0], place[n, 1] = table.left + table.cell * x / total, y / total
             height[n] = value
             n += 1
     return place[:n], height[:n]
-
-
-@lru_cache(maxsize=4)
-def grid_of(camera: Camera, table: DiscTable, radius: float) -> Grid | None:
-    """The grid from the nearest to the farthest centre of the table; None where it has none."""
-    foot = np.array(camera.centre[:2])
-    offset = table.floor_xy.astype(np.float64) - foot
-    usable = table.usable & np.isfinite(offset).all(axis=-1)
-    if min(usable.shape) < 3 or not usable.any():
-        return None
-    direction = offset[usable].mean(axis=0)
-    direction /= max(float(np.hypot(*direction)), 1e-9)
-    turn = np.array([[-direction[1], direction[0]], direction])
-    place = offset @ turn.T
-    per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)
-    per_column = np.linalg.norm(np.gradient(place, axis=1), axis=-1)
-    edges = _edges_ahead(place[usable, 1], per_row[usable], radius)
-    # Up to the image's border, nearer than the centres of the table are.
-    seen = (place[..., 1] >= edges[0]) & (place[..., 1] < edges[-1])
-    across, ahead = np.moveaxis(place[seen], -1, 0)
-    cell, step = _CELL_RADII * radius, radius / _STEPS_PER_RADIUS
-    left = float(across.min()) - 3.0 * cell
-    paired = bool(2.0 * radius >= _WIDE_PX * np.nanmax(per_column[usable]))
-    if paired:
-        pairs = place.shape[1] // 2
-        place = 0.5 * (place[:, : 2 * pairs : 2] + place[:, 1 : 2 * pairs : 2])
-    along_u, along_v = np.gradient(place, axis=1), np.gradient(place, axis=0)
-    sign = np.sign(along_u[..., 0] * along_v[..., 1] - along_v[..., 0] * along_u[..., 1])
-    matrix = [along_v[..., 1], -along_u[..., 1], -along_v[..., 0], along_u[..., 0]]
-    pixel = np.stack(
-        [(place[..., 0] - left) / cell, (place[..., 1] - edges[0]) / step]
-        + [sign * entry / (2.0 * np.pi * radius) for entry in matrix],
-        axis=-1,
-    )
-    inside = np.isfinite(pixel).all(axis=-1) & (place[..., 1] < edges[-1] + radius)
-    pixel = np.where(inside[..., None], pixel, 0.0).astype(np.float32)
-    image_row = []
-    v = 1
-    while v < len(pixel) - 1:
-        every = 1
-        if inside[v].any():
-            every = max(int(2.0 * radius / (_HIGH_PX * np.nanmedian(per_row[v]))), 1)
-            image_row.append(v)
-            pixel[v, :, 2:] *= every
-        v += every
-    row = np.searchsorted(edges, ahead, side="right") - 1
-    first, last = np.full(len(edges) - 1, np.inf), np.zeros(len(edges) - 1)
-    np.minimum.at(first, row, np.floor((across - left) / cell))
-    np.maximum.at(last, row, np.floor((across - left) / cell) + 1.0)
-    known = np.flatnonzero(last)
-    at = np.arange(math.floor((edges[-1] - edges[0]) / step)) + 0.5
-    return Grid(
-        paired=paired,
-        image_row=np.array(image_row),
-        pixel=pixel[image_row],
-        row_of_step=np.searchsorted(edges, edges[0] + step * at, side="right") - 1,
-        ahead=0.5 * (edges[1:] + edges[:-1]),
-        first=np.interp(np.arange(len(first)), known, first[known]).astype(np.int64),
-        last=np.interp(np.arange(len(last)), known, last[known]).astype(np.int64),
-        columns=int(last.max()) + 3,
-        cell=cell,
-        step=step,
-        left=left,
-        foot=foot,
-        turn=turn,
-    )
-
-
-def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:
-    """Distances between rows of cells: a cell of the floor apart, and at least a pixel."""
-    order = np.argsort(ahead)[:: max(len(ahead) // 512, 1)]
-    edges = [float(ahead.min()) - radius]
-    while edges[-1] < ahead.max() + radius:
-        pixel = float(np.interp(edges[-1], ahead[order], per_row[order]))
-        edges.append(edges[-1] + max(_CELL_RADII * radius, _CELL_PX * pixel))
-    return np.array(edges)

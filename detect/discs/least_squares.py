@@ -6,14 +6,13 @@ grey value comes last. So one Cholesky factor of all sums of products gives, row
 left of the grey values' squares without a disc, with the disc where it is, and after the step.
 
 Residuals are the grey values less the fitted model's. Where the model does not fit they are
-correlated, and neighbours say less than their number: `correlated_area`. `outline_statistics`
-asks each of 16 sectors of the disc alone how large its step is and where its edge lies.
+correlated, and neighbours say less than their number: `correlated_area`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,28 +25,16 @@ from detect.discs.model import (
     F32,
     FASTMATH,
     GREY,
-    ONE,
     PIXEL_VARIANCE,
-    PLANE_X,
-    PLANE_Y,
     ROWS,
     SHARE,
     Blur,
     Disc,
 )
-from detect.discs.patch import SECTORS, sector_of
 from redetect.compiled import kernel
 
 #: Terms of the background, and unknowns of a step.
 BACKGROUND, UNKNOWNS = 5, 10
-
-#: Pixels without which the middle of a disc, this part of its radius, says nothing.
-_LEAST_MIDDLE = 2.0
-_MIDDLE = 0.3
-#: A sector counts from this many pixels on, and this spread of the shares in it.
-_LEAST_PIXELS, _LEAST_SPREAD = 3.0, 0.15
-#: A step is good if it has this much of the size of the whole disc's.
-_GOOD_STEP = 0.4
 
 FloatArray = NDArray[np.float64]
 
@@ -197,78 +184,3 @@ def blur_width(patch: Any, n: int, disc: Disc, blur: Blur) -> float:
         weights += weight
     mean: float = widths / max(weights, F32(1e-12))
     return mean
-
-
-class Outline(NamedTuple):
-    """How evenly the edge of a fitted disc goes round."""
-
-    good: float  # share of sectors whose step has the sign, and 0.4 of the size, of the disc's
-    #: Root mean square over the sectors of how far the edge is from the circle, in radii.
-    deviation: float
-    #: Step of the middle (the inner 0.3 of the radius) from the background, relative to the
-    #: contrast: 1 where it has not two pixels.
-    middle: float
-
-
-@kernel(forceinline=True, fastmath=FASTMATH)
-def _find_sectors(patch: Any, n: int, disc: Disc) -> None:
-    """Which sector pixels are in; `SECTORS` for those in the middle, and those not fitted."""
-    design = patch.design
-    x0, y0 = F32(disc.x), F32(disc.y)
-    middle = F32((_MIDDLE * disc.radius) ** 2)
-    for i in range(n):
-        x = design[PLANE_X, i] - x0
-        y = design[PLANE_Y, i] - y0
-        counts = (design[ONE, i] > F32(0.0)) & (x * x + y * y >= middle)
-        patch.sector[i] = sector_of(x, y) if counts else np.int32(SECTORS)
-
-
-@kernel(forceinline=True, fastmath=FASTMATH)
-def outline_statistics(
-    patch: Any, n: int, disc: Disc, contrast: float, sums: NDArray[np.float32]
-) -> Outline:
-    """How evenly the edge goes round: in each sector its step and how far it is from the circle.
-
-    The step is the regression of the grey values on the model's, relative to the whole disc's; the
-    distance is the Gauss-Newton step of the radius from that sector's residuals alone. `sums` is
-    (17, 8) working space.
-    """
-    _find_sectors(patch, n, disc)
-    c = F32(contrast)
-    sums.fill(0.0)
-    for i in range(n):
-        w, e = patch.design[SHARE, i], patch.residual[i]
-        r = c * patch.design[BY_RADIUS, i]
-        g = e + c * w
-        k = patch.sector[i]
-        sums[k, 0] += F32(1.0)
-        sums[k, 1] += w
-        sums[k, 2] += w * w
-        sums[k, 3] += g
-        sums[k, 4] += w * g
-        sums[k, 5] += r * e
-        sums[k, 6] += r * r
-    strongest = 0.0
-    for k in range(SECTORS):
-        strongest = max(strongest, float(sums[k, 6]))
-    seen = good = 0
-    deviation = 0.0
-    for k in range(SECTORS):
-        pixels, shares, greys = float(sums[k, 0]), float(sums[k, 1]), float(sums[k, 3])
-        spread = sums[k, 2] - shares * shares / max(pixels, 1.0)
-        if pixels < _LEAST_PIXELS or spread < _LEAST_SPREAD:
-            continue
-        seen += 1
-        relative = (sums[k, 4] - shares * greys / pixels) / spread / contrast
-        if relative > _GOOD_STEP:
-            good += 1
-        # Sectors with little edge in them say little about its place.
-        offset = sums[k, 5] / (sums[k, 6] + 0.1 * strongest)
-        deviation += min(offset * offset, 0.25)
-    # Pixels that are not fitted are in there, too, with shares and grey values of nothing.
-    middle = 1.0
-    if sums[SECTORS, 1] >= _LEAST_MIDDLE:
-        middle = float(sums[SECTORS, 3]) / float(sums[SECTORS, 1]) / contrast
-    if seen == 0:
-        return Outline(0.0, 0.0, middle)
-    return Outline(good / seen, math.sqrt(deviation / seen), middle)

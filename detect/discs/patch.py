@@ -1,10 +1,10 @@
 """The pixels to which a disc is fitted, with the floor that they see and their grey values.
 
 Pixels count if they are within some radii of the disc where a fit starts, or within some pixels or
-deviations of the blur of its edge. A first look takes some of them, evenly spread. A fit takes all;
-of large discs all of those at the edge, which locate it, and some of the others, which give the
-grey levels. How far a pixel is from the edge is known to first order, with the floor's steps at the
-candidate: ``|r - R| r / |J^T p|`` pixels for a place p on the floor, r = ``|p|``, and the steps J.
+deviations of the blur of its edge. All of them are taken; of large discs all of those at the edge,
+which locate it, and some of the others, which give the grey levels. How far a pixel is from the
+edge is known to first order, with the floor's steps at the candidate: ``|r - R| r / |J^T p|``
+pixels for a place p on the floor, r = ``|p|``, and the steps J.
 """
 
 from __future__ import annotations
@@ -78,8 +78,7 @@ _NEAR_RADII = 1.45
 _NEAR_PX = 2.0
 #: What is called the edge: this many deviations of the blur on either side.
 _EDGE_BLURS = 2.0
-#: About how many pixels a look takes; of windows larger than the other a fit takes some.
-_LOOK_PIXELS = 160
+#: Of windows of more pixels than this, some are taken off the edge.
 _DENSE_WINDOW = 2048
 #: Share of the distance between pixels that are taken by which they shift from row to row: one that
 #: never repeats soon.
@@ -105,18 +104,6 @@ class FitSettings(NamedTuple):
     """and the standard deviation of its logarithm."""
     blur_ratio: float
     """Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames."""
-
-
-class Effort(NamedTuple):
-    """How much a fit may cost: a tuple, for Numba compiles anew for each literal bool."""
-
-    look: bool
-    """Take about 160 pixels, rather than all that matter; leave out covariance and outline."""
-    evaluations: int
-    """Of the model, at most."""
-
-
-LOOK, FULL = Effort(True, 3), Effort(False, 15)
 
 
 class Candidate(NamedTuple):
@@ -214,7 +201,6 @@ def gather(
     candidate: Candidate,
     settings: FitSettings,
     start: Disc,
-    look: bool,
     patch: Any,
 ) -> Gathered:
     """Fill a patch with the pixels round a candidate; none where it sees no floor.
@@ -228,12 +214,10 @@ def gather(
     settings : FitSettings
     start : Disc
         Where the fit starts.
-    look : bool
-        Take about 160 pixels, rather than all that matter.
     patch : PATCH
         The result.
     """
-    shape, count = _choose(floor_xy, candidate, settings, start, look, patch)
+    shape, count = _choose(floor_xy, candidate, settings, start, patch)
     _describe(image, floor_xy, candidate, shape, count, patch)
     return Gathered(shape, padded(count), count)
 
@@ -253,7 +237,7 @@ def gather_by_sector(
 
     `ends` (SECTORS + 1,) is a result: where in the patch each sector begins, and the last ends.
     """
-    shape, count = _choose(floor_xy, candidate, settings, start, False, patch)
+    shape, count = _choose(floor_xy, candidate, settings, start, patch)
     count = _sort_by_sector(floor_xy, candidate, start, between, count, patch, ends)
     _describe(image, floor_xy, candidate, shape, count, patch)
     return Gathered(shape, padded(count), count)
@@ -316,7 +300,6 @@ def _choose(
     candidate: Candidate,
     settings: FitSettings,
     start: Disc,
-    look: bool,
     patch: Any,
 ) -> tuple[int, int]:
     """Which pixels are taken, and the weight of each; returns the shape and their number."""
@@ -333,13 +316,7 @@ def _choose(
     first_u, last_u = max(1, u0 - half_u), min(width - 2, u0 + half_u)
     first_v, last_v = max(1, v0 - half_v), min(height - 2, v0 + half_v)
     window = (2 * half_u + 1) * (2 * half_v + 1)
-    # A look takes some pixels of some rows; a fit goes through all, but off the edge takes some.
-    every, row_step = 1 + window // _DENSE_WINDOW, 1
-    if look:
-        row_step = max(1, int(math.sqrt(window / _LOOK_PIXELS)))
-        every = max(1, window // (_LOOK_PIXELS * row_step))
-    stands_for = F32(every * row_step)
-    at_edge = stands_for if look else F32(1.0)
+    every = 1 + window // _DENSE_WINDOW
     shift = max(1, int(_SHIFT * every + 0.5))
     floor = floor_xy.reshape(-1, 2)
     pixel, weight, row, row_x, row_y = (
@@ -354,30 +331,23 @@ def _choose(
     y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
     per_radius = F32(1.0 / (candidate.radius * start.radius))
     count = 0
-    for v in range(v0 - (v0 - first_v) // row_step * row_step, last_v + 1, row_step):
+    for v in range(first_v, last_v + 1):
         turn = (u0 - first_u + shift * (v - v0)) % every
-        begin, step, between = v * width + first_u, 1, every - 1
-        if look:
-            begin, step, turn, between = begin + turn, every, 0, 0
-        length = (v * width + last_u - begin) // step + 1
+        begin = v * width + first_u
+        length = last_u - first_u + 1
         if count + length > CAPACITY - SECTORS * _SECTOR_WHOLE:
             break
-        if look:
-            for k in range(length):
-                row_x[k] = (floor[begin + step * k, 0] - x0) * per_radius
-                row_y[k] = (floor[begin + step * k, 1] - y0) * per_radius
-        else:
-            places = floor[begin:]
-            for k in range(np.uint64(length)):
-                row_x[k] = (places[k, 0] - x0) * per_radius
-                row_y[k] = (places[k, 1] - y0) * per_radius
-        _weigh(length, candidate, settings, view, stands_for, at_edge, patch)
+        places = floor[begin:]
+        for k in range(np.uint64(length)):
+            row_x[k] = (places[k, 0] - x0) * per_radius
+            row_y[k] = (places[k, 1] - y0) * per_radius
+        _weigh(length, candidate, settings, view, F32(every), patch)
         for k in range(length):
             if row[k] >= F32(0.0) and (turn == 0 or row[k] == F32(1.0)):
-                pixel[count] = begin + step * k
+                pixel[count] = begin + k
                 weight[count] = row[k]
                 count += 1
-            turn = turn - 1 if turn > 0 else between
+            turn = turn - 1 if turn > 0 else every - 1
     return view.shape, count
 
 
@@ -388,7 +358,6 @@ def _weigh(
     settings: FitSettings,
     view: View,
     stands_for: float,
-    at_edge: float,
     patch: Any,
 ) -> None:
     """Weights of the pixels of a row: -1 beyond reach, 0 too far from the disc."""
@@ -424,7 +393,7 @@ def _weigh(
         edge = off_2 < edge_u * gu + edge_v * gv
         weight = F32(0.0) if within else F32(-1.0)
         weight = stands_for if near else weight
-        patch.row[k] = at_edge if near & edge else weight
+        patch.row[k] = F32(1.0) if near & edge else weight
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
-from detect.discs.descent import LEAST_BLUR, MOST_BLUR, Hope, blur_of
+from detect.discs.descent import LEAST_BLUR, MOST_BLUR, blur_of
 from detect.discs.fit import RESULT, fit_disc
 from detect.discs.model import (
     BY_BLUR,
@@ -46,7 +46,6 @@ from detect.discs.model import (
 from detect.discs.patch import (
     CHORDS_ALONG_V,
     EDGE,
-    FULL,
     SECTORS,
     Candidate,
     FitSettings,
@@ -57,13 +56,17 @@ from detect.discs.rim import Rim, follow_rim, median
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
-    from detect.discs.search import Scene
-    from detect.discs.second_look import SecondLooks
+    from detect.discs.judgement import Judgement
 
 FloatArray = NDArray[np.float64]
 
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
-WELL_EXPLAINED = 0.97
+_WELL_EXPLAINED = 0.97
+#: From this share of the rim on, and if it explains this share of the variance, the fit of the
+#: whole disc gives the place.
+_WHOLE_RIM, _IN_PART = 0.8, 0.9
+#: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
+_AT_BOUND, _MOST_REFITS = 0.98, 2
 #: Standard deviation of the radius about that which discs of the image seem to have, relative: of a
 #: short arc, place and radius trade off.
 _RADIUS_SIGMA = 0.02
@@ -110,6 +113,16 @@ _TERMS = 9
 
 _MIDDLES = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
 _COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
+
+
+class Scene(NamedTuple):
+    """An image, and how discs are placed in it."""
+
+    image: NDArray[np.uint8]
+    floor_xy: NDArray[np.float32]
+    radius: float  # nominal, metres
+    settings: FitSettings
+    camera_numbers: NDArray[np.float64]
 
 
 class Start(NamedTuple):
@@ -490,9 +503,8 @@ def place_fitted(scene: Scene, radius: float, work: Any, result: Any) -> None:
             given.blur_px, given.blur_sigma, placed.blur_ratio,
         )  # fmt: skip
         candidate, disc = _candidate_at(scene, radius, start)
-        hope = Hope(-math.inf, -math.inf, scene.search.optics_px)
         image, floor_xy = scene.image, scene.floor_xy
-        if fit_disc(image, floor_xy, candidate, settings, disc, FULL, hope, work, again):
+        if fit_disc(image, floor_xy, candidate, settings, disc, work, again):
             _place_if_better(again, result)
     if placed.agree:
         _place_if_better(by_sectors, result)
@@ -523,23 +535,68 @@ def place_by_rim(scene: Scene, radius: float, rim: Rim, work: Any, result: Any) 
 
 
 @kernel()
-def place_all(scene: Scene, radius: float, looks: SecondLooks, space: NDArray[Any]) -> Any:
-    """(N,) `RESULT` of the discs of N second looks."""
-    results = np.zeros(len(looks.step), RESULT)
-    for k in range(len(results)):
-        x, y = looks.seen_from[k, 0], looks.seen_from[k, 1]
-        rim = follow_rim(scene.image, scene.camera_numbers, x, y, radius, looks.step[k])
-        if not place_by_rim(scene, radius, rim, space[0], results[k]):
-            _add_square(results[k], _DISAGREEMENT, looks.doubt[k, 0], looks.doubt[k, 1])
-    return results
-
-
-@kernel()
 def _add_square(result: Any, share: float, x: float, y: float) -> None:
     """Add a share of the square of (x, y), metres, to the covariance of a result."""
     result.cov_xx += share * x * x
     result.cov_xy += share * x * y
     result.cov_yy += share * y * y
+
+
+@kernel()
+def place_discs(scene: Scene, discs: Judgement, work: Any) -> Any:
+    """Place discs by fits: those that are wholly in view, then the others, of the same size.
+
+    Parameters
+    ----------
+    scene : Scene
+    discs : Judgement
+        Of N discs.
+    work : WORK
+        Working space.
+
+    Returns
+    -------
+    (N,) RESULT
+    """
+    count = len(discs.step)
+    results, radii = np.zeros(count, RESULT), np.empty(count)
+    whole = np.zeros(count, np.bool_)
+    clear = 0
+    for k in range(count):
+        rim = _rim_of(scene, discs, k, scene.radius)
+        whole[k] = rim.agreeing >= _WHOLE_RIM and _fit_whole(scene, rim, work, results[k])
+        if whole[k] and results[k].explained >= _WELL_EXPLAINED:
+            radii[clear] = results[k].radius
+            clear += 1
+    radius = apparent_radius(scene.radius, radii[:clear])
+    for k in range(count):
+        if whole[k]:
+            place_fitted(scene, radius, work, results[k])
+        elif not place_by_rim(scene, radius, _rim_of(scene, discs, k, radius), work, results[k]):
+            _add_square(results[k], _DISAGREEMENT, discs.doubt[k, 0], discs.doubt[k, 1])
+    return results
+
+
+@kernel()
+def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
+    x, y = discs.seen_from[k, 0], discs.seen_from[k, 1]
+    return follow_rim(scene.image, scene.camera_numbers, x, y, radius, discs.step[k])
+
+
+@kernel()
+def _fit_whole(scene: Scene, rim: Rim, work: Any, result: Any) -> bool:
+    """Fit the whole disc of a rim; whether that explains what is seen."""
+    start, blur = Start(rim.x, rim.y, rim.radius, _BLUR_PX), _BLUR_PX
+    for _ in range(1 + _MOST_REFITS):
+        at, disc = _candidate_at(scene, scene.radius, start)
+        candidate = Candidate(at.u, at.v, at.radius, blur)
+        if not fit_disc(scene.image, scene.floor_xy, candidate, scene.settings, disc, work, result):
+            return False
+        if result.blur <= _AT_BOUND * result.blur_bound:
+            break
+        # Too blurred for its patch: once more, in a wider one.
+        start, blur = Start(result.x, result.y, result.radius, result.blur), result.blur_bound
+    return bool(result.explained >= _IN_PART and result.contrast * rim.step > 0.0)
 
 
 @kernel()

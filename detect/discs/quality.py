@@ -67,18 +67,6 @@ class Centres(NamedTuple):
     """(N,) of the inner outline to the outer, grey levels."""
 
 
-NO_CENTRES = Centres(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, np.float32))
-
-
-def contrast_and_floor(
-    image: NDArray[np.uint8], centres: Centres, chosen: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Contrasts of some of the centres, and the grey levels of the floor about them."""
-    contrast = centres.contrast[chosen].astype(np.float64)
-    u, v = centres.pixels[chosen].T
-    return contrast, image[v, u] - contrast
-
-
 def least_part_quality(quality: float, samples: int) -> float:
     """Quality that the samples of a group must have if all of both outlines have `quality`."""
     return 1.0 - (1.0 - quality) * samples / GROUP_SAMPLES

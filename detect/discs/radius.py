@@ -2,8 +2,8 @@
 
 Discs are searched at radii that grow by a constant factor, first at every second one, then beside
 the best of these; a parabola through the logarithms of the best three radii gives the peak.
-Evidence is a log-odds (`detect.discs.evidence`), in which the radius of each fit has a
-part, so that its sum over the discs is a likelihood of the radius.
+Evidence is a log-odds (`detect.discs.judgement`), in which the radius of each rim has a part, so
+that its sum over the discs is a likelihood of the radius.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
-from lut import build_disc_table
+from lut import build_vote_table
 
 #: Radii that are tried, metres, and the factor from one to the next.
 SMALLEST_M, LARGEST_M = 0.02, 0.5
@@ -49,7 +49,7 @@ def find_radius(
 
     def try_radius(k: int) -> None:
         tried = replace(settings, radius_m=float(radii[k]))
-        table = build_disc_table(camera, disc_shape(tried))
+        table = build_vote_table(camera, vote_shape(tried))
         for image in images:
             found = detect_circles(image, camera, table, tried)
             evidence[k] += found.evidence.sum()

@@ -1,9 +1,7 @@
 """Why discs are not found: the candidates of an image, with the stage and number that dropped each.
 
-The candidates are those of the detector itself (`detect.discs.search.Looks`,
-`detect.discs.second_look`), and besides them centres of the other polarity, of a lower contrast or
-down to half of the least quality, which it doesn't look at. Suggestions are tried: each says what
-would be found with it.
+The candidates are those of the detector itself (`detect.discs.judgement`) for discs of both
+polarities. Suggestions are tried: each says what would be found with it.
 """
 
 from __future__ import annotations
@@ -22,38 +20,28 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.circles import (
     CircleDetections,
-    FirstLook,
+    adjusted_log_odds,
+    candidates_of,
     detect_circles,
-    disc_shape,
-    first_look,
-    first_search,
-    second_look,
+    judged,
+    vote_shape,
 )
-from detect.discs.candidates import strong_and_alone
-from detect.discs.evidence import LEAST_EXPLAINED, RADIUS_RANGE
-from detect.discs.quality import Centres, Limits, centres_of
+from detect.discs.judgement import FATES, LEAST_RIM, Judgement
 from detect.discs.radius import FACTOR, find_radius
-from detect.discs.search import FATES, LEAST_STEPS, share_of_steps
+from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
-from lut import DiscTable, build_disc_table, cached_disc_table
+from lut import VoteTable, build_vote_table, cached_vote_table
 
 FloatArray = NDArray[np.float64]
-Stage = Literal[
-    "disc", "quality", "polarity", "contrast", "few steps", "first look", "evidence", "elsewhere",
-    "beside a better disc", "of the rarer sign", "pale", "second look",
-]  # fmt: skip
+Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
 
-#: Centres of at least this share of the least quality are candidates: anywhere, or near a place.
-_QUALITY_SHARE, _QUALITY_SHARE_NEAR = 0.9, 0.3
 #: Radii that are tried at a place are as much smaller and larger.
 _OTHER_RADII = 2.5
 #: A place is as far as this from where it was pointed at, radii.
 _NEAR = 1.5
-#: Blurs that are this much wider than the stated one are worth a suggestion.
-_BLURRED = 1.5
-#: Radii of fits whose median differs by this share from the nominal one are, too.
+#: Radii of rims whose median differs by this share from the usual one are worth a suggestion.
 _OTHER_RADIUS = 0.04
-_FEWEST_FITS = 5
+_FEWEST_RIMS = 5
 
 
 class Candidate(NamedTuple):
@@ -61,10 +49,10 @@ class Candidate(NamedTuple):
 
     u: float  # pixel
     v: float
-    x_m: float  # on the floor as the camera is calibrated, metres
+    x_m: float  # where that is on the floor as the camera is calibrated, metres
     y_m: float
-    quality: float  # Otsu's
-    contrast: float  # grey levels inside minus outside
+    votes: float  # of edges, relative to what is usual as far away
+    contrast: float  # grey levels inside minus outside; NaN where no rim was followed
     stage: Stage  # what dropped it; "disc" if it was found
     value: float  # the number that decided,
     limit: float  # and what it should have been at least; NaN where there is none
@@ -79,21 +67,13 @@ class Candidate(NamedTuple):
         value, limit = f"{self.value:.2f}", f"{self.limit:.2f}"
         return {
             "disc": f"found: evidence {value}, least {limit}",
-            "quality": f"quality {value} is less than {limit} (--threshold)",
-            "polarity": f"contrast {value} is of the other sign (--polarity any)",
-            "contrast": f"contrast {value} is less than {limit}, by the noise (--noise-floor)",
-            "few steps": f"grey values step on {value} of all sides, {limit} expected",
-            "first look": "a quick fit finds no disc"
-            if not math.isfinite(self.value)
-            else f"a quick fit has evidence {value}, {limit} needed to go on (--evidence)",
-            "evidence": "the fit is impossible for a disc: radius, outline or middle"
-            if not math.isfinite(self.value)
-            else f"evidence {value} is less than {limit} (--evidence)",
-            "elsewhere": "the fit wandered to something else",
+            "polarity": "it is of the other polarity (--polarity any)",
+            "steps": "the grey value steps on few sides, or too little for the noise "
+            "(--noise-floor)",
+            "glance": f"no disc at a glance: log-odds {value}",
+            "rim": f"{value} of its rim lie on a circle of this radius, {limit} expected",
+            "evidence": f"evidence {value} is less than {limit} (--evidence)",
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
-            "pale": f"evidence {value}, and much less contrast than the other discs",
-            "of the rarer sign": f"evidence {value}, and nearly all discs are of the other sign",
-            "second look": f"log-odds {value} by its rim, {limit} expected",
         }[self.stage]
 
 
@@ -101,7 +81,7 @@ class Candidate(NamedTuple):
 class DiscExplanation:
     """What became of the candidates of an image."""
 
-    candidates: tuple[Candidate, ...]  # those that were found first, then by falling quality
+    candidates: tuple[Candidate, ...]  # those that were found first, then by falling votes
     place: str  # of the place that was pointed at; empty without one
     suggestions: tuple[str, ...]  # what to try, and what that would find
 
@@ -139,20 +119,19 @@ def explain_discs(
     image : (H, W) uint8
     camera : Camera
     settings : CircleSettings
-        With `verify` and `refine`: the plain detectors drop nothing after the quality.
+        With `refine`: the published detector drops what is of a low quality, and nothing else.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found: candidates near it alone.
     """
     scene = _Scene(image, camera, settings)
-    share = _QUALITY_SHARE if at is None else _QUALITY_SHARE_NEAR
-    candidates = list(_candidates(scene, share))
+    candidates = list(_candidates(scene))
     place = ""
     if at is not None:
         place = _place(at, scene)
         x, y = camera.floor_from_pixel(at).tolist()
         near = _NEAR * settings.radius_m
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
-    candidates.sort(key=lambda c: (not c.is_disc, -c.quality))
+    candidates.sort(key=lambda c: (c.stage != "disc", -c.votes))
     return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
 
 
@@ -162,21 +141,15 @@ def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: Circ
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
     if not stages:
-        return (
-            f"There is no candidate in {len(images)} of the images: no place has a quality of "
-            f"{settings.threshold:g} (--threshold)."
-        )
-    other_sign, faint = stages.pop("polarity", 0), stages.pop("contrast", 0)
-    left = sum(stages.values())
+        return f"There is no candidate in {len(images)} of the images: no edges lie on a circle."
     fates = (
-        (other_sign, f"are not {settings.polarity} (--polarity any)"),
-        (faint, f"have a contrast of less than {settings.noise_floor:g} times the noise "
-         "(--noise-floor)"),
-        (left, "do not look like a disc when one is fitted (--evidence)"),
-    )  # fmt: skip
+        (stages["polarity"], f"are not {settings.polarity} (--polarity any)"),
+        (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
+        (stages["glance"] + stages["rim"], "have no rim of this radius (--radius-m)"),
+        (stages["evidence"], "do not look like a disc (--evidence)"),
+    )
     failed = ", ".join(f"{count} {test}" for count, test in fates if count)
-    count = other_sign + faint + left
-    return f"Of {count} candidates in {len(images)} of the images {failed}."
+    return f"Of {stages.total()} candidates in {len(images)} of the images {failed}."
 
 
 @dataclass(frozen=True)
@@ -188,19 +161,19 @@ class _Scene:
     settings: CircleSettings
 
     @cached_property
-    def table(self) -> DiscTable:
-        return cached_disc_table(self.camera, disc_shape(self.settings))
+    def table(self) -> VoteTable:
+        return cached_vote_table(self.camera, vote_shape(self.settings))
 
     @cached_property
     def found(self) -> CircleDetections:
         return detect_circles(self.image, self.camera, self.table, self.settings)
 
     @cached_property
-    def first(self) -> FirstLook:
-        return first_look(self.image, self.camera, self.table, self.settings)
-
-    def centres(self, least_quality: float) -> Centres:
-        return centres_of(self.image, self.table, Limits(least_quality))
+    def judgement(self) -> tuple[FloatArray, Judgement]:
+        """Votes for the candidates of either polarity, and what they are."""
+        any_sign, noise = replace(self.settings, polarity="any"), estimate_noise(self.image)
+        candidates = candidates_of(self.image, self.table, any_sign, noise)
+        return candidates.score, judged(self.image, self.camera, any_sign, candidates, noise)
 
     def count(self, at: tuple[float, float] | None) -> int:
         """Discs that were found, near a pixel if one is given."""
@@ -210,77 +183,43 @@ class _Scene:
         return int((np.hypot(*(self.found.floor_xy - here).T) < self.settings.radius_m).sum())
 
 
-def _candidates(scene: _Scene, quality_share: float = 1.0) -> Iterator[Candidate]:
+def _candidates(scene: _Scene) -> Iterator[Candidate]:
     """What was found, and the candidates that were rejected."""
-    image, camera, settings = scene.image, scene.camera, scene.settings
-    table, found = scene.table, scene.found
-    pixels = camera.project_floor(found.floor_xy)
-    every = scene.centres(0.0)
-    for (u, v), (x, y), q, evidence in zip(
-        pixels.tolist(), found.floor_xy.tolist(), found.quality.tolist(), found.evidence.tolist()
+    camera, settings, found = scene.camera, scene.settings, scene.found
+    votes, judgement = scene.judgement
+    evidence = adjusted_log_odds(judgement, settings)
+    taken = np.zeros(len(votes), np.bool_)
+    for k, ((x, y), (u, v)) in enumerate(
+        zip(found.floor_xy.tolist(), camera.project_floor(found.floor_xy).tolist())
     ):
-        # Not every pixel of a large disc is tested for its centre.
-        nearest = np.argmin(np.hypot(*(every.pixels - np.array((u, v))).T))
-        contrast = float(every.contrast[nearest])
-        yield Candidate(u, v, x, y, q, contrast, "disc", evidence, settings.evidence)
-    near = 0.5 * settings.separation_m
-    taken = [found.floor_xy]
-    weakest = settings.least_contrast
-    if settings.verify or settings.refine:
-        _, weakest, centres, by_fit, _ = scene.first
-        looks, least = by_fit.looks, first_search(settings).least_evidence
-        best = strong_and_alone(centres, table.floor_xy, weakest, near)
-        at = looks.pixels
-        floor = table.floor_xy[at[:, 1], at[:, 0]].astype(np.float64)
-        for k, number in enumerate(looks.fate.tolist()):
-            name = FATES[number]
-            if name in ("disc", "in a clear disc", "same disc") or _near(
-                found.floor_xy, floor[k], near
-            ):
-                continue
-            quality, contrast = float(centres.quality[best[k]]), float(centres.contrast[best[k]])
-            u, v = at[k].tolist()
-            x, y = floor[k].tolist()
-            value, limit = float(looks.log_odds[k]), least
-            if name == "few steps":
-                value = share_of_steps(
-                    image, table.floor_xy, u, v, settings.inner_radius_m, settings.outer_radius_m,
-                    contrast,
-                )  # fmt: skip
-                limit = LEAST_STEPS
-            elif name == "beside a better disc":
-                away = np.hypot(*(found.floor_xy - floor[k]).T).min(initial=math.inf)
-                value, limit = float(away) / settings.radius_m, settings.separation
-            stage: Stage = name  # type: ignore[assignment]
-            yield Candidate(u, v, x, y, quality, contrast, stage, value, limit)
-        taken.append(floor)
-        more = second_look(image, camera, table, settings, scene.first)
-        dropped = more.log_odds < 0.0
-        for xy, q, odds in zip(
-            more.floor_xy[dropped], more.quality[dropped], more.log_odds[dropped].tolist()
-        ):
-            if not _near(np.concatenate(taken), xy, near):
-                (u, v), (x, y) = camera.project_floor(xy).tolist(), xy.tolist()
-                yield Candidate(u, v, x, y, float(q), math.nan, "second look", odds, 0.0)
-    wider = scene.centres(quality_share * settings.threshold)
-    others = np.concatenate(taken)
-    for k in strong_and_alone(wider, table.floor_xy, 0.0, settings.separation_m).tolist():
-        u, v = wider.pixels[k].tolist()
-        x, y = table.floor_xy[v, u].astype(np.float64).tolist()
-        if _near(others, np.array([x, y]), settings.separation_m):
+        away = np.hypot(*(judgement.floor_xy - found.floor_xy[k]).T)
+        taken |= away < 0.5 * settings.radius_m
+        best = int(np.argmin(away - 1e-3 * (judgement.log_odds > 0.0)))
+        row = float(votes[best]), float(judgement.step[best])
+        yield Candidate(u, v, x, y, *row, "disc", float(found.evidence[k]), settings.evidence)
+    sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[settings.polarity]
+    pixels = camera.project_floor(judgement.floor_xy)
+    for k in np.flatnonzero(~taken).tolist():
+        fate, value = FATES[judgement.fate[k]], float(judgement.value[k])
+        if fate == "same rim":
             continue
-        q, contrast = float(wider.quality[k]), float(wider.contrast[k])
-        sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[settings.polarity]
-        if q < settings.threshold:
-            yield Candidate(u, v, x, y, q, contrast, "quality", q, settings.threshold)
-        elif sign * contrast < 0.0:
-            yield Candidate(u, v, x, y, q, contrast, "polarity", contrast, 0.0)
-        elif abs(contrast) < weakest:
-            yield Candidate(u, v, x, y, q, contrast, "contrast", abs(contrast), weakest)
-
-
-def _near(places: FloatArray, xy: FloatArray, within_m: float) -> bool:
-    return bool((np.hypot(*(places - xy).T) < within_m).any())
+        contrast = float(judgement.step[k]) if fate == "judged" else math.nan
+        stage: Stage = "evidence"
+        limit = settings.evidence
+        if judgement.sign[k] * sign < 0.0:
+            if fate != "judged" or value < 0.0:
+                continue
+            stage = "polarity"
+        elif fate != "judged":
+            stage, limit = fate, LEAST_RIM if fate == "rim" else math.nan
+        elif evidence[k] < limit:
+            value = float(evidence[k])
+        else:
+            away = np.hypot(*(found.floor_xy - judgement.floor_xy[k]).T).min(initial=math.inf)
+            stage = "beside a better disc"
+            value, limit = float(away) / settings.radius_m, settings.separation
+        (u, v), (x, y) = pixels[k].tolist(), judgement.floor_xy[k].tolist()
+        yield Candidate(u, v, x, y, float(votes[k]), contrast, stage, value, limit)
 
 
 def _place(at: tuple[float, float], scene: _Scene) -> str:
@@ -299,18 +238,11 @@ def _place(at: tuple[float, float], scene: _Scene) -> str:
             f"{words}, where the floor moves {per_row:.3f} m per image row: too far for discs of "
             f"{settings.radius_m:g} m, {settings.far_limit_m_per_px:.3f} m at most (--far-limit)."
         )
-    centres = scene.centres(0.0)
-    floor = scene.table.floor_xy[centres.pixels[:, 1], centres.pixels[:, 0]].astype(np.float64)
-    away = np.hypot(floor[:, 0] - x, floor[:, 1] - y)
-    near = np.flatnonzero(away < settings.radius_m)
-    at_border = min(u, v, camera.width - 1 - u, camera.height - 1 - v) < settings.border_px
-    if at_border or not len(near):
-        return f"{words}: no centre of a disc is looked for there, it is too near to the border."
-    best = near[np.argmax(centres.quality[near])]
-    return (
-        f"{words}: within a radius of it the best quality is {centres.quality[best]:.2f} (least "
-        f"{settings.threshold:g}), with a contrast of {centres.contrast[best]:+.0f} grey levels."
-    )
+    votes, judgement = scene.judgement
+    near = np.hypot(*(judgement.seen_from - [x, y]).T) < settings.radius_m
+    if not near.any():
+        return f"{words}: no edges there vote for a disc of {settings.radius_m:g} m."
+    return f"{words}: edges there have {votes[near].max():.1f} times the usual votes for a disc."
 
 
 def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]:
@@ -331,20 +263,9 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
         radius_m = None if estimate is None else estimate.radius_m
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
         yield f"--radius-m {radius_m:.3f} finds a disc {'there' if at is not None else 'here'}."
-    if not settings.verify:
-        return
-    looks = scene.first.found.looks
-    results = looks.results[looks.results["explained"] >= LEAST_EXPLAINED]
-    if len(results):
-        blur_px = round(float(np.median(results["blur"])), 1)
-        if blur_px > _BLURRED * settings.blur_px:
-            more = gained(replace(settings, blur_px=blur_px))
-            if more > 0:
-                yield f"--blur-px {blur_px:g}, as edges are blurred, finds {more} {where}."
-    relative = results["radius"] / settings.radius_m
-    relative = relative[(relative > RADIUS_RANGE[0]) & (relative < RADIUS_RANGE[1])]
-    if len(relative) >= _FEWEST_FITS:
-        off = float(np.median(relative)) - 1.0
+    sizes = scene.judgement[1].relative_radius[scene.judgement[1].log_odds > settings.evidence]
+    if len(sizes) >= _FEWEST_RIMS:
+        off = float(np.median(sizes)) - 1.0
         if abs(off) > _OTHER_RADIUS:
             yield (
                 f"Discs look {100 * abs(off):.0f} % {'larger' if off > 0 else 'smaller'} than "
@@ -366,7 +287,7 @@ def _radius_at(scene: _Scene, at: tuple[float, float]) -> float | None:
     best, of_best = -math.inf, None
     for radius_m in (settings.radius_m * FACTOR ** np.arange(-count, count + 1)).tolist():
         tried = replace(settings, radius_m=radius_m, polarity="any")
-        table = build_disc_table(camera, disc_shape(tried))
+        table = build_vote_table(camera, vote_shape(tried))
         found = detect_circles(scene.image, camera, table, tried)
         near = np.hypot(*(found.floor_xy - here).T) < radius_m
         if near.any() and found.evidence[near].max() > best:

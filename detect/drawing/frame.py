@@ -307,17 +307,12 @@ _FATE_COLOURS: dict[str, Colour] = {
 
 _STAGE_COLOURS: dict[str, Colour] = {
     "disc": LINE_COLOUR,
-    "quality": (150, 150, 150),
     "polarity": (255, 120, 60),
-    "contrast": (200, 200, 0),
-    "few steps": (200, 0, 120),
-    "first look": (0, 140, 255),
+    "steps": (150, 150, 150),
+    "glance": (200, 200, 0),
+    "rim": (0, 140, 255),
     "evidence": (0, 0, 255),
-    "elsewhere": (200, 0, 200),
     "beside a better disc": (60, 120, 60),
-    "of the rarer sign": (160, 80, 200),
-    "pale": (200, 160, 160),
-    "second look": (0, 200, 255),
 }
 
 

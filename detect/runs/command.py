@@ -237,7 +237,7 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
         )
     hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found["discs"] < summary.frames
     none = not found["discs"] and summary.frames > summary.failed
-    if plan.circles is not None and plan.circles.verify and (hardly_any or none):
+    if plan.circles is not None and plan.circles.refine and (hardly_any or none):
         yield from _hints_on_discs(job, plan.circles, summary)
 
 
@@ -264,8 +264,7 @@ def _hints_on_discs(job: Job, settings: CircleSettings, summary: RunSummary) -> 
     if likely is None:
         yield discs + (
             f"At no radius are more found in {len(images)} of the images: is the calibration that "
-            "of this camera (`detect draw` shows outlines), are the images much blurred "
-            "(--blur-px), are there discs in view?"
+            "of this camera (`detect draw` shows outlines), are there discs in view?"
         )
     elif abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
         yield discs + (

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
@@ -50,7 +50,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
-from lut import DiscTable, VerticalTable, cached_disc_table, cached_vertical_table
+from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -95,7 +95,7 @@ class Tables(NamedTuple):
     """The tables by the calibration that a plan needs."""
 
     verticals: VerticalTable | None
-    discs: DiscTable | None
+    discs: VoteTable | DiscTable | None
 
 
 @lru_cache(maxsize=4)
@@ -104,7 +104,7 @@ def tables_of(plan: FramePlan) -> Tables:
     camera = plan.camera
     return Tables(
         cached_vertical_table(camera) if camera and plan.lines else None,
-        cached_disc_table(camera, disc_shape(plan.circles)) if camera and plan.circles else None,
+        disc_table(camera, plan.circles) if camera and plan.circles else None,
     )
 
 

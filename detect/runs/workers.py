@@ -260,7 +260,7 @@ class _InProcess(Executor):
         if not self._shared:
             return
         self._shared = False  # only before the first kernel
-        from detect.runs.first_run import look_again, place_discs
+        from detect.runs.first_run import place_none
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
@@ -269,14 +269,12 @@ class _InProcess(Executor):
                 started.enter_context(_ProcessPool(1, plan, show=False))
                 for plan in (discs, lines, discs)[: _cores()]
             ]
-            # Discs take three times as long as lines. So another process takes on what follows the
-            # first look at discs, which theirs comes to last.
+            # Discs take longer than lines. So another process takes on what theirs comes to last.
             done = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 others[0].submit(work_on_chunk, lines, self._chunk),
             ]
-            for function in (look_again, place_discs):
-                others[-1].submit(function, discs, self._chunk)
+            others[-1].submit(place_none, discs, self._chunk)
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
             raise _CompiledElsewhereError

@@ -19,13 +19,14 @@ from detect.circles import (
     CircleDetections,
     detect_circles,
     disc_shape,
+    disc_table,
     published_positions,
     quality_of_centres,
     tilt_jacobian,
 )
 from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
-from lut import DiscShape, DiscTable, build_disc_table, ring
+from lut import DiscTable, VoteTable, cached_disc_table, ring
 from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor, mirrored_camera
 from tools.evaluation.accuracy import Scene, measure_accuracy
 
@@ -42,14 +43,14 @@ DARK_ONES = np.array([1, 4, 6])
 
 
 @lru_cache(maxsize=8)
-def table_of(camera: Camera, shape: DiscShape) -> DiscTable:
-    return build_disc_table(camera, shape)
+def table_of(camera: Camera, settings: CircleSettings) -> VoteTable | DiscTable:
+    return disc_table(camera, settings)
 
 
 def detect(
     image: NDArray[np.uint8], camera: Camera, settings: CircleSettings = DEFAULT
 ) -> CircleDetections:
-    return detect_circles(image, camera, table_of(camera, disc_shape(settings)), settings)
+    return detect_circles(image, camera, table_of(camera, settings), settings)
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +248,7 @@ def test_what_is_no_disc_is_not_reported(
 
 def test_verification_is_what_drops_the_square(published_camera: Camera) -> None:
     image = PaintedFloor(published_camera).shape((0.2, -1.1), _square).image()
-    assert len(detect(image, published_camera, replace(DEFAULT, verify=False, refine=False))) >= 1
+    assert len(detect(image, published_camera, replace(DEFAULT, refine=False))) >= 1
     assert len(detect(image, published_camera)) == 0
 
 
@@ -270,7 +271,7 @@ def test_published_rows_are_pixels(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
     found = detect(discs_image, published_camera, REPORT)
-    table = table_of(published_camera, disc_shape(REPORT))
+    table = cached_disc_table(published_camera, disc_shape(REPORT))
     quality, _ = quality_of_centres(discs_image, table)
     columns, rows = found.pixels.T
     assert np.issubdtype(found.pixels.dtype, np.integer)
@@ -330,7 +331,7 @@ def test_quality_is_that_of_the_outlines(
     discs_image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
     """Otsu's quotient from the definition, the outlines straight through the camera."""
-    table = table_of(published_camera, disc_shape(REPORT))
+    table = cached_disc_table(published_camera, disc_shape(REPORT))
     quality, contrast = quality_of_centres(discs_image, table)
     rng = np.random.default_rng(11)
     rows, columns = np.nonzero(table.usable)
@@ -405,7 +406,7 @@ def test_mirrored_image_and_camera_give_mirrored_rows(
     """
     image, mirror_image = image_and_mirror_image(published_camera, shift, seed)
     width = published_camera.width
-    quality, _ = quality_of_centres(image, table_of(published_camera, disc_shape(REPORT)))
+    quality, _ = quality_of_centres(image, cached_disc_table(published_camera, disc_shape(REPORT)))
     found = detect(image, published_camera, REPORT)
     for u, v in found.pixels:
         around = quality[v - 1 : v + 2, u - 1 : u + 2]

@@ -10,14 +10,14 @@ import pytest
 from camera import Camera
 from detect.circles import (
     detect_circles,
-    disc_shape,
+    disc_table,
     published_positions,
     refined_covariance,
 )
 from detect.lines import detect_lines
 from detect.markers.geometry import picture_of
 from detect.settings import CircleSettings
-from lut import build_disc_table, build_vertical_table
+from lut import build_vertical_table
 from tests.detect.line_scene import Edge, edge_columns, pinhole, render, tilted
 from tests.detect.painted_floor import PaintedFloor
 
@@ -42,7 +42,7 @@ def largest_error_m(seen_by: Camera, believed: Camera) -> float:
     for place in PLACES:
         floor.disc(place)
     settings = CircleSettings(polarity="light")
-    table = build_disc_table(believed, disc_shape(settings))
+    table = disc_table(believed, settings)
     found = detect_circles(floor.image(), believed, table, settings)
     assert len(found) == len(PLACES)
     distance = np.linalg.norm(found.floor_xy[:, None] - PLACES, axis=-1)

@@ -7,10 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_table
 from detect.grey_values import blank_margins
 from detect.settings import CircleSettings
-from lut import build_disc_table
 from tests.detect.painted_floor import PaintedFloor
 
 LIGHT = 200.0
@@ -51,7 +50,7 @@ def test_a_disc_that_a_margin_cuts_is_found_in_its_place(
     published_camera: Camera, u: float
 ) -> None:
     settings = CircleSettings()
-    table = build_disc_table(published_camera, disc_shape(settings))
+    table = disc_table(published_camera, settings)
     image, place = floor_with_disc(published_camera, u, 190.0)
     found = detect_circles(with_margin(image, 7), published_camera, table, settings)
     assert len(found) == 1

@@ -73,7 +73,6 @@ def test_published_preset_is_the_law() -> None:
     assert (PUBLISHED.threshold, PUBLISHED.least_contrast) == (0.6, 5.0)
     assert PUBLISHED.separation_m == pytest.approx(0.2)
     assert (PUBLISHED.polarity, PUBLISHED.border_px, PUBLISHED.noise_floor) == ("any", 0, 0.0)
-    assert not PUBLISHED.verify
     assert not PUBLISHED.refine
 
 
@@ -81,7 +80,6 @@ def test_report_preset_is_the_report() -> None:
     outlines = REPORT.radius_m, REPORT.inner_radius_m, REPORT.outer_radius_m
     assert outlines == pytest.approx((0.10, 0.06, 0.14))
     assert (REPORT.samples, REPORT.threshold, REPORT.border_px) == (16, 0.6, 12)
-    assert not REPORT.verify
     assert not REPORT.refine
     assert REPORT.separation_m == REPORT.noise_floor == REPORT.stride == 0.0
     assert REPORT.polarity == "any"

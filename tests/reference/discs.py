@@ -166,35 +166,3 @@ def fitted_disc(
 
     start = np.array([0.0, 0.0, 1.0, math.log(settings.blur_px)])
     return np.asarray(least_squares(misfit, start, x_scale=[0.1, 0.1, 0.1, 0.5]).x)
-
-
-# -- the residuals ------------------------------------------------------------------------------
-
-
-def outline_of(
-    place: FloatArray, share: FloatArray, by_radius: FloatArray, residual: FloatArray,
-    disc: tuple[float, float, float], contrast: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Share of good sectors, deviation from the circle, and step of the middle.
-
-    `place` is (N, 2), relative to the candidate; the disc is x, y, radius.
-    """
-    dx, dy = place[:, 0] - disc[0], place[:, 1] - disc[1]
-    sector = np.floor(np.arctan2(dy, dx) % (2.0 * np.pi) / (np.pi / 8.0)).astype(int) % 16
-    outside = np.hypot(dx, dy) >= 0.3 * disc[2]
-    grey = residual + contrast * share
-    edge = contrast * by_radius
-    strongest = max(np.sum(edge[outside & (sector == k)] ** 2) for k in range(16))
-    good, off = [], []
-    for k in range(16):
-        these = outside & (sector == k)
-        if these.sum() < 3 or np.var(share[these]) * these.sum() < 0.15:
-            continue
-        slope = np.cov(grey[these], share[these], bias=True)[0, 1] / np.var(share[these])
-        good.append(slope / contrast > 0.4)
-        step = np.sum(edge[these] * residual[these])
-        off.append(min((step / (np.sum(edge[these] ** 2) + 0.1 * strongest)) ** 2, 0.25))
-    middle = 1.0
-    if np.sum(share[~outside]) >= 2.0:
-        middle = float(np.sum(grey[~outside]) / np.sum(share[~outside]) / contrast)
-    return float(np.mean(good)), float(np.sqrt(np.mean(off))), middle

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_shape, disc_table
 from detect.cli import carry_out
 from detect.discs.quality import Limits, centres_of, quality_of_centres
 from detect.grey_values import estimate_noise
@@ -40,8 +40,8 @@ Command = All | Circles | Lines
 def whole_detectors(camera: Camera) -> dict[str, Function]:
     """The detectors as the commands use them, by name."""
     settings = CircleSettings()
-    published = cached_disc_table(camera, disc_shape(PUBLISHED))
-    default = cached_disc_table(camera, disc_shape(settings))
+    published = disc_table(camera, PUBLISHED)
+    default = disc_table(camera, settings)
     verticals = cached_vertical_table(camera)
     return {
         "circles (published)": lambda p: detect_circles(p.grey, camera, published, PUBLISHED),
@@ -54,7 +54,7 @@ def all_detectors(camera: Camera) -> dict[str, Function]:
     """The detectors, their parts by themselves, and all of `detect all` for one image."""
     settings = CircleSettings()
     report = cached_disc_table(camera, disc_shape(REPORT))
-    default = cached_disc_table(camera, disc_shape(settings))
+    default = disc_table(camera, settings)
     verticals = cached_vertical_table(camera)
 
     def everything(picture: Picture) -> object:
@@ -65,9 +65,7 @@ def all_detectors(camera: Camera) -> dict[str, Function]:
 
     return {
         KERNEL: lambda p: quality_of_centres(p.grey, report),
-        "quality map (default)": lambda p: quality_of_centres(p.grey, default),
         "good centres (report)": lambda p: centres_of(p.grey, report, Limits(REPORT.threshold)),
-        "good centres (default)": lambda p: centres_of(p.grey, default, Limits(settings.threshold)),
         "noise estimate": lambda p: estimate_noise(p.grey),
         RESPONSE: lambda p: line_response(p.grey, verticals, LINES_DEFAULT),
         **whole_detectors(camera),

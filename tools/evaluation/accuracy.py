@@ -1,26 +1,24 @@
-"""Accuracy of the disc fit on rendered discs whose truth is exact.
+"""Accuracy of the places of rendered discs whose truth is exact.
 
 Discs are drawn at random over all pixels that the detector's table covers, at random sub-pixel
 places, rendered by exact supersampling (`tools.simulator.single_disc`, which knows nothing of the
-fit), and fitted. Errors are held against the covariance that the fit predicts.
+detector), and detected. Errors are held against the covariances that the detector states.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from camera import Camera, read_camera
-from detect.circles import disc_shape, refined_covariance
-from detect.discs.fit import blur_ratio_of
-from detect.grey_values import estimate_noise
+from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
-from lut import cached_disc_table
+from lut import cached_vote_table
+from lut.outlines import floor_positions, pixels_within, size_down
 from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
-from tools.evaluation.single_fits import fit_discs
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
 
@@ -33,10 +31,10 @@ class Accuracy:
     """Errors of N fitted discs."""
 
     distance_m: FloatArray  # (N,) Of the discs from the robot.
-    error_px: FloatArray  # (N, 2) Fitted minus true centre in the image, pixels.
+    error_px: FloatArray  # (N, 2) Found minus true centre in the image, pixels.
     normalised_error: FloatArray
     """(N,) Squared error over the predicted covariance, per degree of freedom."""
-    failed: int  # Discs that the fit gave up.
+    failed: int  # Discs that were not found.
 
     @property
     def rms_px(self) -> float:
@@ -57,27 +55,26 @@ class Scene:
 def measure_accuracy(
     camera: Camera, settings: CircleSettings, scene: Scene, *, discs: int, seed: int
 ) -> Accuracy:
-    """Render and fit discs."""
-    table = cached_disc_table(camera, disc_shape(replace(settings, rows_apart=0.0)))
+    """Render and detect discs."""
+    table = cached_vote_table(camera, vote_shape(settings))
     rng = np.random.default_rng(seed)
-    rows, columns = np.nonzero(table.usable)
+    usable = pixels_within(size_down(floor_positions(camera)), 6, settings.far_limit_m_per_px)
+    rows, columns = np.nonzero(usable)
     distance, error, normalised = [], [], []
     failed = 0
     for index in rng.integers(len(rows), size=discs):
         nearest = np.array([columns[index], rows[index]], np.int64)
         true_xy = camera.floor_from_pixel(nearest + rng.uniform(-0.5, 0.5, 2))
         image = _render(camera, scene, true_xy, settings.radius_m, rng)
-        fit = fit_discs(
-            image, table.floor_xy, nearest[None], settings.radius_m, estimate_noise(image),
-            blur_ratio=blur_ratio_of(camera),
-        )  # fmt: skip
-        if not fit.fitted[0]:
+        found = detect_circles(image, camera, table, settings)
+        off = found.floor_xy - true_xy
+        if not (np.hypot(*off.T) < 0.5 * settings.radius_m).any():
             failed += 1
             continue
-        covariance = refined_covariance(camera, fit.floor_xy, fit.covariance, settings)[0]
+        best = int(np.argmin(np.hypot(*off.T)))
         distance.append(float(np.hypot(*true_xy)))
-        error.append(camera.project_floor(fit.floor_xy[0]) - camera.project_floor(true_xy))
-        normalised.append(squared_mahalanobis(fit.floor_xy[0] - true_xy, covariance) / 2.0)
+        error.append(camera.project_floor(found.floor_xy[best]) - camera.project_floor(true_xy))
+        normalised.append(squared_mahalanobis(off[best], found.covariance[best]) / 2.0)
     return Accuracy(np.array(distance), np.array(error), np.array(normalised), failed)
 
 
@@ -100,7 +97,7 @@ def _render(
 class AccuracyStudy:
     """Refined centres of rendered single discs against the truth, by blur and distance."""
 
-    camera: Path = Path("images/e/e.cam")  # Calibration to render and fit through.
+    camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
     discs: int = 400  # Discs per blur.
     seed: int = 1  # Of places and noise.
 

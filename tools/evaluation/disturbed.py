@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.settings import CircleSettings
-from lut import cached_disc_table
 from redetect.array_types import ByteArray, FloatArray
 from redetect.storage import write_whole
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
@@ -202,7 +201,7 @@ def measure(
 ) -> Iterator[tuple[str, float, Tally]]:
     """Detect the discs of scenes of every family and share, and the look-alikes."""
     stage = Stage(camera, settings.radius_m, np.random.default_rng(seed))
-    table = cached_disc_table(camera, disc_shape(settings))
+    table = disc_table(camera, settings)
     cases = [(kind, share) for kind in (*DISTURBANCES, BORDER) for share in shares]
     cases += [(kind, 0.0) for kind in (*BLURRED, *LOOK_ALIKES)]
     for number, (kind, share) in enumerate(cases):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_shape, disc_table
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
@@ -39,10 +39,10 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     """Quality of every pixel; candidates; what the fit makes of them."""
     camera, image = _frame(run, frame)
     settings = CircleSettings()
-    table = cached_disc_table(camera, disc_shape(settings))
+    table = disc_table(camera, settings)
     from detect.discs.quality import quality_of_centres
 
-    without_fit = CircleSettings(verify=False, refine=False)
+    without_fit = CircleSettings(refine=False)
     every = cached_disc_table(camera, disc_shape(without_fit))
     quality, _ = quality_of_centres(image, every)
     found = detect_circles(image, camera, table, settings)
@@ -96,7 +96,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
 def draw_tables(figure: Any, run: Path) -> None:
     """What is known of every pixel before the first image."""
     camera, image = _frame(run, 0)
-    settings = CircleSettings(rows_apart=0.0)
+    settings = CircleSettings(refine=False)
     radii = settings.inner_radius_m, settings.outer_radius_m
     table = cached_disc_table(camera, disc_shape(settings))
     verticals = cached_vertical_table(camera)

@@ -1,8 +1,9 @@
-"""Second looks of known truth (`detect.discs.second_look`), for training its network.
+"""Candidates of known truth (`detect.discs.judgement`), for training the networks.
 
-Candidates come from rendered buildings with known truth, from discs of these and of real images
-that were disturbed (`tools.evaluation.disturbances`), and from a recorded run with its map: there
-only what is far from every mapped disc is used, as what is no disc.
+They come from rendered buildings and floors with known truth, from boards of many discs, from discs
+of the buildings and of real images that were disturbed (`tools.evaluation.disturbances`), and from
+a recorded run with its map: there discs are the shipped rows of mapped ones, and what is far from
+every mapped disc is none. Other cameras than the run's see a part of the floors, and the boards.
 """
 
 from __future__ import annotations
@@ -20,36 +21,34 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
-from detect.circles import candidates_at, disc_shape, first_look, second_looks_at
+from detect.circles import candidates_of, judged, vote_shape
+from detect.discs.judgement import FEATURES, GLANCED_AT, JUDGED, glance, pairs_of_steps
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
-from detect.discs.second_look import FEATURES, GLANCED_AT, glance, pairs_of_steps
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
-from lut import DiscTable, cached_disc_table
+from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
+from redetect.landmarks import read_frames
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
 from tools.evaluation.disturbed import BLURRED, Stage, render_scene
 
-_SETTINGS = CircleSettings(polarity="light")
-#: There is no second look with these.
-_FIRST = CircleSettings(polarity="any")
+_SETTINGS = CircleSettings()
 #: Of a disc, metres.
 _RADIUS = 0.1
-#: How much a row counts of a rendered building.
-_BUILDING_WEIGHT = 3.0
-#: How much a row counts that is a disturbed disc, or no disc on a real image.
-_DISTURBED_WEIGHT, _REAL_WEIGHT = 0.2, 0.4
-#: How much less a disc counts that the first look finds.
-_FOUND_WEIGHT = 0.3
-#: Evidence of the first look from which on a disc of the real run is one.
-_CLEAR = 6.0
+#: How much a row counts: of a rendered building, a disturbed disc, a real image, a rendered floor,
+#: a board; and by how much a row less that is of the other polarity than the discs of the building.
+_BUILDING, _DISTURBED, _REAL, _SCENE, _BOARD, _OTHER_SIGN = 3.0, 0.2, 0.4, 0.4, 0.1, 0.3
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
-#: How much a row counts of a rendered floor, how often floors change, and the disturbed shares.
-_SCENE_WEIGHT, _SCENES_PER_STAGE, _SHARES = 0.4, 50, (0.1, 0.5)
+#: How often floors and cameras change, and the disturbed shares.
+_SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
 #: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
 _VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
+#: A disc of fewer pixels than this from its middle up is not told from others.
+_LEAST_HALF_PX = 1.0
+#: Sizes of images of other cameras.
+_SIZES = (640, 480), (512, 384), (320, 240)
 
 
 def _network_by(features: int, decisive: int, inputs: int) -> RimNetwork:
@@ -66,21 +65,30 @@ _BY_RIM = Networks(
     _network_by(1, 0, len(GLANCED_AT) + OTHERS),
     _network_by(len(FEATURES), FEATURES.index("rim"), STEPS // 2 + OTHERS),
 )
-_NOWHERE, _NO_PLACES = np.zeros((0, 4)), np.zeros((0, 2))
 
 
 class Looks(NamedTuple):
     """Glances at candidates or second looks, of known truth."""
 
     features: FloatArray  # (N, F)
-    grey: Float32Array  # (N, V, K, M)
+    grey: Float32Array  # (N, V, K, M) Of a dark disc, turned into a light one.
     pixels_per_radius: Float32Array  # (N, V, K) What the network sees, from V places nearby.
     is_disc: BoolArray  # (N,)
     weight: FloatArray  # (N,)
     source: NDArray[np.str_]  # (N,)
 
 
+class Truth(NamedTuple):
+    """What is known of an image; places are (N, 4) pixels u, v, half width and height."""
+
+    light: FloatArray  # discs that are lighter than the floor,
+    dark: FloatArray  # and darker
+    unsure: FloatArray
+    others: FloatArray | None = None  # where nothing is a disc; None: wherever else
+
+
 _Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
+_NOWHERE = np.zeros((0, 4))
 
 
 class _Gathering:
@@ -90,44 +98,40 @@ class _Gathering:
         self.looks: list[_Row] = []
 
     def add(
-        self,
-        image: ByteArray,
-        view: tuple[Camera, DiscTable],
-        discs: FloatArray,
-        unsure: FloatArray,
-        weight: tuple[float, float],
-        source: str,
-        only: bool = False,
-    ) -> None:
-        """Look at an image with discs and unsure places in pixels: u, v, half width and height.
+        self, image: ByteArray, camera: Camera, truth: Truth, weight: float, source: str,
+        other_sign: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Look at an image."""
+        table = cached_vote_table(camera, vote_shape(_SETTINGS))
+        noise, numbers = estimate_noise(image, 16), camera_numbers(camera)
+        signs = len(truth.light) > 0, len(truth.dark) > 0
 
-        With `only`, the places are known to be of something else, and nothing else counts.
-        """
-        camera, table = view
-        noise = estimate_noise(image, 32)
-        found = first_look(image, camera, table, _FIRST).found
-        numbers = camera_numbers(camera)
+        def known(places: FloatArray, sign: FloatArray) -> Iterator[tuple[int, bool, float, str]]:
+            for k, uv in enumerate(camera.project_floor(places)):
+                discs = truth.light if sign[k] > 0.0 else truth.dark
+                other = any(signs) and not signs[0 if sign[k] > 0.0 else 1]
+                is_disc = _nearest(uv, discs) < 0.6
+                if truth.others is not None:
+                    counts = is_disc or _nearest(uv, truth.others) < 0.6
+                else:
+                    counts = is_disc or min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
+                if counts:
+                    yield k, is_disc, weight * (other_sign if other else 1.0), source
 
-        def judged(place: FloatArray) -> tuple[bool, float, str]:
-            uv = camera.project_floor(place[None])[0]
-            near, far = _nearest(uv, discs), _nearest(uv, unsure)
-            is_disc, is_other = near < 0.6, far < 0.6 if only else min(near, far) > 1.5
-            counts = weight[0] if is_disc else weight[1]
-            if is_disc and (np.hypot(*(found.floor_xy - place).T) < _RADIUS).any():
-                counts *= _FOUND_WEIGHT
-            return is_disc, counts if is_disc or is_other else 0.0, source
-
-        candidates = candidates_at(image, camera, table, _SETTINGS, noise)
-        for place, score in zip(candidates.floor_xy, candidates.score, strict=True):
-            grey, scale = glance(image, numbers, place[0], place[1], _RADIUS)
-            self.glances.append((np.array([score]), grey[None], scale[None], *judged(place)))
-        looks = second_looks_at(image, camera, _SETTINGS, candidates, _NO_PLACES, noise, _BY_RIM)
-        for features, place in zip(looks.features, looks.floor_xy, strict=True):
-            if np.isfinite(features).all():
-                self.looks.append((features, *self._views(image, camera, place), *judged(place)))
+        candidates = candidates_of(image, table, _SETTINGS, noise)
+        for k, *row in known(candidates.floor_xy, candidates.sign):
+            x, y = candidates.floor_xy[k]
+            grey, scale = glance(image, numbers, x, y, _RADIUS)
+            seen = candidates.score[k : k + 1], candidates.sign[k] * grey[None], scale[None]
+            self.glances.append((*seen, *row))
+        rims = judged(image, camera, _SETTINGS, candidates, noise, _BY_RIM)
+        rims = rims.where((rims.fate == JUDGED) & np.isfinite(rims.features).all(axis=1))
+        for k, *row in known(rims.floor_xy, rims.sign):
+            views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])
+            self.looks.append((rims.features[k], *views, *row))
 
     def _views(
-        self, image: ByteArray, camera: Camera, place: FloatArray
+        self, image: ByteArray, camera: Camera, place: FloatArray, sign: float
     ) -> tuple[FloatArray, FloatArray]:
         grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS // 2)), np.empty((_VIEWS, DIRECTIONS))
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
@@ -136,12 +140,11 @@ class _Gathering:
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
             steps, scale[k] = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
-            grey[k] = pairs_of_steps(steps)
+            grey[k] = sign * pairs_of_steps(steps)
         return grey, scale
 
 
 def _looks_of(rows: list[_Row]) -> Looks:
-    rows = [row for row in rows if row[4] > 0.0]
     features, grey, scale, is_disc, weight, source = zip(*rows, strict=True)
     return Looks(
         np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
@@ -156,7 +159,7 @@ def _nearest(uv: FloatArray, places: FloatArray) -> float:
     return float(np.nanmin(off, initial=np.inf))
 
 
-def _images(camera: Camera, places: FloatArray, slack_px: float) -> FloatArray:
+def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatArray:
     """(N, 4) pixel, half width and half height of discs."""
     angle = np.linspace(0.0, 2.0 * np.pi, 24)
     rim = _RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -174,40 +177,43 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
     """Glances and looks at all sources of a folder of data; of the real frames, every n-th."""
     rng = np.random.default_rng(seed)
     gathering = _Gathering(rng)
-    _add_scenes(gathering, read_camera(data / "dlr" / "e" / "e.cam"), scenes, rng)
+    run_camera = read_camera(data / "dlr" / "e" / "e.cam")
+    _add_scenes(gathering, run_camera, scenes, rng)
+    for number in range(scenes // 8):
+        image, camera, places, dark = render_board(rng)
+        if number % 2:
+            image, dark = np.asarray(255 - image, np.uint8), not dark
+        at = _images(camera, places)
+        truth = Truth(_NOWHERE, at, _NOWHERE) if dark else Truth(at, _NOWHERE, _NOWHERE)
+        gathering.add(image, camera, truth, _BOARD, "boards")
     for folder in sorted((data / "rendered").glob("r*")):
         camera = read_camera(folder / f"{folder.name}.cam")
-        view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
         for frame in json.loads((folder / "truth.json").read_text())["frames"]:
             image = _read(folder / "images" / f"{frame['prefix']}.jpg")
-            sizes = {
-                c["id"]: _images(camera, np.array([[c["px"], c["py"]]]), 0.0)
+            rows = [
+                (c["mandatory"], [c["u"], c["v"], *of[0, 2:]], [c["px"], c["py"]])
                 for c in frame["circles"]
-            }
-            at = [
-                (c["mandatory"], [c["u"], c["v"], *sizes[c["id"]][0, 2:]])
-                for c in frame["circles"]
-                if len(sizes[c["id"]])
+                if len(of := _images(camera, np.array([[c["px"], c["py"]]])))
             ]
-            sure = np.array([a for mandatory, a in at if mandatory]).reshape(-1, 4)
-            unsure = np.array([a for mandatory, a in at if not mandatory]).reshape(-1, 4)
-            gathering.add(
-                image, view, sure, unsure, (_BUILDING_WEIGHT, _BUILDING_WEIGHT), folder.name
-            )
-            _add_disturbed(gathering, image, view, rng, f"{folder.name} disturbed")
-    run = data / "dlr"
-    camera = read_camera(run / "e" / "e.cam")
-    view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
-    for number, (name, mapped) in enumerate(_mapped(run)):
-        path = run / "e" / "images" / f"{name}.jpg"
+            sure = np.array([at for mandatory, at, _ in rows if mandatory]).reshape(-1, 4)
+            unsure = np.array([at for mandatory, at, _ in rows if not mandatory]).reshape(-1, 4)
+            truth = Truth(sure, _NOWHERE, unsure)
+            gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
+            places = np.array([xy for mandatory, _, xy in rows if mandatory]).reshape(-1, 2)
+            _add_disturbed(gathering, image, camera, places, rng, f"{folder.name} disturbed")
+    for number, (name, mapped, rows_xy) in enumerate(_mapped(data / "dlr", run_camera)):
+        path = data / "dlr" / "e" / "images" / f"{name}.jpg"
         if number % every or not path.is_file():
             continue
         image = _read(path)
-        found = first_look(image, *view, _FIRST).found
-        clear = _images(camera, found.floor_xy[found.evidence > _CLEAR], 0.0)
-        gathering.add(image, view, clear, mapped, (_REAL_WEIGHT, _REAL_WEIGHT), "real")
+        shipped = np.array([xy for xy in rows_xy if _is_mapped(run_camera, xy, mapped)])
+        shipped = shipped.reshape(-1, 2)
+        light = np.array([_is_light(image, run_camera, xy) for xy in shipped], np.bool_)
+        of_light, of_dark = (_images(run_camera, shipped[of]) for of in (light, ~light))
+        truth = Truth(of_light, of_dark, mapped)
+        gathering.add(image, run_camera, truth, _REAL, "real")
         if number % (3 * every) == 0:
-            _add_disturbed(gathering, image, view, rng, "real disturbed")
+            _add_disturbed(gathering, image, run_camera, shipped[light], rng, "real disturbed")
     return _looks_of(gathering.glances), _looks_of(gathering.looks)
 
 
@@ -215,48 +221,117 @@ def _add_scenes(
     gathering: _Gathering, camera: Camera, scenes: int, rng: np.random.Generator
 ) -> None:
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
-    view = camera, cached_disc_table(camera, disc_shape(_SETTINGS))
     kinds = [*DISTURBANCES, *DISTURBANCES, *BLURRED, *LOOK_ALIKES]
     for number in range(scenes):
         if number % _SCENES_PER_STAGE == 0:
-            stage = Stage(camera, _RADIUS, rng)
+            own = (number // _SCENES_PER_STAGE) % 2 == 0
+            stage = Stage(camera if own else other_camera(rng), _RADIUS, rng)
         kind = str(rng.choice(kinds))
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
-        at = _images(camera, np.array(places), 0.0)
-        is_disc = kind not in LOOK_ALIKES
-        discs, others = (at, _NOWHERE) if is_disc else (_NOWHERE, at)
-        weight = (_SCENE_WEIGHT, _SCENE_WEIGHT)
-        gathering.add(image, view, discs, others, weight, "scenes", only=not is_disc)
+        at = _images(stage.camera, np.array(places))
+        if kind in LOOK_ALIKES:
+            truth = Truth(_NOWHERE, _NOWHERE, _NOWHERE, at)
+        else:
+            half = np.ptp([stage.outline(place)[:, 1] for place in places], axis=1) / 2.0
+            clear = half >= _LEAST_HALF_PX if len(places) else np.zeros(0, np.bool_)
+            truth = Truth(at[clear], _NOWHERE, at[~clear])
+        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN)
+
+
+def other_camera(rng: np.random.Generator) -> Camera:
+    """A camera of another size, height and angle over the floor."""
+    width, height = _SIZES[rng.integers(len(_SIZES))]
+    scale, pitch = width * rng.uniform(0.55, 1.1), np.radians(rng.uniform(15.0, 60.0))
+    cos, sin = np.cos(pitch), np.sin(pitch)
+    pose = (-1.0, 0.0, 0.0, 0.0), (0.0, sin, -cos, 0.0), (0.0, -cos, -sin, rng.uniform(0.4, 1.7))
+    middle = (width - 1) / 2.0, (height - 1) / 2.0
+    return Camera(width, height, scale, scale, *middle, (0.0,) * 5, pose)
+
+
+def render_board(rng: np.random.Generator) -> tuple[ByteArray, Camera, FloatArray, bool]:
+    """A board of many discs, and what is about it; its camera, (N, 2) places, and if they are dark.
+
+    The board lies on the floor, below a camera that looks down at it at some angle.
+    """
+    width, height = _SIZES[rng.integers(len(_SIZES))]
+    scale, pitch = width * rng.uniform(0.7, 1.6), np.radians(rng.uniform(35.0, 90.0))
+    columns, rows = rng.integers(4, 14, 2)
+    spacing = _RADIUS * rng.uniform(2.3, 4.0)
+    size = np.array([columns - 1, rows - 1]) * spacing
+    away = scale * np.hypot(*size) / (height * rng.uniform(0.5, 1.2))
+    cos, sin = np.cos(pitch), np.sin(pitch)
+    pose = (-1.0, 0.0, 0.0, 0.0), (0.0, sin, -cos, cos * away), (0.0, -cos, -sin, sin * away)
+    middle = (width - 1) / 2.0, (height - 1) / 2.0
+    camera = Camera(width, height, scale, scale, *middle, (0.0,) * 5, pose)
+    fine = 3
+    u, v = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (width, height))
+    floor = camera.floor_from_pixel(np.stack(np.meshgrid(u, v), axis=-1))
+    turn = rng.uniform(-np.pi, np.pi)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    at = np.nan_to_num(floor @ matrix, nan=1e6) + size / 2.0
+    index = np.clip(np.rint(at / spacing), 0, [columns - 1, rows - 1])
+    shifted = rng.random() < 0.4  # every second row by half of the spacing
+    if shifted:
+        row = np.clip(np.rint(at[..., 1] / spacing), 0, rows - 1)
+        across = np.clip(np.rint(at[..., 0] / spacing - 0.5 * (row % 2)), 0, columns - 1)
+        index = np.stack([across + 0.5 * (row % 2), row], axis=-1)
+    off = np.hypot(*np.moveaxis(at - index * spacing, -1, 0))
+    margin = rng.uniform(0.15, 0.6)
+    on_board = ((at > -margin) & (at < size + margin + 0.5 * spacing * shifted)).all(axis=-1)
+    blocks = cv2.resize(
+        rng.uniform(20.0, 200.0, (rng.integers(3, 14), rng.integers(3, 14))).astype(np.float32),
+        (width * fine, height * fine),
+        interpolation=int(rng.choice([cv2.INTER_NEAREST, cv2.INTER_LINEAR])),
+    )
+    paper, ink = rng.uniform(110.0, 240.0), rng.uniform(10.0, 80.0)
+    grey = np.where(on_board, np.where(off < _RADIUS, ink, paper), blocks)
+    slope = rng.uniform(-0.3, 0.3, 2)
+    light = 1.0 + slope[0] * u[None, :] / width + slope[1] * v[:, None] / height
+    sigma = fine * rng.uniform(0.4, 1.6)
+    seen = cv2.GaussianBlur((grey * light).astype(np.float32), (0, 0), sigma)
+    pixels = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
+    noisy = pixels + rng.normal(0.0, rng.uniform(0.5, 5.0), pixels.shape)
+    image = np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
+    number = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
+    if shifted:
+        number[..., 0] += 0.5 * (number[..., 1] % 2)
+    places = (number.reshape(-1, 2) * spacing - size / 2.0) @ matrix.T
+    return image, camera, places, True
 
 
 def _add_disturbed(
-    gathering: _Gathering,
-    image: ByteArray,
-    view: tuple[Camera, DiscTable],
-    rng: np.random.Generator,
-    source: str,
-) -> None:
-    found = first_look(image, *view, _FIRST).found
-    clear = np.flatnonzero(found.evidence > 4.0)
-    for i in (i for _ in range(_ROUNDS) for i in rng.permutation(clear)[:_PER_ROUND]):
-        at = found.floor_xy[i]
-        place = _images(view[0], at, 0.0)
+    gathering: _Gathering, image: ByteArray, camera: Camera, places: FloatArray,
+    rng: np.random.Generator, source: str,
+) -> None:  # fmt: skip
+    """Look at an image of which light discs (N, 2) are disturbed or replaced, a few at a time."""
+    floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
+    turns = (rng.permutation(len(places))[:_PER_ROUND] for _ in range(_ROUNDS))
+    for at in (places[i] for turn in turns for i in turn):
+        place = _images(camera, at)
         kind = str(rng.choice(list(DISTURBANCES)))
-        changed = disturbed(image, view[1].floor_xy, at, _RADIUS, kind, rng)
-        gathering.add(changed, view, place, _NOWHERE, (_DISTURBED_WEIGHT, 0.0), source)
-        other = replaced(image, view[1].floor_xy, at, _RADIUS, str(rng.choice(LOOK_ALIKES)), rng)
+        changed = disturbed(image, floor_xy, at, _RADIUS, kind, rng)
+        disc = Truth(place, _NOWHERE, _NOWHERE, others=_NOWHERE)
+        gathering.add(changed, camera, disc, _DISTURBED, source)
+        other = replaced(image, floor_xy, at, _RADIUS, str(rng.choice(LOOK_ALIKES)), rng)
         if rng.random() < 0.5:
             kind = str(rng.choice(list(DISTURBANCES)))
-            other = disturbed(other, view[1].floor_xy, at, _RADIUS, kind, rng)
-        gathering.add(other, view, _NOWHERE, place, (0.0, _DISTURBED_WEIGHT), source, only=True)
+            other = disturbed(other, floor_xy, at, _RADIUS, kind, rng)
+        gathering.add(
+            other, camera, Truth(_NOWHERE, _NOWHERE, _NOWHERE, others=place), _DISTURBED, source
+        )
 
 
-def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:
-    """Names of frames, and where mapped discs are in them, with some slack."""
-    camera = read_camera(run / "e" / "e.cam")
+def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Names of frames, places of mapped discs in the image with slack, and shipped rows (m)."""
     true = np.array(json.loads((run / "mounting.json").read_text())["robot_from_camera"])
     rows = list(csv.DictReader((run / "levelled_map.csv").open()))
     discs = np.array([(float(d["x_m"]), float(d["y_m"])) for d in rows])
+    shipped = {
+        frame.step.prefix.split("/")[-1].rsplit(".ppm", 1)[0]: np.array(
+            [(c.px, c.py) for c in frame.circles if c.ids and c.ids[0] >= 0]
+        ).reshape(-1, 2)
+        for frame in read_frames(run / "map.circles")
+    }
     seen = with_pose(camera, true)
     for pose in csv.DictReader((run / "levelled_path.csv").open()):
         if not pose["prefix"][-4:].isdigit():
@@ -265,7 +340,16 @@ def _mapped(run: Path) -> Iterator[tuple[str, FloatArray]]:
         cos, sin = np.cos(turn), np.sin(turn)
         places = (discs - [x, y]) @ [[cos, -sin], [sin, cos]]
         near = places[np.hypot(*places.T) < 9.5]
-        yield pose["prefix"], _images(seen, near, 4.0)
+        yield pose["prefix"], _images(seen, near, 4.0), shipped[pose["prefix"]]
+
+
+def _is_mapped(camera: Camera, floor_xy: FloatArray, mapped: FloatArray) -> bool:
+    return _nearest(camera.project_floor(floor_xy[None])[0], mapped) < 1.0
+
+
+def _is_light(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> bool:
+    grey, _ = glance(image, camera_numbers(camera), floor_xy[0], floor_xy[1], _RADIUS)
+    return bool(np.nanmean(grey[:, 1:3]) > np.nanmean(grey[:, 5:7]))
 
 
 def _read(path: Path) -> ByteArray:

@@ -1,4 +1,4 @@
-"""Which pixels a disc is fitted to, held against their definition; and who is looked at at all."""
+"""Which pixels a disc is fitted to, held against their definition."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import disc_shape
+from detect.circles import vote_shape
 from detect.discs.fit import fit_settings
 from detect.discs.model import GREY, ONE, PLANE_X, PLANE_Y, Disc
 from detect.discs.patch import EDGE, PATCH, WHOLE, Candidate, FitSettings, Gathered, gather, padded
-from detect.discs.search import share_of_steps
 from detect.settings import CircleSettings
-from lut import DiscTable, build_disc_table
-from tests.detect.painted_floor import PaintedFloor
+from lut import VoteTable, build_vote_table
 from tests.reference.discs import pixels_within_reach
 
 RADIUS = 0.1
@@ -25,23 +23,22 @@ NOMINAL = Disc(0.0, 0.0, 1.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def table(published_camera: Camera) -> DiscTable:
-    return build_disc_table(published_camera, disc_shape(CircleSettings()))
+def table(published_camera: Camera) -> VoteTable:
+    return build_vote_table(published_camera, vote_shape(CircleSettings()))
 
 
 @njit(error_model="numpy")
 def _gather(
     image: NDArray[np.uint8], floor_xy: NDArray[np.float32], candidate: Candidate,
-    settings: FitSettings, start: Disc, look: bool, patch: Any,
+    settings: FitSettings, start: Disc, patch: Any,
 ) -> Gathered:  # fmt: skip
-    return gather(image, floor_xy, candidate, settings, start, look, patch[0])
+    return gather(image, floor_xy, candidate, settings, start, patch[0])
 
 
 def gathered(
-    table: DiscTable,
+    table: VoteTable,
     image: NDArray[np.uint8],
     candidate: Candidate,
-    look: bool = False,
     start: Disc = NOMINAL,
 ) -> tuple[Gathered, dict[str, Any]]:
     """`gather` into a patch that was used before."""
@@ -49,12 +46,12 @@ def gathered(
     for name in ("x", "y", "design", "weight", "row"):
         patch[name] = 7.0
     settings = fit_settings(1.0, 0.5)
-    found = _gather(image, table.floor_xy, candidate, settings, start, look, patch)
+    found = _gather(image, table.floor_xy, candidate, settings, start, patch)
     return found, {name: patch[name][0] for name in PATCH.names or ()}
 
 
 @pytest.mark.parametrize(("u", "v"), [(400, 160), (200, 130), (500, 110), (3, 150), (765, 165)])
-def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -> None:
+def test_patches_are_the_pixels_within_reach(table: VoteTable, u: int, v: int) -> None:
     image = np.random.default_rng(3).integers(0, 256, table.floor_xy.shape[:2], np.uint8)
     candidate = Candidate(u, v, RADIUS, 0.8)
     found, patch = gathered(table, image, candidate)
@@ -79,7 +76,7 @@ def test_patches_are_the_pixels_within_reach(table: DiscTable, u: int, v: int) -
     assert np.all(patch["x"][n : found.n] > 100.0)
 
 
-def test_patches_lie_about_the_start_of_the_fit(table: DiscTable) -> None:
+def test_patches_lie_about_the_start_of_the_fit(table: VoteTable) -> None:
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
     start = Disc(0.1, -0.2, 1.2, 0.0)
     found, patch = gathered(table, image, Candidate(400, 200, RADIUS, 0.8), start=start)
@@ -92,7 +89,7 @@ def test_patches_lie_about_the_start_of_the_fit(table: DiscTable) -> None:
 
 
 @pytest.mark.parametrize("v", [200, 115])
-def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
+def test_steps_are_those_of_the_floor(table: VoteTable, v: int) -> None:
     """The steeper axis comes first where the disc is seen flat."""
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
     found, patch = gathered(table, image, Candidate(400, v, RADIUS, 0.8))
@@ -112,7 +109,7 @@ def test_steps_are_those_of_the_floor(table: DiscTable, v: int) -> None:
         assert patch["growth"] == pytest.approx(expected, abs=1e-4)
 
 
-def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: DiscTable) -> None:
+def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: VoteTable) -> None:
     image = np.zeros(table.floor_xy.shape[:2], np.uint8)
     candidate = Candidate(400, 250, RADIUS, 0.8)
     found, patch = gathered(table, image, candidate)
@@ -128,37 +125,3 @@ def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: Dis
     often = int(weight.max())
     assert set(weight[~at_edge]) == {0, often}
     assert (~at_edge).sum() == pytest.approx((len(every) - at_edge.sum()) / often, rel=0.1)
-
-
-@pytest.mark.parametrize("v", [250, 200, 150])
-def test_looks_take_some_pixels_evenly(table: DiscTable, v: int) -> None:
-    image = np.zeros(table.floor_xy.shape[:2], np.uint8)
-    candidate = Candidate(400, v, RADIUS, 0.6)
-    found, patch = gathered(table, image, candidate, look=True)
-    every = pixels_within_reach(table.floor_xy, candidate, fit_settings(1.0, 0.5))
-    index = patch["pixel"][: found.fitted].astype(int)
-    assert set(index) <= set(every)
-    assert 60 < found.fitted < 200
-    spread = [np.stack(np.divmod(pixels, 768)).std(axis=1) for pixels in (index, every)]
-    np.testing.assert_allclose(spread[0], spread[1], rtol=0.15)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_discs_step_on_all_sides_and_edges_on_some(
-    published_camera: Camera, table: DiscTable, sign: float
-) -> None:
-    place = (0.3, -1.8)
-    u, v = np.rint(published_camera.project_floor(np.array(place))).astype(int)
-    grey = 140.0 - 60.0 * sign, 140.0 + 60.0 * sign
-    disc = PaintedFloor(published_camera, grey[0]).disc(place, grey[1], RADIUS, 0.7).image(2.0)
-    outlines = 0.06, 0.14
-    assert share_of_steps(disc, table.floor_xy, u, v, *outlines, 120.0 * sign) == 1.0
-    assert share_of_steps(disc, table.floor_xy, u, v, *outlines, -120.0 * sign) == 0.0
-    # A line of one radius to either side of the middle: none along it.
-    stripe = np.full_like(disc, round(grey[0]))
-    off = np.abs(table.floor_xy[..., 0] - place[0])
-    stripe[off < RADIUS] = round(grey[1])
-    share = share_of_steps(stripe, table.floor_xy, u, v, *outlines, 120.0 * sign)
-    assert share == pytest.approx(0.5, abs=0.13)
-    # In the image's corner few directions are seen, or none.
-    assert share_of_steps(np.zeros_like(disc), table.floor_xy, 0, 287, 5.0, 9.0, 50.0) == 1.0

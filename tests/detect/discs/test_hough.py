@@ -7,37 +7,35 @@ import pytest
 
 from camera import Camera
 from camera.uncertainty import with_pose
-from detect.circles import disc_shape
-from detect.discs.hough import count_votes, grid_of, hough_candidates
-from detect.settings import CircleSettings
-from lut import DiscShape, DiscTable, build_disc_table
+from detect.discs.hough import count_votes, hough_candidates
+from lut import VoteShape, VoteTable, build_vote_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 PLACES = np.array([(0.3, -1.2), (-0.5, -2.0), (0.5, -3.2)])
 
 
 @pytest.fixture(scope="module")
-def table(published_camera: Camera) -> DiscTable:
-    return build_disc_table(published_camera, disc_shape(CircleSettings()))
+def table(published_camera: Camera) -> VoteTable:
+    return build_vote_table(published_camera, VoteShape())
 
 
-@pytest.mark.parametrize(("grey", "sign"), [(LIGHT, 1.0), (DARK, -1.0)])
+@pytest.mark.parametrize(("grey", "sign"), [(LIGHT, 1), (DARK, -1)])
 @pytest.mark.parametrize("half", [False, True])
 def test_the_best_candidates_are_the_discs(
-    published_camera: Camera, table: DiscTable, grey: float, sign: float, half: bool
+    published_camera: Camera, table: VoteTable, grey: float, sign: int, half: bool
 ) -> None:
     floor = PaintedFloor(published_camera)
     for place in PLACES:
         floor.disc(place, grey)
         if half:  # the floor's own grey value covers what lies on one side of the middle
             floor.shape(place, lambda x, y: x > 0.02, FLOOR)
-    found = hough_candidates(floor.image(seed=1), published_camera, table, 0.1, sign, 4.0)
+    found = hough_candidates(floor.image(seed=1), table, 0.1, sign, 4.0)
     assert (np.diff(found.score) <= 0.0).all()
     best = found.floor_xy[: len(PLACES)]
     distance = np.hypot(*np.moveaxis(best[:, None] - PLACES, -1, 0))
     assert sorted(distance.argmin(axis=1)) == [0, 1, 2]
     assert (distance.min(axis=1) < 0.05).all()
-    other = hough_candidates(floor.image(seed=1), published_camera, table, 0.1, -sign, 4.0)
+    other = hough_candidates(floor.image(seed=1), table, 0.1, -sign, 4.0)
     assert not len(other.score) or other.score[0] < found.score[len(PLACES) - 1]
 
 
@@ -46,41 +44,49 @@ def test_a_camera_that_looks_back_sees_the_same(published_camera: Camera) -> Non
     turned = np.array(published_camera.robot_from_camera)
     turned[:2] *= -1.0
     camera = with_pose(published_camera, turned)
-    table = build_disc_table(camera, disc_shape(CircleSettings()))
+    table = build_vote_table(camera, VoteShape())
     for place in [(0.0, 1.3), (0.02, 2.0), (-0.02, 2.6)]:
         image = PaintedFloor(camera).disc(place).image(seed=4)
-        found = hough_candidates(image, camera, table, 0.1, 1.0, 4.0)
+        found = hough_candidates(image, table, 0.1, 1, 4.0)
         assert np.hypot(*(found.floor_xy[0] - place)) < 0.05
 
 
 def test_a_table_without_centres_has_no_candidates(published_camera: Camera) -> None:
-    table = build_disc_table(published_camera, DiscShape(far_limit_m_per_px=1e-9))
+    table = build_vote_table(published_camera, VoteShape(far_limit_m_per_px=1e-9))
     image = PaintedFloor(published_camera).disc(PLACES[0]).image(seed=1)
-    assert len(hough_candidates(image, published_camera, table, 0.1, 1.0, 4.0).score) == 0
+    assert len(hough_candidates(image, table, 0.1, 1, 4.0).score) == 0
 
 
-def test_nothing_on_a_bare_floor(published_camera: Camera, table: DiscTable) -> None:
+def test_both_signs_are_those_of_each(published_camera: Camera, table: VoteTable) -> None:
+    image = PaintedFloor(published_camera).disc(PLACES[0]).disc(PLACES[1], DARK).image(seed=5)
+    both = hough_candidates(image, table, 0.1, 0, 4.0)
+    for sign in (1, -1):
+        of_sign = hough_candidates(image, table, 0.1, sign, 4.0)
+        np.testing.assert_array_equal(both.floor_xy[both.sign == sign], of_sign.floor_xy)
+        np.testing.assert_array_equal(both.score[both.sign == sign], of_sign.score)
+        assert (of_sign.sign == sign).all()
+
+
+def test_nothing_on_a_bare_floor(published_camera: Camera, table: VoteTable) -> None:
     image = PaintedFloor(published_camera).image(seed=2)
-    found = hough_candidates(image, published_camera, table, 0.1, 1.0, 10.0)
+    found = hough_candidates(image, table, 0.1, 1, 10.0)
     assert len(found.score) == 0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_votes_are_shares_of_the_rim(
-    published_camera: Camera, table: DiscTable, sign: float
+    published_camera: Camera, table: VoteTable, sign: float
 ) -> None:
     """As sums over pixels one by one."""
     image = PaintedFloor(published_camera).disc(PLACES[0]).image(seed=3)
     least, radius = 6.0, 0.1
-    grid = grid_of(published_camera, table, radius)
-    assert grid is not None
-    assert grid.paired
-    votes = count_votes(image, grid, sign * radius, least)
+    assert table.paired
+    votes = count_votes(image, table, np.array([-sign * radius, sign * radius]), least)[1]
     grey = image.astype(float)[:, ::2] / 2.0 + image.astype(float)[:, 1::2] / 2.0
     floor_xy = (table.floor_xy[:, ::2].astype(float) + table.floor_xy[:, 1::2]) / 2.0
     expected = np.zeros(votes.shape)
-    weight = np.diff(np.append(grid.image_row, len(image) - 1))
-    for v, rows in zip(grid.image_row, weight, strict=True):
+    weight = np.diff(np.append(table.image_row, len(image) - 1))
+    for v, rows in zip(table.image_row, weight, strict=True):
         for u in range(1, grey.shape[1] - 1):
             near = grey[v - 1 : v + 2, u - 1 : u + 2]
             smooth = np.array([1.0, 2.0, 1.0]) / 8.0
@@ -93,10 +99,10 @@ def test_votes_are_shares_of_the_rim(
             ) / 2.0  # fmt: skip
             normal = np.linalg.solve(jacobian.T, gradient)
             normal /= np.hypot(*normal)
-            centre = floor_xy[v, u] + sign * radius * normal - grid.foot
-            across, ahead = grid.turn @ centre
-            row = np.abs(grid.ahead - ahead).argmin()
-            column = int((across - grid.left) / grid.cell)
+            centre = floor_xy[v, u] + sign * radius * normal - table.foot
+            across, ahead = table.turn @ centre
+            row = np.abs(table.ahead - ahead).argmin()
+            column = int((across - table.left) / table.cell)
             share = abs(np.linalg.det(jacobian)) / np.hypot(*(jacobian.T @ normal))
             expected[row, column] += rows * share / (2.0 * np.pi * radius)
     assert votes.sum() == pytest.approx(expected.sum(), rel=1e-3)

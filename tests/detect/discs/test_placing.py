@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, vote_shape
 from detect.discs.placing import apparent_radius, eliminate
 from detect.discs.rim import DIRECTIONS, best_circle
 from detect.settings import CircleSettings
-from lut import DiscTable, build_disc_table
+from lut import VoteTable, build_vote_table
 from tests.detect.discs.test_rim import PLACES, door_over
 from tests.detect.painted_floor import LIGHT, PaintedFloor
 
@@ -22,13 +22,13 @@ SETTINGS = CircleSettings(tilt_sigma_deg=0.0)
 
 
 @pytest.fixture(scope="module")
-def table(published_camera: Camera) -> DiscTable:
-    return build_disc_table(published_camera, disc_shape(SETTINGS))
+def table(published_camera: Camera) -> VoteTable:
+    return build_vote_table(published_camera, vote_shape(SETTINGS))
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6])
 def test_a_door_over_a_disc_does_not_move_it(
-    published_camera: Camera, table: DiscTable, share: float
+    published_camera: Camera, table: VoteTable, share: float
 ) -> None:
     rng = np.random.default_rng(3)
     off_px, squares = [], []
@@ -51,7 +51,7 @@ def test_a_door_over_a_disc_does_not_move_it(
 
 
 def errors_of(
-    camera: Camera, table: DiscTable, floors: list[tuple[PaintedFloor, NDArray[np.float64]]]
+    camera: Camera, table: VoteTable, floors: list[tuple[PaintedFloor, NDArray[np.float64]]]
 ) -> tuple[float, float]:
     """Root mean square error of a coordinate, pixels, and mean normalised error squared."""
     off_px, squares = [], []
@@ -70,7 +70,7 @@ def places(count: int) -> list[NDArray[np.float64]]:
 
 
 def test_a_shadow_over_half_of_a_disc_does_not_move_it(
-    published_camera: Camera, table: DiscTable
+    published_camera: Camera, table: VoteTable
 ) -> None:
     floors = []
     for k, place in enumerate(places(24)):
@@ -87,7 +87,7 @@ def test_a_shadow_over_half_of_a_disc_does_not_move_it(
 
 
 def test_light_that_falls_off_across_a_disc_does_not_move_it(
-    published_camera: Camera, table: DiscTable
+    published_camera: Camera, table: VoteTable
 ) -> None:
     floors = []
     for place in places(24):
@@ -102,7 +102,7 @@ def test_light_that_falls_off_across_a_disc_does_not_move_it(
 
 @pytest.mark.parametrize("length_px", [7, 11])
 def test_movement_leaves_a_disc_in_its_place_and_its_covariance_right(
-    published_camera: Camera, table: DiscTable, length_px: int
+    published_camera: Camera, table: VoteTable, length_px: int
 ) -> None:
     floors = []
     for place in places(24):

@@ -15,11 +15,11 @@ from detect.cli import main, parsed
 from detect.discs.radius import find_radius
 from detect.options import All, Circles
 from detect.settings import CircleSettings
-from lut import build_disc_table
+from lut import build_vote_table
 from tests.detect.painted_floor import PaintedFloor
 
 #: Every test tries the same radii with the same camera: their tables are made once.
-TABLE_OF = cache(build_disc_table)
+TABLE_OF = cache(build_vote_table)
 
 PLACES = [(0.4, -1.3), (-0.6, -1.6), (0.1, -2.1), (0.7, -2.4)]
 
@@ -33,7 +33,7 @@ def image(camera: Camera, radius_m: float, seed: int) -> np.ndarray:
 
 @pytest.fixture(autouse=True)
 def tables_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("detect.discs.radius.build_disc_table", TABLE_OF)
+    monkeypatch.setattr("detect.discs.radius.build_vote_table", TABLE_OF)
 
 
 @pytest.mark.parametrize("radius_m", [0.06, 0.1, 0.15])

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.circles import CircleDetections, detect_circles, disc_shape
+from detect.circles import CircleDetections, detect_circles, vote_shape
 from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim
 from detect.settings import CircleSettings
-from lut import DiscTable, build_disc_table
+from lut import VoteTable, build_vote_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 SETTINGS = CircleSettings()
@@ -22,8 +22,8 @@ DOOR = 140.0
 
 
 @pytest.fixture(scope="module")
-def table(published_camera: Camera) -> DiscTable:
-    return build_disc_table(published_camera, disc_shape(SETTINGS))
+def table(published_camera: Camera) -> VoteTable:
+    return build_vote_table(published_camera, vote_shape(SETTINGS))
 
 
 def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Rim:
@@ -107,12 +107,12 @@ def test_a_step_to_the_circle_is_that_of_the_normal_equations() -> None:
         )
 
 
-def found_in(camera: Camera, table: DiscTable, floor: PaintedFloor, seed: int) -> CircleDetections:
+def found_in(camera: Camera, table: VoteTable, floor: PaintedFloor, seed: int) -> CircleDetections:
     return detect_circles(floor.image(seed=seed), camera, table, SETTINGS)
 
 
 def test_a_disc_behind_a_door_is_found_where_it_is(
-    published_camera: Camera, table: DiscTable
+    published_camera: Camera, table: VoteTable
 ) -> None:
     for seed, place in enumerate(PLACES):
         floor = PaintedFloor(published_camera).disc(place, LIGHT)
@@ -138,7 +138,7 @@ def test_covariances_of_the_rim_cover_its_errors(published_camera: Camera) -> No
     assert 0.1 < np.median(squares) / np.log(2.0) < 1.6
 
 
-def test_a_larger_plate_is_not_found(published_camera: Camera, table: DiscTable) -> None:
+def test_a_larger_plate_is_not_found(published_camera: Camera, table: VoteTable) -> None:
     for seed, place in enumerate(PLACES):
         floor = PaintedFloor(published_camera).disc(place, LIGHT, 0.14)
         assert len(found_in(published_camera, table, floor, seed)) == 0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from detect.discs.judgement import FEATURES
 from detect.discs.rim import DIRECTIONS, STEPS
 from detect.discs.rim_network import network_inputs, network_log_odds, trained_networks
-from detect.discs.second_look import FEATURES
 from tests.reference import rim_network as reference
 
 Profiles = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from camera import read_camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_table
 from detect.discs.fit import working_space
 from detect.discs.patch import CAPACITY
 from detect.settings import CircleSettings
-from lut import cached_disc_table
 
 
 @pytest.mark.parametrize("left", [np.nan, 1e30, -7.0])
@@ -21,13 +20,13 @@ def test_what_is_left_in_the_memory_of_fits_does_not_matter(
     project_root: Path, left: float
 ) -> None:
     camera, settings = read_camera(project_root / "images" / "e" / "e.cam"), CircleSettings()
-    table = cached_disc_table(camera, disc_shape(settings))
+    table = disc_table(camera, settings)
     file = project_root / "images" / "e" / "images" / "e.0010.jpg"
     image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
     work = working_space()
     found = []
     for number in (0.0, left):
-        for name in ("products", "best", "damped", "factor", "values", "bare", "sector_sums"):
+        for name in ("products", "best", "damped", "factor", "values", "bare"):
             work[name] = number
         for name in ("weight", "row", "x", "y", "x1", "y2", "growth", "design", "residual"):
             work["patch"][name] = number

@@ -15,11 +15,11 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import read_camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_table
 from detect.lines import detect_lines
 from detect.markers.detect import detect_markers
 from detect.settings import CircleSettings, MarkerSettings
-from lut import build_disc_table, build_vertical_table
+from lut import build_vertical_table
 
 Image = NDArray[np.uint8]
 
@@ -43,7 +43,7 @@ def _detector(project_root: Path, kind: str) -> tuple[Path, Callable[[Image], by
     if kind == "lines":
         verticals = build_vertical_table(camera)
         return folder, lambda image: _bytes(detect_lines(image, verticals))
-    discs = build_disc_table(camera, disc_shape(CircleSettings()))
+    discs = disc_table(camera, CircleSettings())
     return folder, lambda image: _bytes(detect_circles(image, camera, discs, CircleSettings()))
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect.circles import detect_circles, disc_shape
+from detect.circles import detect_circles, disc_table
 from detect.lines import detect_lines
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
-from lut import build_disc_table, build_vertical_table
+from lut import build_vertical_table
 from tools.benchmark.material import (
     BenchmarkError,
     contents_of,
@@ -112,7 +112,7 @@ def test_a_long_run_takes_no_more_room_on_the_disk_than_a_processor_notices(
 @pytest.mark.parametrize("count", [0, 50])
 def test_as_many_discs_are_painted_as_were_asked_for(published_camera: Camera, count: int) -> None:
     settings = CircleSettings()
-    table = build_disc_table(published_camera, disc_shape(settings))
+    table = disc_table(published_camera, settings)
     places = disc_places(published_camera, count, seed=0)
     found = detect_circles(
         floor_with_discs(published_camera, places, seed=0), published_camera, table, settings

@@ -1,23 +1,21 @@
-"""A second look for discs of one polarity: candidates by edges, followed round their rims.
+"""Which candidates are discs: a glance at each, then its rim, by networks trained on known truth.
 
-Glare or a sun patch beside a disc raises the total variance of its outlines, a cable across it
-leaves much that the fit of a whole disc does not explain, and far away a disc has few pixels. A
-person sees the disc all the same. Here the candidates are those of the Hough transform
-(`detect.discs.hough`). Round each the rim is followed (`detect.discs.rim`), and where enough of it
-lies on a circle of the right size, a small network (`detect.discs.rim_network`) decides by the grey
-values about it and by the rim.
+Candidates are those of the Hough transform (`detect.discs.hough`). Most are dropped at a glance at
+few grey values. Round the others the rim is followed (`detect.discs.rim`): glare or a sun patch
+beside a disc, a cable across it or a door's edge before it leave the rest of its rim on a circle of
+the right size. A small network (`detect.discs.rim_network`) then decides by the grey values about
+it and by the rim.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
-from detect.discs.candidates import suppress_neighbours
 from detect.discs.hough import HoughCandidates
 from detect.discs.rim import (
     COS,
@@ -44,17 +42,13 @@ _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
-_LEAST_STEPS = 0.24
+_LEAST_STEPS = 0.4
 #: Least log-odds of a glance; those of candidates with at least this score.
 _LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.3, -0.7, 3.0
 #: Least share of the rim that is on a circle.
-_LEAST_RIM = 0.3
-#: Nearer to a disc already found than this share of the separation nothing is looked for.
-_WITHIN = 0.75
+LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
-#: Log-odds by the network that make a disc.
-_TAKEN = 0.8
 #: A rim that looks worse than this by the log-odds is not followed from its own middle.
 _HOPELESS = -4.0
 #: Nearer to another rim than this share of the radius it is the same.
@@ -66,26 +60,26 @@ FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 class Sought(NamedTuple):
     """Which discs are looked for."""
 
-    radius: float
-    """Nominal, metres."""
-    separation: float
-    """Least distance of two discs, metres."""
-    sign: float
-    """1 for light discs, -1 for dark ones."""
-    least_step: float
-    """Least step of the grey value at a rim, grey levels."""
-    needed: float
-    """Log-odds that a disc needs more than usual."""
+    radius: float  # nominal, metres
+    least_step: float  # of the grey value at a rim, grey levels
 
 
-class SecondLooks(NamedTuple):
-    """Candidates that were followed to the end, at most one in each place.
+class Judgement(NamedTuple):
+    """Candidates and what became of them; step and later mean something for judged rims.
 
     Attributes
     ----------
+    fate : (N,) int8
+        Indices of `FATES`.
+    value : (N,) float64
+        The number that decided: log-odds, or a share of the rim.
+    sign : (N,) float64
+        1 of light discs, -1 of dark ones.
     features : (N, len(FEATURES)) float64
+    relative_radius : (N,) float64
+        Of the rim, relative to that of one that fits best.
     floor_xy : (N, 2) float64
-        Metres.
+        Centre of the rim, metres; where it was not followed, of the candidate.
     seen_from, doubt : (N, 2) float64
         Where the rim was followed from, and the difference to the centre of the rim that is found
         from the other start, metres.
@@ -96,10 +90,14 @@ class SecondLooks(NamedTuple):
     quality : (N,) float64
         Otsu's, of the disc and that floor.
     log_odds : (N,) float64
-        That it is a disc; above 0 it is taken for one.
+        That it is a disc.
     """
 
+    fate: NDArray[np.int8]
+    value: FloatArray
+    sign: FloatArray
     features: FloatArray
+    relative_radius: FloatArray
     floor_xy: FloatArray
     seen_from: FloatArray
     doubt: FloatArray
@@ -108,100 +106,102 @@ class SecondLooks(NamedTuple):
     quality: FloatArray
     log_odds: FloatArray
 
+    def where(self, chosen: NDArray[Any]) -> Judgement:
+        """Some of the candidates, by indices or a mask."""
+        return Judgement(*(values[chosen] for values in self))
 
-NO_LOOKS = SecondLooks(np.empty((0, len(FEATURES))), *np.empty((3, 0, 2)), *np.empty((4, 0)))
+
+NO_CANDIDATES = Judgement._make(
+    [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), np.empty(0),
+     *np.empty((3, 0, 2)), *np.empty((4, 0))]
+)  # fmt: skip
+
+#: What became of a candidate, in the order of the stages: the first did not pass the second, and so
+#: on; the last was judged by its rim.
+FATES: tuple[Literal["steps", "glance", "rim", "same rim", "judged"], ...] = (
+    "steps", "glance", "rim", "same rim", "judged",
+)  # fmt: skip
+_FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 
 
-def second_looks(
+@kernel()
+def judge(
     image: NDArray[np.uint8],
     candidates: HoughCandidates,
-    found_xy: FloatArray,
     sought: Sought,
     camera_numbers: FloatArray,
     networks: Networks,
-) -> SecondLooks:
-    """Look a second time at candidates that are not at discs already found.
+) -> Judgement:
+    """Judge candidates, the best first.
 
     Parameters
     ----------
     image : (H, W) uint8
     candidates : HoughCandidates
-    found_xy : (M, 2) float64
-        Places of discs already found, metres.
     sought : Sought
     camera_numbers : (K,) float64
         `camera.kernels.camera_numbers`.
     networks : Networks
     """
-    looks = _look_at_all(image, candidates, found_xy, sought, camera_numbers, networks)
-    best = suppress_neighbours(looks.floor_xy, looks.log_odds, sought.separation)
-    return SecondLooks(*(values[best] for values in looks))
-
-
-@kernel()
-def _look_at_all(
-    image: NDArray[np.uint8],
-    candidates: HoughCandidates,
-    found_xy: FloatArray,
-    sought: Sought,
-    camera_numbers: FloatArray,
-    networks: Networks,
-) -> SecondLooks:
     n = len(candidates.score)
-    features, place = np.empty((n, len(FEATURES))), np.empty((n, 2))
-    seen_from, doubt = np.empty((n, 2)), np.empty((n, 2))
-    step, floor_grey, quality, log_odds = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
+    seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
+    step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    fate, value = np.full(n, _FEW_STEPS, np.int8), np.zeros(n)
+    relative_radius = np.ones(n)
+    judged = np.empty((n, 3))  # places and signs of rims
     count = 0
     for i in range(n):
-        x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
-        if _near_any(found_xy, x, y, _WITHIN * sought.separation):
-            continue
+        x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
         grey, scale = glance(image, camera_numbers, x, y, sought.radius)
-        contrast = _contrast(grey, sought)
+        contrast = _contrast(grey, sign, sought.least_step)
         if contrast == 0.0:
             continue
-        inputs, scales = network_inputs(grey, scale, sought.sign)
+        inputs, scales = network_inputs(grey, scale, sign)
         score = candidates.score[i : i + 1]
-        least = _LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE
-        if network_log_odds(inputs, scales, score, networks.glance) < least + sought.needed:
+        fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
+        if value[i] < (_LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE):
             continue
-        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sought.sign * contrast)
-        is_known = _near_any(found_xy, rim.x, rim.y, sought.separation) or _near_any(
-            place[:count], rim.x, rim.y, _SAME * sought.radius
-        )
-        if rim.agreeing < _LEAST_RIM or is_known:
+        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sign * contrast)
+        fate[i], value[i] = _NO_RIM, rim.agreeing
+        if rim.agreeing < LEAST_RIM:
             continue
-        odds, noted, grey = _look(image, camera_numbers, rim, score[0], sought, networks.look)
-        if odds < _HOPELESS:
+        fate[i] = _SAME_RIM
+        if _is_known(judged[:count], rim, sign, sought.radius):
             continue
-        # From its own middle a rim is seen best, but that may lead to another circle.
-        again = follow_again(image, camera_numbers, sought.radius, rim)
-        if _near_any(found_xy, again.x, again.y, sought.separation):
-            continue
-        doubt[count, 0], doubt[count, 1] = again.x - rim.x, again.y - rim.y
-        more, noted_again, grey_again = _look(
-            image, camera_numbers, again, score[0], sought, networks.look
-        )
-        if more > odds and not _near_any(place[:count], again.x, again.y, _SAME * sought.radius):
-            x, y = rim.x, rim.y
-            rim, odds, noted, grey = again, more, noted_again, grey_again
+        odds, noted, grey = _look(image, camera_numbers, rim, score[0], sign, sought, networks.look)
+        if odds >= _HOPELESS:
+            # From its own middle a rim is seen best, but that may lead to another circle.
+            again = follow_again(image, camera_numbers, sought.radius, rim)
+            doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
+            more, noted_again, grey_again = _look(
+                image, camera_numbers, again, score[0], sign, sought, networks.look
+            )
+            if more > odds and not _is_known(judged[:count], again, sign, sought.radius):
+                x, y = rim.x, rim.y
+                rim, odds, noted, grey = again, more, noted_again, grey_again
+        fate[i], value[i], log_odds[i], step[i] = JUDGED, odds, odds, rim.step
+        relative_radius[i] = rim.radius / (_RIM_RADIUS * sought.radius)
         for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
-            features[count, k] = noted[k]
-        log_odds[count], step[count] = odds, rim.step
-        quality[count], floor_grey[count] = _quality(grey)
-        place[count, 0], place[count, 1] = rim.x, rim.y
-        seen_from[count, 0], seen_from[count, 1] = x, y
+            features[i, k] = noted[k]
+        quality[i], floor_grey[i] = _quality(grey)
+        place[i, 0], place[i, 1] = rim.x, rim.y
+        seen_from[i, 0], seen_from[i, 1] = x, y
+        judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
         count += 1
-    return SecondLooks(
-        features[:count], place[:count], seen_from[:count], doubt[:count], step[:count],
-        floor_grey[:count], quality[:count], log_odds[:count],
+    return Judgement(
+        fate, value, candidates.sign, features, relative_radius, place, seen_from, doubt, step,
+        floor_grey, quality, log_odds,
     )  # fmt: skip
 
 
 @kernel()
-def _near_any(places: FloatArray, x: float, y: float, distance: float) -> bool:
-    for k in range(len(places)):
-        if (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2 < distance * distance:
+def _is_known(judged: FloatArray, rim: Rim, sign: float, radius: float) -> bool:
+    """Whether a rim is one of those (x, y, sign)."""
+    near = _SAME * radius
+    for k in range(len(judged)):
+        off_x, off_y = judged[k, 0] - rim.x, judged[k, 1] - rim.y
+        if off_x * off_x + off_y * off_y < near * near and judged[k, 2] == sign:
             return True
     return False
 
@@ -252,14 +252,14 @@ def pairs_of_steps(grey: FloatArray) -> FloatArray:
 
 
 @kernel()
-def _contrast(grey: FloatArray, sought: Sought) -> float:
+def _contrast(grey: FloatArray, sign: float, least_step: float) -> float:
     """Median step over those directions that step enough; 0 where these are too few."""
     steps = np.empty(GLANCED)
     for inner in _INNER:
         count = 0
         for k in range(GLANCED):
-            step = sought.sign * (np.mean(grey[k, inner]) - np.mean(grey[k, _OUTER]))
-            if step > sought.least_step:
+            step = sign * (np.mean(grey[k, inner]) - np.mean(grey[k, _OUTER]))
+            if step > least_step:
                 steps[count] = step
                 count += 1
         if count >= _LEAST_STEPS * GLANCED:
@@ -287,6 +287,7 @@ def _look(
     camera_numbers: FloatArray,
     rim: Rim,
     score: float,
+    sign: float,
     sought: Sought,
     network: RimNetwork,
 ) -> tuple[float, FloatArray, FloatArray]:
@@ -304,5 +305,5 @@ def _look(
     noted[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     noted[6] = min(score, 12.0)
     grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
-    inputs, scales = network_inputs(pairs_of_steps(grey), scale, sought.sign)
-    return network_log_odds(inputs, scales, noted, network) - _TAKEN - sought.needed, noted, grey
+    inputs, scales = network_inputs(pairs_of_steps(grey), scale, sign)
+    return network_log_odds(inputs, scales, noted, network), noted, grey

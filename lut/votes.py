@@ -1,0 +1,155 @@
+"""Table of the cells of the floor in which edges vote for centres of discs (`detect.discs.hough`).
+
+Which point of the floor a pixel sees, in which direction its gradient points there, and which share
+of a rim it stands for, depend on the calibration and the discs' radius alone. Cells are a quarter
+of the radius across, and at least a pixel ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera import Camera
+from lut.outlines import (
+    TableError,
+    demand_above_floor,
+    floor_positions,
+    pixels_within,
+    size_down,
+)
+from redetect.array_types import FloatArray
+from redetect.storage.bounds import Limit, Positive, demand_fields, whole
+
+#: Width of a cell, radii, and at least ahead, pixels.
+_CELL_RADII, _CELL_PX = 0.25, 0.8
+#: Steps in which it is looked up how far ahead a cell is, for each radius.
+_STEPS_PER_RADIUS = 16.0
+#: Where every disc is this wide (pixels), columns are added in pairs; where it is this high, every
+#: second row votes, and so on.
+_WIDE_PX, _HIGH_PX = 9.0, 6.0
+
+
+@dataclass(frozen=True)
+class VoteShape:
+    """Which discs votes are for, and the nearest and farthest centres."""
+
+    radius_m: Positive = 0.10  #: Of the discs, metres.
+    border_px: Annotated[int, whole(0)] = 6  #: Least distance from the image's border.
+    #: The floor moves at most this far from one image row to the next; infinite: however far.
+    far_limit_m_per_px: Limit = 0.12
+
+    def __post_init__(self) -> None:
+        demand_fields(self, TableError)
+
+
+class VoteTable(NamedTuple):
+    """Which pixels vote, and the cells in which their votes are counted; lengths in metres."""
+
+    #: (H, W, 2) floor position (robot X, Y) that each pixel sees; NaN above the horizon
+    floor_xy: NDArray[np.float32]
+    paired: bool  # columns of the image are added in pairs
+    image_row: NDArray[np.int64]  # (R,) rows of the image that vote; none without centres
+    #: (R, W, 6) of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r)
+    #: by rows; all 0 where no floor is seen
+    pixel: NDArray[np.float32]
+    row_of_step: NDArray[np.int64]  # (S,) row of cells at each step ahead
+    ahead: FloatArray  # (M,) middle of each row of cells
+    first: NDArray[np.int64]  # (M,) columns of cells between which each row is in view
+    last: NDArray[np.int64]
+    columns: int
+    cell: float  # width of cells,
+    step: float  # of steps ahead,
+    left: float  # and where column 0 begins
+    foot: FloatArray  # (2,) of the camera
+    turn: FloatArray  # (2, 2) the directions across and ahead
+
+
+def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
+    """Compute the cells from the nearest to the farthest centre.
+
+    A camera that is not above the floor raises a TableError.
+    """
+    demand_above_floor(camera)
+    floor_xy = floor_positions(camera)
+    foot, radius = np.array(camera.centre[:2]), shape.radius_m
+    offset = floor_xy - foot
+    limits = shape.border_px, shape.far_limit_m_per_px
+    usable = pixels_within(size_down(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
+    if min(usable.shape) < 3 or not usable.any():
+        nothing = np.zeros(0, np.int64)
+        return VoteTable(
+            floor_xy.astype(np.float32), False, nothing, np.zeros((0, 0, 6), np.float32), nothing,
+            np.zeros(0), nothing, nothing, 0, 1.0, 1.0, 0.0, foot, np.eye(2),
+        )  # fmt: skip
+    direction = offset[usable].mean(axis=0)
+    direction /= max(float(np.hypot(*direction)), 1e-9)
+    turn = np.array([[-direction[1], direction[0]], direction])
+    place = offset @ turn.T
+    per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)
+    per_column = np.linalg.norm(np.gradient(place, axis=1), axis=-1)
+    edges = _edges_ahead(place[usable, 1], per_row[usable], radius)
+    # Up to the image's border, nearer than the first centres are.
+    seen = (place[..., 1] >= edges[0]) & (place[..., 1] < edges[-1])
+    across, ahead = np.moveaxis(place[seen], -1, 0)
+    cell, step = _CELL_RADII * radius, radius / _STEPS_PER_RADIUS
+    left = float(across.min()) - 3.0 * cell
+    paired = bool(2.0 * radius >= _WIDE_PX * np.nanmax(per_column[usable]))
+    if paired:
+        pairs = place.shape[1] // 2
+        place = 0.5 * (place[:, : 2 * pairs : 2] + place[:, 1 : 2 * pairs : 2])
+    along_u, along_v = np.gradient(place, axis=1), np.gradient(place, axis=0)
+    sign = np.sign(along_u[..., 0] * along_v[..., 1] - along_v[..., 0] * along_u[..., 1])
+    matrix = [along_v[..., 1], -along_u[..., 1], -along_v[..., 0], along_u[..., 0]]
+    pixel = np.stack(
+        [(place[..., 0] - left) / cell, (place[..., 1] - edges[0]) / step]
+        + [sign * entry / (2.0 * np.pi * radius) for entry in matrix],
+        axis=-1,
+    )
+    inside = np.isfinite(pixel).all(axis=-1) & (place[..., 1] < edges[-1] + radius)
+    pixel = np.where(inside[..., None], pixel, 0.0).astype(np.float32)
+    image_row = []
+    v = 1
+    while v < len(pixel) - 1:
+        every = 1
+        if inside[v].any():
+            every = max(int(2.0 * radius / (_HIGH_PX * np.nanmedian(per_row[v]))), 1)
+            image_row.append(v)
+            pixel[v, :, 2:] *= every
+        v += every
+    row = np.searchsorted(edges, ahead, side="right") - 1
+    first, last = np.full(len(edges) - 1, np.inf), np.zeros(len(edges) - 1)
+    np.minimum.at(first, row, np.floor((across - left) / cell))
+    np.maximum.at(last, row, np.floor((across - left) / cell) + 1.0)
+    known = np.flatnonzero(last)
+    at = np.arange(math.floor((edges[-1] - edges[0]) / step)) + 0.5
+    return VoteTable(
+        floor_xy=floor_xy.astype(np.float32),
+        paired=paired,
+        image_row=np.array(image_row),
+        pixel=pixel[image_row],
+        row_of_step=np.searchsorted(edges, edges[0] + step * at, side="right") - 1,
+        ahead=0.5 * (edges[1:] + edges[:-1]),
+        first=np.interp(np.arange(len(first)), known, first[known]).astype(np.int64),
+        last=np.interp(np.arange(len(last)), known, last[known]).astype(np.int64),
+        columns=int(last.max()) + 3,
+        cell=cell,
+        step=step,
+        left=left,
+        foot=foot,
+        turn=turn,
+    )
+
+
+def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:
+    """Distances between rows of cells: a cell of the floor apart, and at least a pixel."""
+    order = np.argsort(ahead)[:: max(len(ahead) // 512, 1)]
+    edges = [float(ahead.min()) - radius]
+    while edges[-1] < ahead.max() + radius:
+        pixel = float(np.interp(edges[-1], ahead[order], per_row[order]))
+        edges.append(edges[-1] + max(_CELL_RADII * radius, _CELL_PX * pixel))
+    return np.array(edges)
