@@ -43,8 +43,8 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.4
-#: Least log-odds of a glance; those of candidates with at least this score.
-_LEAST_GLANCE, _LEAST_IF_VOTED, _VOTED = 0.3, -0.7, 3.0
+#: Least log-odds of a glance.
+_LEAST_GLANCE = -1.5
 #: Least share of the rim that is on a circle.
 LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
@@ -160,7 +160,7 @@ def judge(
         inputs, scales = network_inputs(grey, scale, sign)
         score = candidates.score[i : i + 1]
         fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
-        if value[i] < (_LEAST_IF_VOTED if score[0] >= _VOTED else _LEAST_GLANCE):
+        if value[i] < _LEAST_GLANCE:
             continue
         rim = follow_rim(image, camera_numbers, x, y, sought.radius, sign * contrast)
         fate[i], value[i] = _NO_RIM, rim.agreeing
