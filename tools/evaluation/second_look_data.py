@@ -179,12 +179,13 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
     gathering = _Gathering(rng)
     run_camera = read_camera(data / "dlr" / "e" / "e.cam")
     _add_scenes(gathering, run_camera, scenes, rng)
-    for number in range(scenes // 8):
-        image, camera, places, dark = render_board(rng)
+    photographs = sorted((data / "york").glob("dev/*/images/*"))
+    for number in range(scenes // 5):
+        image, camera, places = render_board(_read(photographs[number % len(photographs)]), rng)
         if number % 2:
-            image, dark = np.asarray(255 - image, np.uint8), not dark
+            image = np.asarray(255 - image, np.uint8)
         at = _images(camera, places)
-        truth = Truth(_NOWHERE, at, _NOWHERE) if dark else Truth(at, _NOWHERE, _NOWHERE)
+        truth = Truth(at, _NOWHERE, _NOWHERE) if number % 2 else Truth(_NOWHERE, at, _NOWHERE)
         gathering.add(image, camera, truth, _BOARD, "boards")
     for folder in sorted((data / "rendered").glob("r*")):
         camera = read_camera(folder / f"{folder.name}.cam")
@@ -248,8 +249,10 @@ def other_camera(rng: np.random.Generator) -> Camera:
     return Camera(width, height, scale, scale, *middle, (0.0,) * 5, pose)
 
 
-def render_board(rng: np.random.Generator) -> tuple[ByteArray, Camera, FloatArray, bool]:
-    """A board of many discs, and what is about it; its camera, (N, 2) places, and if they are dark.
+def render_board(
+    photograph: ByteArray, rng: np.random.Generator
+) -> tuple[ByteArray, Camera, FloatArray]:
+    """A board of many dark discs before a part of a photograph; its camera and (N, 2) places.
 
     The board lies on the floor, below a camera that looks down at it at some angle.
     """
@@ -258,7 +261,7 @@ def render_board(rng: np.random.Generator) -> tuple[ByteArray, Camera, FloatArra
     columns, rows = rng.integers(4, 14, 2)
     spacing = _RADIUS * rng.uniform(2.3, 4.0)
     size = np.array([columns - 1, rows - 1]) * spacing
-    away = scale * np.hypot(*size) / (height * rng.uniform(0.5, 1.2))
+    away = scale * np.hypot(*size) / (height * rng.uniform(0.3, 1.2))
     cos, sin = np.cos(pitch), np.sin(pitch)
     pose = (-1.0, 0.0, 0.0, 0.0), (0.0, sin, -cos, cos * away), (0.0, -cos, -sin, sin * away)
     middle = (width - 1) / 2.0, (height - 1) / 2.0
@@ -278,13 +281,13 @@ def render_board(rng: np.random.Generator) -> tuple[ByteArray, Camera, FloatArra
     off = np.hypot(*np.moveaxis(at - index * spacing, -1, 0))
     margin = rng.uniform(0.15, 0.6)
     on_board = ((at > -margin) & (at < size + margin + 0.5 * spacing * shifted)).all(axis=-1)
-    blocks = cv2.resize(
-        rng.uniform(20.0, 200.0, (rng.integers(3, 14), rng.integers(3, 14))).astype(np.float32),
-        (width * fine, height * fine),
-        interpolation=int(rng.choice([cv2.INTER_NEAREST, cv2.INTER_LINEAR])),
-    )
+    zoom = rng.uniform(0.5, 1.0, 2) * photograph.shape
+    top, left = rng.uniform(0.0, photograph.shape - zoom)
+    part = photograph[int(top) : int(top + zoom[0]), int(left) : int(left + zoom[1])]
+    behind = cv2.resize(part, (width * fine, height * fine), interpolation=cv2.INTER_CUBIC)
+    behind = behind * rng.uniform(0.3, 1.0)
     paper, ink = rng.uniform(110.0, 240.0), rng.uniform(10.0, 80.0)
-    grey = np.where(on_board, np.where(off < _RADIUS, ink, paper), blocks)
+    grey = np.where(on_board, np.where(off < _RADIUS, ink, paper), behind)
     slope = rng.uniform(-0.3, 0.3, 2)
     light = 1.0 + slope[0] * u[None, :] / width + slope[1] * v[:, None] / height
     sigma = fine * rng.uniform(0.4, 1.6)
@@ -296,7 +299,7 @@ def render_board(rng: np.random.Generator) -> tuple[ByteArray, Camera, FloatArra
     if shifted:
         number[..., 0] += 0.5 * (number[..., 1] % 2)
     places = (number.reshape(-1, 2) * spacing - size / 2.0) @ matrix.T
-    return image, camera, places, True
+    return image, camera, places
 
 
 def _add_disturbed(
