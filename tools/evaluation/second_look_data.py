@@ -31,7 +31,7 @@ from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.landmarks import read_frames
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
-from tools.evaluation.disturbed import BLURRED, Stage, render_scene
+from tools.evaluation.disturbed import BLURRED, BORDER, Stage, render_scene
 
 _SETTINGS = CircleSettings()
 #: Of a disc, metres.
@@ -222,7 +222,7 @@ def _add_scenes(
     gathering: _Gathering, camera: Camera, scenes: int, rng: np.random.Generator
 ) -> None:
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
-    kinds = [*DISTURBANCES, *DISTURBANCES, *BLURRED, *LOOK_ALIKES]
+    kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
     for number in range(scenes):
         if number % _SCENES_PER_STAGE == 0:
             own = (number // _SCENES_PER_STAGE) % 2 == 0
