@@ -150,7 +150,8 @@ class Circles(DetectorFlags):
     #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    draw: MaybePath = None  #: Folder for images with the outlines and qualities drawn in.
+    #: Folder for images with the outlines and qualities drawn in, once all is detected.
+    draw: MaybePath = None
     #: Write the rows with their pixels and evidence as JSON as well; -: to standard output, alone.
     json: MaybePath = None
     parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
@@ -177,9 +178,11 @@ class Lines(DetectorFlags):
     ids_from: MaybePath = None
     #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
     join_threshold: MaybeFloat = None
-    #: Folder for images with the lines and their standard deviations drawn in.
+    #: Folder for images with the lines and their standard deviations drawn in, once all is
+    #: detected.
     draw: MaybePath = None
-    rejected: bool = False  #: Draw all tracks instead, the rejected ones with the reason.
+    #: Draw all tracks instead, the rejected ones with the reason; detects once more.
+    rejected: bool = False
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -199,8 +202,9 @@ class Markers(DetectorFlags):
         without one, edges are taken to be straight in the images.
     """
 
-    #: Folder for images with the markers drawn in, and with what was rejected.
+    #: Folder for images with the markers drawn in, once all are detected.
     draw: MaybePath = None
+    rejected: bool = False  #: Draw what was rejected as well; detects once more.
     parameters: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 

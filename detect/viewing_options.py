@@ -78,10 +78,6 @@ class RowFiles:
     #: Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
     #: they exist; by default the run's.
     rows: MaybePath = None
-    circles: MaybePath = None  #: Rows of discs, if not detected.circles there.
-    lines: MaybePath = None  #: Rows of verticals, if not detected.lines there.
-    markers: MaybePath = None  #: Rows of square markers, if not detected.markers there.
-    tilt: MaybePath = None  #: Tilts of the frames, if not detected.tilt there.
     #: Reference rows of discs, by default map.circles in the run folder if it exists.
     reference: MaybePath = None
     #: Reference rows of verticals, by default map.lines in the run folder if it exists.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
@@ -43,7 +42,9 @@ class FrameMatch(NamedTuple):
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that fit something that does not count
-    errors: FloatArray  # of the pairs: distance on the floor (m), or difference in bearing (deg)
+    #: Of the pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
+    #: (deg).
+    errors: FloatArray
 
     @property
     def largest_error(self) -> float | None:
@@ -105,7 +106,8 @@ class FloorDifference:
 class DistanceBin(ForwardRange):
     """Discs at a range of forward distances; qualities and errors are medians.
 
-    Differences are of matched discs on the floor, before and after the common lean.
+    Differences are of matched discs on the floor, as their rows are and levelled alike; the latter
+    are None where all rows are levelled alike to begin with.
     """
 
     reference: int
@@ -118,22 +120,8 @@ class DistanceBin(ForwardRange):
     detected_quality_median: float | None
     error_median_m: float | None
     quality_difference: float | None
-    before: FloorDifference
-    after: FloorDifference | None
-
-
-@dataclass(frozen=True)
-class CommonLean:
-    """Tilt, as in a ``.tilt`` file, and height of the camera that explain the differences."""
-
-    pitch_deg: float
-    pitch_sigma_deg: float
-    roll_deg: float
-    roll_sigma_deg: float
-    raised_m: float
-    raised_sigma_m: float
-    left: FloorDifference
-    normalised_error: NormalisedError
+    as_written: FloorDifference
+    alike: FloorDifference | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +129,15 @@ class DiscPairs:
     """N matched discs on the floor (m)."""
 
     reference_xy: FloatArray  # (N, 2)
-    offset: FloatArray  # (N, 2) detected minus reference positions
-    left: FloatArray  # (N, 2) the same after the common lean
+    as_written: FloatArray  # (N, 2) detected minus reference positions
+    offset: FloatArray  # (N, 2) the same, both levelled alike: the errors
     covariance: FloatArray  # (N, 2, 2) what errors are measured in
     away: FloatArray  # (N, 2) unit vectors along which the camera sees them
+
+    @property
+    def levelled_apart(self) -> bool:
+        """Whether some rows are not levelled alike as they are written."""
+        return not np.array_equal(self.as_written, self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +150,7 @@ class LinePairs:
 
 
 @dataclass(frozen=True)
-class Comparison(ABC):
+class Comparison:
     """How a run's detected rows compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Rows are counted as in
@@ -183,6 +176,7 @@ class Comparison(ABC):
     on_lookalikes: int | None  # extra rows on what resembles a disc, where that is known
     recall: float | None
     precision: float | None
+    normalised_error: NormalisedError
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
@@ -202,14 +196,14 @@ class Comparison(ABC):
                 f" {alike} are on things known to look like a disc, and "
                 f"{self.extra - alike or 'none'} on nothing known."
             )
-        return found, extra, *self._error_sentences()
+        return found, extra, self._errors(), _agreement(self.normalised_error)
 
-    @abstractmethod
-    def _error_sentences(self) -> tuple[str, str]:
-        """How large errors are, and whether covariances say so."""
+    def _errors(self) -> str:
+        """How large errors are."""
+        raise NotImplementedError
 
-    def to_json(self) -> str:
-        """All figures as JSON: same keys in the same order, numbers finite or null.
+    def figures(self) -> dict[str, Any]:
+        """All figures by name, for JSON: the same names in the same order.
 
         Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those
         that only one file has.
@@ -227,7 +221,12 @@ class Comparison(ABC):
                 for match in self.worst_frames(WORST_FRAMES)
             ],
         }
-        return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
+        plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
+        return plain
+
+    def to_json(self) -> str:
+        """`figures` as JSON; numbers are finite or null."""
+        return f"{json.dumps(self.figures(), indent=2)}\n"
 
     def _repr_html_(self) -> str:
         return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
@@ -250,7 +249,6 @@ class DiscComparison(Comparison):
 
     error_median_m: float | None
     error_95_m: float | None
-    normalised_error: NormalisedError
     reference_quality_matched: float | None
     reference_quality_missed: float | None
     detected_quality_matched: float | None
@@ -262,19 +260,17 @@ class DiscComparison(Comparison):
     image_95_px: float | None
     reference_levelled: int  # frames whose rows are levelled by a tilt
     detected_levelled: int
-    lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
 
-    def _error_sentences(self) -> tuple[str, str]:
+    def _errors(self) -> str:
         median, most = (
             None if value is None else 1000.0 * value
             for value in (self.error_median_m, self.error_95_m)
         )
-        errors = (
+        return (
             f"Positions on the floor err by {number(median, 1)} mm (median), "
             f"95 % of them by less than {number(most, 1)} mm."
         )
-        return errors, _agreement(self.normalised_error)
 
 
 @dataclass(frozen=True)
@@ -286,17 +282,15 @@ class LineComparison(Comparison):
 
     bearing_median_deg: float | None
     bearing_95_deg: float | None
-    normalised_error: NormalisedError
     ends_median: float | None  # normalised image coordinates, top and bottom alike
     beta_median_deg: float | None
     pairs: LinePairs = field(repr=False)
 
-    def _error_sentences(self) -> tuple[str, str]:
-        errors = (
+    def _errors(self) -> str:
+        return (
             f"Bearings err by {number(self.bearing_median_deg, 3)} degrees (median), 95 % of them "
             f"by less than {number(self.bearing_95_deg, 3)}."
         )
-        return errors, _agreement(self.normalised_error)
 
 
 def number(value: float | None, decimals: int) -> str:

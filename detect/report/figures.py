@@ -150,14 +150,14 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
     return _part(words, content, 2.8)
 
 
-def floor_figure(pairs: DiscPairs, *, lean: bool) -> Part:
-    """Differences on the floor over distance, along and across the view; also after a lean."""
+def floor_figure(pairs: DiscPairs) -> Part:
+    """Differences on the floor over distance, along and across the view; also levelled alike."""
     left_of = np.column_stack([-pairs.away[:, 1], pairs.away[:, 0]])
     distance = np.hypot(*pairs.reference_xy.T)
-    # Both of one panel are of the same scale, so that what a lean explains is seen.
-    series = [("as the rows are", pairs.offset, SECOND, "s--")]
-    if lean:
-        series.append(("after the common lean", pairs.left, DATA, "o-"))
+    # Both of one panel are of the same scale, so that what levelling explains is seen.
+    series = [("as the rows are", pairs.as_written, SECOND, "s--")]
+    if pairs.levelled_apart:
+        series.append(("levelled alike", pairs.offset, DATA, "o-"))
     with figure_file((_WIDE, 3.1), "svg") as (figure, content):
         both = figure.subplots(1, 2)
         for axes, direction, name in (
@@ -166,10 +166,9 @@ def floor_figure(pairs: DiscPairs, *, lean: bool) -> Part:
         ):
             ends = []
             for label, offset, colour, mark in series:
-                usable = np.isfinite(offset).all(axis=1)
-                error = 1e3 * (offset * direction).sum(axis=1)[usable]
-                _dots(axes, distance[usable], error, colour)
-                middle, half, _ = binned(distance[usable], error)
+                error = 1e3 * (offset * direction).sum(axis=1)
+                _dots(axes, distance, error, colour)
+                middle, half, _ = binned(distance, error)
                 axes.plot(middle, half, mark, color=colour, lw=1.4, ms=4, label=label)
                 ends += [*np.quantile(error, [0.01, 0.99])] if len(error) else []
             axes.axhline(0.0, color=REFERENCE, lw=0.8)
@@ -341,16 +340,16 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
     """(M,) errors in units of their covariances: standard normal if these are right.
 
-    Two independent components for each disc with a positive definite covariance, after the common
-    lean; one for each line with a positive sigma.
+    Two independent components for each disc with a positive definite covariance; one for each line
+    with a positive sigma.
     """
     if isinstance(comparison, LineComparison):
         usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD
         return comparison.pairs.error_rad[usable] / comparison.pairs.sigma_rad[usable]
     pairs = comparison.pairs
-    usable = is_positive_definite(pairs.covariance) & np.isfinite(pairs.left).all(axis=1)
+    usable = is_positive_definite(pairs.covariance)
     factor = np.linalg.cholesky(pairs.covariance[usable])
-    return np.linalg.solve(factor, pairs.left[usable][:, :, None]).ravel()
+    return np.linalg.solve(factor, pairs.offset[usable][:, :, None]).ravel()
 
 
 def binned(at: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -159,12 +159,10 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
     parts += _rates(figures.rates_over(result, np.unique(levels)))
     if result.matched:
-        parts.append(figures.floor_figure(result.pairs, lean=result.lean is not None))
-    what = "two components for each matched disc"
-    if result.lean is not None:
-        what += ", after the common lean"
-        parts.append(Part("table", *floor_table(result)))
-    return [*parts, *_honesty(result, what)]
+        parts.append(figures.floor_figure(result.pairs))
+        if result.pairs.levelled_apart:
+            parts.append(Part("table", *floor_table(result)))
+    return [*parts, *_honesty(result, "two components for each matched disc")]
 
 
 def _lines(inputs: ReportInputs) -> list[Part]:
@@ -182,9 +180,8 @@ def _lines(inputs: ReportInputs) -> list[Part]:
 def _summary_of(result: Comparison) -> Part:
     """What `detect compare` says."""
     rows = tuple(summary_rows(result).items())
-    return Part(
-        "table", "Detected rows against reference rows", ("what", "value"), rows, left=(0, 1)
-    )
+    words = " ".join(result.sentences())
+    return Part("table", words, ("what", "value"), rows, left=(0, 1))
 
 
 def _rates(curve: figures.RateCurve) -> list[Part]:

@@ -43,7 +43,7 @@ from detect.runs.outputs import Output, is_log, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
 from detect.sources.interface import RunFrame
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
@@ -71,8 +71,8 @@ class Journal:
         self.file.stream.flush()
 
     def write_frames(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Write the rows of frames that are done, without their pictures."""
-        self.write(*([task_digest(task), *rows[:-1]] for task, rows in frames))
+        """Write the rows of frames that are done."""
+        self.write(*([task_digest(task), *rows] for task, rows in frames))
 
     def write_complete(self, parts: Sequence[int], *, overwrite: bool) -> None:
         """Note that the results are on the disk, in these parts, and only have to be renamed."""
@@ -183,12 +183,8 @@ def detect_run(
         are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
-    if job.pictures is None:
-        plan = replace(plan, drawing=None)
-    else:
-        make_folder(job.pictures)
     job = replace(job, plan=plan)
-    workers = workers or local_workers(1, large=job.ships_images)
+    workers = workers or local_workers(1, large=job.run.frames.ships_images)
     summary = RunSummary()
 
     def count(rows: FrameRows) -> None:
@@ -200,10 +196,6 @@ def detect_run(
         files = stack.enter_context(RunFiles(job))
         tasks = files.take_over(stack.enter_context(closing(_tasks(job))), count)
         for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            for _, rows in frames:
-                if job.pictures is not None and rows.picture is not None:
-                    path = job.pictures / f"{Path(rows.prefix).name}.png"
-                    write_bytes(path, rows.picture, overwrite=files.may_replace_pictures)
             files.add(frames)
             for _, rows in frames:
                 count(rows)
@@ -242,7 +234,7 @@ class RunFiles:
         self._paths = [*(output.path for output in self._outputs), self._log_path]
         self._made_by = made_by(self._outputs, job.plan)
         self._overwrite, self._resumable = job.overwrite, True
-        self._frames = self._taken_over = 0
+        self._frames = 0
         self._resumes = self._done = False
         self._journal: Journal
 
@@ -342,14 +334,8 @@ class RunFiles:
             self._frames += 1
             count(rows)
         self._journal.cut()
-        self._taken_over = self._frames
         _log.info("%d frames of an unfinished run are taken over", self._frames)
         return chain(beyond, tasks)
-
-    @property
-    def may_replace_pictures(self) -> bool:
-        """Whether pictures may be replaced: a resumed run may have drawn the next ones."""
-        return self._overwrite or (self._resumes and self._frames == self._taken_over)
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
         """Note the next frames."""

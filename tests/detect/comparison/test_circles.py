@@ -72,14 +72,10 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
     assert (found.matched, found.missed, found.extra) == (4, 1, 2)
     assert (found.set_aside, found.on_lookalikes) == (1, 1)
     assert found.precision == pytest.approx(4 / 6)
-    lines = [" ".join(line.split()) for line in format_text(found).splitlines()]
-    assert lines[:5] == [
-        "found 4 of 5 reference rows",
-        "missed 1 of 5 reference rows",
-        "look-alikes 1 of 6 detected rows: on things known to look like a disc",
-        "clutter 1 of 6 detected rows: on nothing known",
-        "not counted 1 more detected rows: on discs in view that are not listed",
-    ]
+    text = " ".join(format_text(found).split())
+    assert "4 of 5 discs of the reference are found, 1 missed, in 2 frames." in text
+    assert "1 are on things known to look like a disc, and 1 on nothing known." in text
+    assert "set aside 1" in text
     without = compare_frames(REFERENCE, detected, STANDARD)
     assert (without.extra, without.set_aside, without.on_lookalikes) == (3, 0, None)
 
@@ -263,7 +259,7 @@ def test_no_matches_give_clear_results(reference: list[Frame], detected: list[Fr
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
     assert json.loads(found.to_json())["error_95_m"] is None
-    assert "position error     median - m, 95 % - m" in format_text(found)
+    assert "error median m -" in " ".join(format_text(found).split())
 
 
 def test_demands_are_met_or_named() -> None:
@@ -297,22 +293,14 @@ def test_rows_where_the_reference_ends_are_counted_apart() -> None:
     far = frame("e.0002", disc(0, 4.9, 0.9), disc(3.0, 4.0, 0.9), disc(3.0, 0.1, 0.8))
     result = compare(REFERENCE, [*DETECTED, far])
     assert (result.extra, result.extra_beyond) == (4, 2)
-    assert "on no reference row, 2 of them farther away than any that is on one" in " ".join(
-        format_text(result).split()
-    )
+    assert "extra beyond 2" in " ".join(format_text(result).split())
 
 
 def test_text_shows_the_figures_plainly() -> None:
     text = format_text(compare(REFERENCE, DETECTED))
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert lines[:5] == [
-        "found 4 of 5 reference rows",
-        "missed 1 of 5 reference rows",
-        "extra 1 of 5 detected rows: on no reference row",
-        "recall 0.8000",
-        "precision 0.8000",
-    ]
-    assert "same disc on the floor, within 0.1 m" in lines
+    assert lines[0] == "4 of 5 discs of the reference are found, 1 missed, in 2 frames."
+    assert {"found 4", "extra 1", "recall 0.8", "options gate m 0.1"} <= {*lines}
     (middle,) = (line for line in text.splitlines() if line.strip().startswith("2-2.5"))
     assert " ".join(middle.split()) == "2-2.5 1 1 0.000 1 1 0.000 - 0.920 0.600 -0.320"
     assert "\x1b" not in text

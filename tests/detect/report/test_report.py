@@ -216,7 +216,7 @@ def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> No
     assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
     assert f"recall {expected.recall:.4f}" in words
     assert f"precision {expected.precision:.4f}" in words
-    assert "found 2 of 3 reference rows missed 1 of 3 reference rows" in words
+    assert "2 of 3 discs of the reference are found, 1 missed" in words
     assert "extra 1 of 3 detected rows" in words
     assert "s.0001 0 1 1 -" in words
     assert "radius_m 0.1" in words

@@ -98,18 +98,6 @@ def test_a_journal_gives_back_what_was_noted(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_pictures_are_not_noted(
-    tasks_and_plan: tuple[list[FrameTask], FramePlan], tmp_path: Path
-) -> None:
-    drawn = ROWS_OF_JOURNAL[0]._replace(picture=b"PNG")
-    with new_part(tmp_path / "a", "journal") as file:
-        journal = Journal(file)
-        journal.write(["program"])
-        journal.write_frames([(tasks_and_plan[0][0], drawn)])
-        ((_, rows),) = journal.frames()
-    assert rows == ROWS_OF_JOURNAL[0]
-
-
 def test_a_journal_goes_on_behind_what_is_taken_over(
     tasks_and_plan: tuple[list[FrameTask], FramePlan], tmp_path: Path
 ) -> None:
