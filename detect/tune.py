@@ -14,13 +14,14 @@ from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from detect import __version__
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.drawing.inputs import select_frames
 from detect.errors import DetectError
-from detect.report.figures import draw_rates, f1_score, knee, pareto_front
+from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import CircleSettings
@@ -233,16 +234,70 @@ def trial_records(
     return records
 
 
+def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
+    """Harmonic mean of recall and precision; 0 where both are, NaN where one is."""
+    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
+    return np.asarray(2.0 * r * p / np.where(r + p == 0.0, 1.0, r + p))
+
+
+def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
+    """(M,) indices of settings that none beats in recall or precision without losing in the other.
+
+    By rising recall; of equals the first. Recalls and precisions (N,) are NaN where there are none.
+    """
+    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
+    known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
+    # By falling recall, then falling precision: points no better than before are dominated.
+    order = known[np.lexsort((known, -p[known], -r[known]))]
+    before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
+    return order[p[order] > before][::-1]
+
+
+def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
+    """The setting at the knee of the curve of precision over recall; None without any.
+
+    That is the point of the front farthest beyond the chord between the front's ends, both axes
+    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
+    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
+    harmonic mean of recall and precision is used instead.
+    """
+    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
+    front = pareto_front(r, p)
+    if not len(front):
+        return None
+    if len(front) > 2:
+        x = (r[front] - r[front[0]]) / (r[front[-1]] - r[front[0]])
+        y = (p[front] - p[front[-1]]) / (p[front[0]] - p[front[-1]])
+        beyond = x + y - 1.0
+        if beyond.max() > 1e-9:
+            return int(front[np.argmax(beyond)])
+    return int(front[np.argmax(f1_score(r[front], p[front]))])
+
+
 def curve_picture(
     combinations: Sequence[Combination], trials: Sequence[Trial], title: str
 ) -> bytes:
     """Precision over recall as a PNG file: all trials, their front, and the knee."""
+    recall, precision = _rates(trials)
+    names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
+    front, best = pareto_front(recall, precision), knee(recall, precision)
     with figure_file((6.4, 6.2), "png") as (figure, content):
         axes = figure.subplots()
-        names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
-        draw_rates(axes, *_rates(trials), names, _MOST_NAMED)
+        axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
+        label = "none is better in both"
+        axes.plot(recall[front], precision[front], "--", color=DATA, lw=1.2, label=label)
+        if best is not None:
+            knee_style = {"mfc": "none", "mec": MARK, "mew": 2.0, "ms": 12}
+            label = f"knee: {names[best]}"
+            axes.plot(recall[best], precision[best], "o", label=label, **knee_style)
+        for k in front[:: max(1, -(-(len(front) - 1) // (_MOST_NAMED - 1)))]:
+            at = (recall[k], precision[k])
+            axes.annotate(
+                names[k], at, (-7, -9), textcoords="offset points", ha="right", fontsize=7
+            )
+        axes.set(xlabel="recall", ylabel="precision", title=title)
+        axes.grid(alpha=0.25, lw=0.6)
         axes.margins(0.15)
-        axes.set_title(title, fontsize=10)
         figure.legend(loc="outside lower center", fontsize=8, ncols=1)
     return content.getvalue()
 

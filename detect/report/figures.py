@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
+from detect.comparison.compare import LEAST_SIGMA_RAD
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
@@ -17,7 +17,7 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import SeenRows
 from detect.seen import ellipses, summed_steps
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
@@ -31,69 +31,6 @@ if TYPE_CHECKING:
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
 
 
-def draw_rates(
-    axes: Axes, recall: FloatArray, precision: FloatArray, names: Sequence[str], most_named: int
-) -> None:
-    """Draw precision over recall (N,): all settings, their front with some names, and the knee."""
-    front, best = pareto_front(recall, precision), knee(recall, precision)
-    axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
-    axes.plot(
-        recall[front], precision[front], "--", color=DATA, lw=1.2, label="none is better in both"
-    )
-    if best is not None:
-        axes.plot(
-            recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=12,
-            label=f"knee: {names[best]}",
-        )  # fmt: skip
-    for k in front[:: max(1, -(-(len(front) - 1) // (most_named - 1)))]:
-        axes.annotate(
-            names[k], (recall[k], precision[k]), xytext=(-7, -9), textcoords="offset points",
-            ha="right", fontsize=7,
-        )  # fmt: skip
-    axes.set(xlabel="recall", ylabel="precision")
-    axes.grid(alpha=0.25, lw=0.6)
-
-
-def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
-    """Harmonic mean of recall and precision; 0 where both are, NaN where one is."""
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    return np.asarray(2.0 * r * p / np.where(r + p == 0.0, 1.0, r + p))
-
-
-def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) indices of settings that none beats in recall or precision without losing in the other.
-
-    By rising recall; of equals the first. Recalls and precisions (N,) are NaN where there are none.
-    """
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
-    # By falling recall, then falling precision: points no better than before are dominated.
-    order = known[np.lexsort((known, -p[known], -r[known]))]
-    before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
-    return order[p[order] > before][::-1]
-
-
-def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
-    """The setting at the knee of the curve of precision over recall; None without any.
-
-    That is the point of the front farthest beyond the chord between the front's ends, both axes
-    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
-    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
-    harmonic mean of recall and precision is used instead.
-    """
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    front = pareto_front(r, p)
-    if not len(front):
-        return None
-    if len(front) > 2:
-        x = (r[front] - r[front[0]]) / (r[front[-1]] - r[front[0]])
-        y = (p[front] - p[front[-1]]) / (p[front[0]] - p[front[-1]])
-        beyond = x + y - 1.0
-        if beyond.max() > 1e-9:
-            return int(front[np.argmax(beyond)])
-    return int(front[np.argmax(f1_score(r[front], p[front]))])
-
-
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _HISTOGRAM_REACH = 5.0
@@ -101,26 +38,17 @@ _MOST_DOTS = 4000
 
 
 def rates_figure(curve: RateCurve) -> Part:
-    """Recall and precision over the least quality, and precision over recall with the knee."""
-    with figure_file((_WIDE, 3.1), "svg") as (figure, content):
-        left, right = figure.subplots(1, 2)
-        at = curve.threshold
-        left.plot(at, curve.recall, color=DATA, lw=1.4, label="recall")
-        left.plot(at, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision")
-        draw_rates(right, curve.recall, curve.precision, [f"{t:.3g}" for t in at], most_named=2)
-        right.legend(fontsize=8)
-        best = knee(curve.recall, curve.precision)
-        if best is not None:
-            left.axvline(at[best], color=MARK, lw=0.9, ls=":", label=f"knee: {at[best]:.3g}")
-        _finish(left, "least quality", "share")
-        left.legend(fontsize=8)
-        for limits in (left.set_ylim, right.set_ylim, right.set_xlim):
-            limits(0.0, 1.05)
-    words = (
-        "Recall and precision of the rows of a least quality; on the right one over the other. The "
-        "knee is the point farthest beyond the chord between the ends."
-    )
-    return _part(words, content, 3.1)
+    """Recall and precision over the least quality."""
+    with figure_file((_WIDE, 2.8), "svg") as (figure, content):
+        axes = figure.subplots()
+        axes.plot(curve.threshold, curve.recall, color=DATA, lw=1.4, label="recall")
+        axes.plot(
+            curve.threshold, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision"
+        )
+        axes.set_ylim(0.0, 1.05)
+        _finish(axes, "least quality", "share")
+        axes.legend(fontsize=8)
+    return _part("Recall and precision of the rows of a least quality.", content, 2.8)
 
 
 def whitened_figure(residuals: FloatArray, what: str) -> Part:
@@ -311,30 +239,24 @@ def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class RateCurve(NamedTuple):
-    """Recall and precision (NaN without rows) of the `kept` rows of at least each quality."""
+    """Recall and precision (NaN without rows) of the rows of at least each quality."""
 
     threshold: FloatArray
     recall: FloatArray
     precision: FloatArray
-    kept: IntArray
 
 
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality; they are paired anew for each."""
+    """Recall and precision of discs of at least each quality."""
     levels = np.asarray(qualities, np.float64)
-    found, kept = np.zeros((2, len(levels)), np.int64)
-    for match in comparison.frames:
-        passed = match.frame.detected
-        for k in np.argsort(levels, kind="stable"):
-            fewer = [row for row in passed if row.quality >= levels[k]]
-            if len(fewer) < len(passed):
-                passed = fewer
-                match = match_frame(match.frame._replace(detected=passed), comparison.options)
-            found[k] += len(match.matched)
-            kept[k] += len(match.matched) + len(match.extra)
+    matched, extra = (
+        np.array([row.quality for match in comparison.frames for row in rows(match)])
+        for rows in (lambda match: match.paired[1], lambda match: match.extra)
+    )
+    found, beside = ((side >= levels[:, None]).sum(axis=1) for side in (matched, extra))
     with np.errstate(invalid="ignore"):
-        recall, precision = found / np.float64(comparison.reference), found / kept
-    return RateCurve(levels, recall, precision, kept)
+        recall, precision = found / np.float64(comparison.reference), found / (found + beside)
+    return RateCurve(levels, recall, precision)
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

@@ -39,7 +39,7 @@ import numpy as np
 
 from detect import __version__
 from detect.errors import DetectError
-from detect.runs.outputs import Output, is_log, log_text, outputs_of
+from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
 from detect.sources.interface import RunFrame
@@ -233,7 +233,7 @@ class RunFiles:
         self._base, self._log_path = job.beside(""), job.beside(".log.json")
         self._paths = [*(output.path for output in self._outputs), self._log_path]
         self._made_by = made_by(self._outputs, job.plan)
-        self._overwrite, self._resumable = job.overwrite, True
+        self._overwrite, self._keep = job.overwrite, True
         self._frames = 0
         self._resumes = self._done = False
         self._journal: Journal
@@ -287,21 +287,18 @@ class RunFiles:
             part = left_part(path, number=number)
             if part is not None:
                 with part:
-                    part.replace(path, overwrite=overwrite or self._may_replace(path))
+                    part.replace(path, overwrite=overwrite)
 
     def _begin(self) -> None:
         file = new_part(self._base, "journal", named=self._paths[0])
         self._journal = Journal(file)
         try:
             if file.number > 0:
-                self._resumable = False
-                if not self._overwrite:
-                    place = self._base.with_name(f".{self._base.name}.journal")
-                    raise DetectError(
-                        f"{place}: another run is writing these files: wait for it, or, if it was "
-                        "killed on another machine, remove this file"
-                    )
-                _log.info("another run is writing these files: this one cannot be resumed")
+                place = self._base.with_name(f".{self._base.name}.journal")
+                raise DetectError(
+                    f"{place}: another run is writing these files: wait for it, or, if it was "
+                    "killed on another machine, remove this file"
+                )
             self._journal.write([self._made_by])
         except BaseException:
             file.remove()
@@ -310,11 +307,7 @@ class RunFiles:
     def _demand_places(self) -> None:
         """Refuse to replace what must not be, or cannot be."""
         for path in self._paths:
-            demand_place(path, overwrite=self._may_replace(path))
-
-    def _may_replace(self, path: Path) -> bool:
-        """Whether an existing file may be replaced: the log always, if it is one."""
-        return self._overwrite or (path == self._log_path and is_log(path))
+            demand_place(path, overwrite=self._overwrite)
 
     # -- frames -----------------------------------------------------------------------------
 
@@ -339,17 +332,14 @@ class RunFiles:
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
         """Note the next frames."""
-        try:
-            for _, rows in frames:
-                self._demand_strictly(rows)
-        except DetectError:
-            self._resumable = False  # nothing is kept
-            raise
+        for _, rows in frames:
+            self._demand_strictly(rows)
         self._journal.write_frames(frames)
         self._frames += len(frames)
 
     def _demand_strictly(self, rows: FrameRows) -> None:
         if rows.error is not None and self._job.strict:
+            self._keep = False
             raise DetectError(f"{rows.error} (--strict: nothing is written)")
 
     # -- ending -----------------------------------------------------------------------------
@@ -376,13 +366,12 @@ class RunFiles:
                         separators[output.kind] = output.between
             for output, part in results:
                 part.stream.write(output.encoded(output.tail))
-            written = [_described(output, part) for output, part in results]
             failures = [
                 {"frame": number, "prefix": rows.prefix, "reason": rows.error}
                 for number, (_, rows) in enumerate(self._journal.frames())
                 if rows.error is not None
             ]
-            parts[-1].stream.write(log_text(self._job, summary, failures, written).encode())
+            parts[-1].stream.write(log_text(self._job, summary, failures).encode())
             for part in parts:
                 part.sync()
             self._place(parts)
@@ -394,7 +383,7 @@ class RunFiles:
             self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)
             try:
                 for path, part in zip(self._paths, parts):
-                    part.replace(path, overwrite=self._may_replace(path))
+                    part.replace(path, overwrite=self._overwrite)
             except OutputExistsError:
                 raise
             except BaseException:
@@ -406,7 +395,7 @@ class RunFiles:
         journal = self._journal.file
         if (
             self._done
-            or not self._resumable
+            or not self._keep
             or isinstance(error, OutputExistsError)  # another process was faster
             or not (self._frames or self._resumes)
             or journal.stream.closed
@@ -417,11 +406,3 @@ class RunFiles:
         journal.close()
         if self._frames:
             _log.info("%d frames are kept: --resume goes on after them", self._frames)
-
-
-def _described(output: Output, part: PartFile) -> dict[str, object]:
-    """Name, size and hash of a result, for the log."""
-    size = part.stream.tell()
-    part.stream.seek(0)
-    sha256 = hashlib.file_digest(part.stream, "sha256").hexdigest()
-    return {"name": output.path.name, "bytes": size, "sha256": sha256}

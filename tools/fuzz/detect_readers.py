@@ -16,7 +16,6 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.outputs import is_log
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import (
@@ -224,9 +223,6 @@ DETECT_READERS: tuple[Reader, ...] = (
            NUMBERS),
     Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
-    Reader("log", "detected.log.json", is_log, (),
-           (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
-           (b"{", b"}", b"\xef\xbb\xbf"), needed=False),
     Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,
            made_seeds=_table_content),
 )  # fmt: skip

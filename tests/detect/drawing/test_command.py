@@ -251,7 +251,7 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run, "-o", out], small_run, "detect all", capsys)
     (small_run / "detected.circles").write_text("STEP s.0000 0 0 0 0 0 0 0 0 0\n")
     assert_refused(["draw", run], small_run, "--video", capsys)
-    assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
+    assert_refused(["draw", run, "-o", out, "--rows", "no"], small_run, "no/detected", capsys)
     assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
     assert_refused(["draw", run, "-o", out, "--images", "x"], small_run, "'x'", capsys)
     video = tmp_path / "v.mp4"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -126,14 +125,6 @@ def test_every_command_goes_on(spoilt_run: Path) -> None:
     assert main(["all", str(spoilt_run)]) == 3
     log = json.loads((spoilt_run / "detected.log.json").read_text())
     assert [failure["prefix"] for failure in log["failures"]] == list(REASONS)
-    names = [f"detected.{kind}" for kind in ("frames.tilt", "lines", "tilt", "circles")]
-    assert [file["name"] for file in log["outputs"]] == names
-    for file in log["outputs"]:
-        content = (spoilt_run / file["name"]).read_bytes()
-        assert (file["bytes"], file["sha256"]) == (
-            len(content),
-            hashlib.sha256(content).hexdigest(),
-        )
     assert main(["markers", str(spoilt_run)]) == 3
     assert len(log_of(spoilt_run / "detected.markers")["failures"]) == len(REASONS)
 

@@ -15,13 +15,15 @@ from hypothesis import strategies as st
 from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
-from detect.report.figures import f1_score, knee, pareto_front
 from detect.settings import CircleSettings
 from detect.tune import (
     Trial,
     combinations,
     curve_picture,
+    f1_score,
+    knee,
     parameter_values,
+    pareto_front,
     trial_records,
 )
 from redetect.landmarks import read_frames
