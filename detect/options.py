@@ -40,21 +40,13 @@ class RunFlags:
     force: bool = False  #: Replace existing files.
 
 
-@dataclass(frozen=True, kw_only=True)
-class PickedFrames:
-    """Selects the frames of a run."""
-
-    every: int = 1  #: Only every n-th frame.
-    images: tuple[str, ...] = ()  #: Only the frames of these images, by their names.
-
-
 @dataclass(frozen=True)
 class SourceOptions:
     """Options of a source besides its name."""
 
     #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
     #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
-    #: rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: rows of image files, a nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
     wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
     metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
@@ -66,14 +58,9 @@ class SourceOptions:
     base_frame: str = ""
     #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0)] = 0
-    #: Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
-    #: the values of the first images.
-    bits: int = 0
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
-        if self.bits and not 8 <= self.bits <= 16:
-            raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
 
     @property
     def plain(self) -> bool:
@@ -122,12 +109,7 @@ class DiscIdOptions:
     #: A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
     #: fall on,
     ids_from_map: MaybePath = None
-    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`),
-    #: with this standard deviation of map and path added to the covariances, metres.
-    id_slack_m: NotNegative = 0.1
-
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
+    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`).
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from detect import __version__
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
-from detect.drawing.inputs import select_frames
+from detect.drawing.inputs import every_nth
 from detect.errors import DetectError
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
@@ -51,7 +51,7 @@ def perform(options: Tune) -> int:
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
-    _, selection = select_frames(run.frames, options.images, options.every)
+    _, selection = every_nth(run.frames, options.every)
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 
@@ -287,9 +287,8 @@ def curve_picture(
         label = "none is better in both"
         axes.plot(recall[front], precision[front], "--", color=DATA, lw=1.2, label=label)
         if best is not None:
-            knee_style = {"mfc": "none", "mec": MARK, "mew": 2.0, "ms": 12}
-            label = f"knee: {names[best]}"
-            axes.plot(recall[best], precision[best], "o", label=label, **knee_style)
+            at = (recall[best], precision[best])
+            axes.plot(*at, "o", mfc="none", mec=MARK, mew=2.0, ms=12, label=f"knee: {names[best]}")
         for k in front[:: max(1, -(-(len(front) - 1) // (_MOST_NAMED - 1)))]:
             at = (recall[k], precision[k])
             axes.annotate(

@@ -13,7 +13,7 @@ import numpy as np
 from camera import Camera
 from detect.comparison.compare import numbers
 from detect.drawing.frame import ends_of, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, open_rows, select_frames
+from detect.drawing.inputs import SeenRows, every_nth, open_rows
 from detect.errors import DetectError, FrameError
 from detect.seen import circle_on_floor, image_positions, summed_steps
 from detect.sources.interface import read_image
@@ -40,7 +40,7 @@ def perform(options: View) -> int:
     source = open_rows(run, options.files)
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.images, options.every)
+    expected, selection = every_nth(run.frames, options.every)
     radius_m = source.circle_settings.radius_m
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")

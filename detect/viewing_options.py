@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from detect.errors import CompareError
-from detect.options import PickedFrames, RunFlags, SourceOptions
+from detect.errors import CompareError, DetectError
+from detect.options import RunFlags, SourceOptions
 from detect.settings import CircleSettings
 from redetect.storage.bounds import (
     ABOVE_0,
@@ -92,7 +92,17 @@ class RowsFlags(RunFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draw(PickedFrames, RowsFlags):
+class SomeFramesFlags(RowsFlags):
+    """Options of those that may leave frames out."""
+
+    every: Annotated[int, whole(1)] = 1  #: Only every n-th frame.
+
+    def __post_init__(self) -> None:
+        demand_fields(self, DetectError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draw(SomeFramesFlags):
     """Draw rows from files into the images: PNG files, or a video. Nothing is detected again.
 
     Example: detect all images/e, then: detect draw images/e -o /tmp/drawn --every 10
@@ -109,7 +119,7 @@ class Draw(PickedFrames, RowsFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(PickedFrames, RowsFlags):
+class View(SomeFramesFlags):
     """Frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
 
     Example: detect all images/e, then: detect view images/e -o /tmp/e.rrd
@@ -205,7 +215,7 @@ else:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune(PickedFrames, RowsFlags):
+class Tune(SomeFramesFlags):
     """Try parameters over a grid against a reference file: precision and recall, knee marked.
 
     Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned

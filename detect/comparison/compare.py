@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from detect.comparison.floor import floor_difference, normalised_error, quantile
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
@@ -32,6 +31,9 @@ from detect.comparison.result import (
     Kind,
     LineComparison,
     LinePairs,
+    floor_difference,
+    normalised_error,
+    quantile,
 )
 from detect.errors import CompareError
 from detect.seen import Sight

@@ -1,4 +1,4 @@
-"""Options and results of comparisons of the discs, or of the lines, of two runs."""
+"""Results of comparisons of the discs, or of the lines, of two runs, and figures of errors."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 if TYPE_CHECKING:
     from detect.seen import Sight
@@ -311,19 +313,34 @@ def _agreement(error: NormalisedError) -> str:
     return f"The stated covariances are too {size}: {figure}."
 
 
-def unmet_demands(
-    comparison: Comparison,
-    *,
-    min_recall: float | None = None,
-    min_precision: float | None = None,
-) -> tuple[str, ...]:
-    """A sentence for each demand that a comparison fails, as it does without rows to judge by."""
-    demands = (
-        ("recall", comparison.recall, min_recall),
-        ("precision", comparison.precision, min_precision),
-    )
-    return tuple(
-        f"{name} is {'unknown' if value is None else f'{value:.4f}'}: at least {least:g} demanded"
-        for name, value, least in demands
-        if least is not None and (value is None or value < least)
+def quantile(values: FloatArray, q: float = 0.5) -> float | None:
+    """Quantile of `values`, interpolated linearly; by default the median."""
+    return float(np.quantile(values, q)) if len(values) else None
+
+
+def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
+
+    Errors whose covariance (N, n, n) is not positive definite are left out.
+    """
+    usable = is_positive_definite(covariance)
+    left_out = int((~usable).sum())
+    dof = offset[usable].size
+    if dof == 0:
+        return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
+    squared = squared_mahalanobis(offset[usable], covariance[usable])
+    low, high = (float(chdtri(dof, 1.0 - p)) / dof for p in (0.025, 0.975))
+    return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+
+
+def floor_difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+    """Figures of differences (N, 2) on the floor (m), seen along unit vectors `away` (N, 2)."""
+    size = np.asarray(np.linalg.norm(offset, axis=1))
+    return FloorDifference(
+        pairs=len(offset),
+        median_m=quantile(size),
+        most_m=quantile(size, 0.95),
+        along_m=quantile((offset * away).sum(axis=1)),
+        # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
+        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0]),
     )

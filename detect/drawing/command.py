@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
-from detect.drawing.inputs import RunRows, open_rows, picture_name, select_frames
+from detect.drawing.inputs import RunRows, every_nth, open_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.runs.frame import detect_batch, tables_of
 from detect.runs.plan import FramePlan, FrameTask
@@ -40,7 +40,7 @@ def perform(options: Draw) -> int:
         )
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.images, options.every)
+    expected, selection = every_nth(run.frames, options.every)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 

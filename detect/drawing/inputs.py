@@ -1,8 +1,8 @@
-"""Rows of a run from files, the heads of these files, and which frames are selected."""
+"""Rows of a run from files, and the heads of these files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import islice
@@ -162,22 +162,7 @@ def picture_name(prefix: str) -> str:
 # -- frames -----------------------------------------------------------------------------------
 
 
-def select_frames(
-    frames: Frames, wanted: Sequence[str], every: int
-) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
-    """Their number, if it is known, and the selected frames with their positions in the run.
-
-    Every n-th of those that are `wanted` by names of images, or of all. Raises DetectError if a
-    name is no image's.
-    """
-    if every < 1:
-        raise DetectError(f"every is {every}: expected 1 or more")
-    if not wanted:
-        expected = None if frames.expected is None else -(-frames.expected // every)
-        return expected, islice(enumerate(frames), 0, None, every)
-    names = [image_name(frame.step.prefix) for frame in frames]
-    asked = {image_name(word): word for word in wanted}
-    for name in asked.keys() - set(names):
-        raise DetectError(f"frame {asked[name]!r}: expected the name of an image of the run")
-    kept = frozenset([k for k, name in enumerate(names) if name in asked][::every])
-    return len(kept), ((k, frame) for k, frame in enumerate(frames) if k in kept)
+def every_nth(frames: Frames, every: int) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
+    """How many every n-th frames are, if that is known, and these with their places in the run."""
+    expected = None if frames.expected is None else -(-frames.expected // every)
+    return expected, islice(enumerate(frames), 0, None, every)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from detect.comparison.compare import LEAST_SIGMA_RAD
+from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
@@ -249,11 +249,10 @@ class RateCurve(NamedTuple):
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
     """Recall and precision of discs of at least each quality."""
     levels = np.asarray(qualities, np.float64)
-    matched, extra = (
-        np.array([row.quality for match in comparison.frames for row in rows(match)])
-        for rows in (lambda match: match.paired[1], lambda match: match.extra)
-    )
-    found, beside = ((side >= levels[:, None]).sum(axis=1) for side in (matched, extra))
+    found, beside = np.zeros((2, len(levels)), np.int64)
+    for match in comparison.frames:
+        found += (levels[:, None] <= numbers(match.paired[1], "quality")).sum(axis=1)
+        beside += (levels[:, None] <= numbers(match.extra, "quality")).sum(axis=1)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), found / (found + beside)
     return RateCurve(levels, recall, precision)

@@ -168,7 +168,7 @@ def _known_discs(options: DiscIdOptions) -> Known:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
-    known = Known(discs=_frames(options.ids_from), slack_m=options.id_slack_m)
+    known = Known(discs=_frames(options.ids_from))
     if options.ids_from is not None:
         known = replace(known, discs_level=read_head(options.ids_from).level)
     if options.ids_from_map is not None and options.path is not None:

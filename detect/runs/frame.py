@@ -184,6 +184,8 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
 #: Prefix, lines and tilt of a frame.
 _Tilted = tuple[str, int, FrameTilt | None]
 
+#: Standard deviation of where a map's discs are seen, besides their covariances: its path's (m).
+_MAP_SIGMA_M = 0.1
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
@@ -273,7 +275,7 @@ def _disc_rows(
         taken = {number for own in ids for number in own}
         left = [disc for disc in known.mapped if disc.id not in taken]
         without = [k for k, own in enumerate(ids) if own == (-1,)]
-        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, known.slack_m)
+        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, _MAP_SIGMA_M)
         for k, number in zip(without, found.tolist()):
             ids[k] = (number,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]

@@ -59,7 +59,6 @@ class KnownOfFrame(NamedTuple):
     discs: tuple[CircleLandmark, ...] = ()
     discs_level: bool = False
     mapped: tuple[MappedDisc, ...] = ()
-    slack_m: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,6 @@ class Known:
     discs_level: bool = False  # whether these are corrected for the tilt
     #: Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
     mapped: ByPrefix[Sequence[MappedDisc]] | None = None
-    slack_m: float = 0.1  # standard deviation of where these are, besides their covariances
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
@@ -84,7 +82,6 @@ class Known:
             discs.circles if discs else (),
             self.discs_level,
             tuple(self.mapped.get(prefix) or ()) if self.mapped else (),
-            self.slack_m,
         )
 
 

@@ -47,7 +47,7 @@ from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
-_JOURNAL_VERSION = 6
+_JOURNAL_VERSION = 7
 
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
@@ -142,7 +142,7 @@ def task_digest(task: FrameTask) -> str:
     Of an image file, name, size and time of change count.
     """
     frame = task.frame
-    beside = (frame.step, _file_of(frame), frame.time_s, frame.bits, frame.failure, task.known)
+    beside = (frame.step, _file_of(frame), frame.time_s, frame.failure, task.known)
     return _digest_of(repr(beside), b"" if frame.content is None else bytes(frame.content))
 
 

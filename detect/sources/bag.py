@@ -36,7 +36,6 @@ from detect.sources.interface import (
     Source,
     gray_of_pixels,
     numbered_prefix,
-    significant_bits,
     still,
 )
 from detect.sources.poses import (
@@ -214,19 +213,15 @@ class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
     The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; topic and frame as in
-    `SourceOptions`. 16-bit images have as many significant bits as the first one needs, if not
-    named.
+    `SourceOptions`.
     """
 
-    def __init__(
-        self, path: Path, image_topic: str = "", bits: int | None = None, base_frame: str = ""
-    ) -> None:
+    def __init__(self, path: Path, image_topic: str = "", base_frame: str = "") -> None:
         self.path = path
         self.name = str(path)
         self.stem = path.name if path.is_dir() else path.stem
         self.beside = path.parent, self.stem
         self.output_base = path.with_name(f"{self.stem}.detected")
-        self._bits = bits
         self._base_frame = base_frame or BASE_FRAME
         with opened_bag(path) as reader:
             self.topic = chosen_topic(
@@ -235,7 +230,6 @@ class Bag(Source):
             self.expected = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        bits = self._bits
         with opened_bag(self.path) as reader:
             said = messages(reader, self.path, self.topic)
             for number, (kind, recorded_s, message) in enumerate(said):
@@ -249,14 +243,10 @@ class Bag(Source):
                         if kind == _COMPRESSED:
                             content = compressed_content(message, name)
                         else:
-                            pixels = pixels_of_message(message, name)
-                            bits = bits or significant_bits(pixels)
-                            content = gray_of_pixels(pixels, name, bits)
+                            content = gray_of_pixels(pixels_of_message(message, name), name)
                 except FrameError as error:
                     failure = str(error)
-                # Of compressed images the bits are those of PNG files: 16, or named.
-                step = still(prefix)
-                yield RunFrame(step, None, content, time_s, self._bits or 16, failure)
+                yield RunFrame(still(prefix), None, content, time_s, failure)
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""

@@ -19,7 +19,6 @@ from detect.sources.interface import (
     RunFrame,
     Source,
     frame_prefix,
-    significant_bits_of_file,
     still,
 )
 from redetect.landmarks import read_steps
@@ -133,9 +132,6 @@ def _natural_order(name: str) -> str:
 
 WILDCARDS = frozenset("*?[")
 
-# Number of images, spread over all, that determine the significant bits.
-_SAMPLES = 5
-
 
 class RunFrames(Frames):
     """The frames of a file of STEP rows, with the images that these name, in its order."""
@@ -147,11 +143,10 @@ class RunFrames(Frames):
         self,
         images: ImageNames,
         odometry: Path,
-        bits: int,
         times: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self._images, self._odometry = images, odometry
-        self._bits, self._times = bits, times
+        self._times = times
         # Errors in the odometry are raised here, before any work is done.
         named = set()
         self.expected = 0
@@ -170,7 +165,7 @@ class RunFrames(Frames):
                 found = self._images.place_of(step.prefix)
                 image = None if found is None else self._images.checked(found)
                 time_s = None if image is None else self._times.get(image.stem)
-                yield RunFrame(step, image, time_s=time_s, bits=self._bits)
+                yield RunFrame(step, image, time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
 
@@ -179,14 +174,13 @@ class ImageFiles(Source):
     """Images in natural order of their names.
 
     Calibration and times (``<folder>.times``, if not named) are in the run's folder, and results
-    are written there: the folder of the images, or the one above ``images/``. 16-bit images have
-    the significant bits that some of them need, if not named.
+    are written there: the folder of the images, or the one above ``images/``.
     """
 
     ships_images = False
     times_own = False
 
-    def __init__(self, name: Path, times: str = "", bits: int | None = None) -> None:
+    def __init__(self, name: Path, times: str = "") -> None:
         self.name = str(name)
         if name.is_dir():
             self._names, self._home = images_of_folder(name), name
@@ -202,28 +196,19 @@ class ImageFiles(Source):
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
         self._times = read_times(times_file) if times or times_file.is_file() else {}
         self.has_times = bool(times) or times_file.is_file()
-        self._bits = bits_of_images(self._names) if bits is None else bits
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         for place in range(len(self._names)):
             stem = self._names.path(place).stem
             step, time_s = still(frame_prefix(stem)), self._times.get(stem)
             try:
-                yield RunFrame(step, self._path(place), time_s=time_s, bits=self._bits)
+                yield RunFrame(step, self._path(place), time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
     def along(self, odometry: Path) -> RunFrames:
         """The images that a file of STEP rows names, in its order."""
-        return RunFrames(self._names, odometry, self._bits, self._times)
-
-
-def bits_of_images(names: ImageNames) -> int:
-    """Significant bits of 16-bit images: what some, spread over all, need; 16 if there are none."""
-    last = len(names) - 1
-    places = {round(k * last / (_SAMPLES - 1)) for k in range(_SAMPLES)}
-    found = [significant_bits_of_file(names.path(place)) for place in places if last >= 0]
-    return max((bits for bits in found if bits is not None), default=16)
+        return RunFrames(self._names, odometry, self._times)
 
 
 def _matching_images(pattern: Path) -> ImageNames:

@@ -18,7 +18,6 @@ from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
     FramesAlongPoses,
-    FramesAlongRows,
     PoseStream,
     tick_poses,
     tum_poses,
@@ -108,12 +107,11 @@ def _own_odometry(folder: Path) -> Path | None:
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
-    bits = options.bits or None
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in _BAG_SUFFIXES
     if is_bag and name.exists():
         from detect.sources.bag import Bag  # takes as long as everything else
 
-        return Bag(name, options.image_topic, bits, options.base_frame)
+        return Bag(name, options.image_topic, options.base_frame)
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")
     if options.base_frame and not is_bag:
@@ -123,7 +121,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
     if name.is_file() and name.suffix.lower() not in IMAGE_SUFFIXES:
         return VideoFile(name)
     if name.exists() or WILDCARDS & set(str(name)):
-        return ImageFiles(name, options.times, bits)
+        return ImageFiles(name, options.times)
     raise DetectError(
         f"{name}: no such folder or file: expected a run folder, a folder of images, a pattern "
         "of images in quotes ('drive/*.png'), a video, a bag (.bag, .mcap), or camera:0"
@@ -148,10 +146,12 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        path = Path(named)
-        if isinstance(source, ImageFiles):
-            return source.along(path), path
-        return FramesAlongRows(source, path), path
+        if not isinstance(source, ImageFiles):
+            raise DetectError(
+                f"{named}: STEP rows are those of image files: expected a trajectory (.tum), "
+                f"ticks (.ticks), a bag's topic or none for {source.name}"
+            )
+        return source.along(Path(named)), Path(named)
     else:
         poses = None if named else source.poses(None)
     if poses is None:

@@ -4,7 +4,7 @@ A pose (x, y, theta) has the robot's X forward and Y left, as in ROS; a STEP its
 backward, in the robot's frame before it. Turning by the same angle is the same in both. Poses may
 come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from
 the counters of two wheels, rows ``t left right``. The robot moves on the floor: of its attitude the
-heading is taken, of its position x and y. Or the steps themselves are in a file.
+heading is taken, of its position x and y.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
-from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
-from redetect.landmarks import Step, read_steps, wrap_angle
+from redetect.landmarks import Step, wrap_angle
 from redetect.storage.bounded import read_text
 
 #: Limit of distances from the start (m), such that products of two remain finite.
@@ -230,34 +229,6 @@ class FramesAlongPoses(Frames):
                     image = replace(image, step=step_between(image.step.prefix, last, pose))
                 yield image
                 last = pose
-
-
-class FramesAlongRows(Frames):
-    """The frames of a source whose STEP rows are in a file, by the last parts of their prefixes.
-
-    Images without a row are no part of the run; rows without an image are frames that cannot be
-    worked on, at the end.
-    """
-
-    why_left_out = "images are not named by a STEP row: left out"
-
-    def __init__(self, source: Source, path: Path) -> None:
-        self._source = source
-        self._steps = {last_part(step.prefix.strip('"')): step for step in read_steps(path)}
-        self.ships_images, self.expected = source.ships_images, source.expected
-
-    def __iter__(self) -> Generator[RunFrame, None, None]:
-        self.left_out = 0
-        steps = dict(self._steps)
-        with closing(iter(self._source)) as images:
-            for image in images:
-                step = steps.pop(image.step.prefix, None)
-                if step is None:
-                    self.left_out += 1
-                else:
-                    yield replace(image, step=step)
-        for step in steps.values():
-            yield RunFrame(step, None)
 
 
 class FirstFrames(Frames):

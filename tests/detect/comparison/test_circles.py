@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from detect.comparison.compare import compare_frames
 from detect.comparison.report import comparison_of
-from detect.comparison.result import DiscComparison, unmet_demands
+from detect.comparison.result import DiscComparison
 from detect.errors import CompareError, DetectError
 from detect.sources.image_files import image_name
 from detect.viewing_options import Compare, CompareOptions
@@ -260,19 +260,6 @@ def test_no_matches_give_clear_results(reference: list[Frame], detected: list[Fr
     assert found.precision == (0 if found.detected else None)
     assert json.loads(found.to_json())["error_95_m"] is None
     assert "error median m -" in " ".join(format_text(found).split())
-
-
-def test_demands_are_met_or_named() -> None:
-    found = compare(REFERENCE, DETECTED)
-    assert unmet_demands(found) == ()
-    assert unmet_demands(found, min_recall=0.8, min_precision=0.8) == ()
-    assert unmet_demands(found, min_recall=0.81) == ("recall is 0.8000: at least 0.81 demanded",)
-    assert len(unmet_demands(found, min_recall=0.81, min_precision=0.81)) == 2
-    nothing = compare([], [])
-    assert unmet_demands(nothing) == ()
-    assert unmet_demands(nothing, min_precision=0.0) == (
-        "precision is unknown: at least 0 demanded",
-    )
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:

@@ -69,7 +69,7 @@ def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -
     tasks, _ = tasks_and_plan
     tilt = FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7)
     tasks[1] = FrameTask(tasks[1].frame, KnownOfFrame(tilt))
-    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, 12, "why")
+    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, "why")
     assert pickle.loads(pickle.dumps(tasks)) == tasks
     arrived = pickle.loads(pickle.dumps(shipped))
     assert arrived == shipped
