@@ -53,9 +53,6 @@ class SourceOptions:
     #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
     times: str = ""
     image_topic: str = ""  #: The images of a bag, if there are several topics of them.
-    #: The frame of the robot's base, on the floor, in a bag that holds the calibration itself
-    #: (camera_info and tf_static); by default base_footprint.
-    base_frame: str = ""
     #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0)] = 0
 
@@ -65,7 +62,7 @@ class SourceOptions:
     @property
     def plain(self) -> bool:
         """Whether nothing is said of steps and times."""
-        return not (self.odometry or self.times or self.image_topic or self.base_frame)
+        return not (self.odometry or self.times or self.image_topic)
 
 
 @dataclass(frozen=True, kw_only=True)

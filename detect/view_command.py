@@ -51,7 +51,6 @@ def perform(options: View) -> int:
             _show(recording)
         else:
             recording.save(str(raw))
-        rr.send_blueprint(_layout(), recording=recording)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         path = rr.LineStrips3D([poses * [1.0, 1.0, 0.0]])
         recording.log("world/path", path, static=True)
@@ -114,9 +113,6 @@ def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius
         rings = circle_on_floor(circle_arrays(rows.circles.circles).xy, radius_m)
         strips = list(np.pad(rings, ((0, 0), (0, 0), (0, 1))))
         recording.log("world/robot/discs", rr.LineStrips3D(strips, colors=_EDGE))
-        recording.log("count/discs", rr.Scalars([float(len(rings))]))
-    if rows.lines is not None:
-        recording.log("count/verticals", rr.Scalars([float(len(rows.lines.lines))]))
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
@@ -148,23 +144,6 @@ def _log_image(rr: Any, recording: Any, camera: Camera, rows: SeenRows, radius_m
         ]
         labels = [f"{row.id}" for row in rows.markers.markers]
         log("markers", squares, colors=_LINE, labels=labels)
-
-
-def _layout() -> Any:
-    """The frame to the left, wide; the floor, counts and tilt to the right of it."""
-    import rerun.blueprint as rrb
-
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial2DView(origin="camera/image", name="frame"),
-            rrb.Vertical(
-                rrb.Spatial3DView(origin="world", name="floor"),
-                rrb.TimeSeriesView(origin="count", name="rows in the frame"),
-                rrb.TimeSeriesView(origin="tilt", name="tilt (deg)"),
-            ),
-            column_shares=[2, 1],
-        )
-    )
 
 
 def _show(recording: Any) -> None:

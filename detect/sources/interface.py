@@ -67,7 +67,6 @@ class Source(Frames):
 
     name: str  # in messages
     output_base: Path  # results are called this, with an ending of their own
-    size: tuple[int, int] | None = None  # width and height, where they are known beforehand
     beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
     times_own = True  # images have times by themselves; of others, they can be named
     has_times = True
@@ -75,7 +74,7 @@ class Source(Frames):
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside it, or that it holds; None if there is none.
 
-        One of several is refused, and, if `posed`, one whose pose above the floor is not known.
+        One of several is refused; if `posed`, one whose pose above the floor is not known is none.
         """
         return None if self.beside is None else camera_in(*self.beside)
 

@@ -91,12 +91,6 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     if camera is None:
         return run
-    if source.size is not None and source.size != (camera.width, camera.height):
-        raise DetectError(
-            f"{source.name}: is {source.size[0]}x{source.size[1]} px: expected "
-            f"{camera.width}x{camera.height}, the calibration's size: "
-            "name the calibration of this video by --camera"
-        )
     return run.calibrated(camera)
 
 
@@ -111,11 +105,9 @@ def _source(name: Path, options: SourceOptions) -> Source:
     if is_bag and name.exists():
         from detect.sources.bag import Bag  # takes as long as everything else
 
-        return Bag(name, options.image_topic, options.base_frame)
+        return Bag(name, options.image_topic)
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")
-    if options.base_frame and not is_bag:
-        raise DetectError(f"{name}: --base-frame {options.base_frame}: only bags have frames")
     if live := _LIVE.fullmatch(str(name)):
         return LiveCamera(int(live[1]))
     if name.is_file() and name.suffix.lower() not in IMAGE_SUFFIXES:

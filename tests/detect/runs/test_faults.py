@@ -141,18 +141,14 @@ def test_the_log_of_a_good_run(small_run: Path, tmp_path: Path) -> None:
     assert (log["failures"], log["failed"], log["exit_code"], log["frames"]) == ([], 0, 0, 3)
 
 
-def test_a_log_is_replaced_but_nothing_else(small_run: Path, capsys: Captured) -> None:
-    output, log = small_run / "detected.circles", small_run / "detected.circles.log.json"
-    assert main(["circles", str(small_run)]) == 0
-    output.unlink()
-    assert main(["circles", str(small_run)]) == 0
-    output.unlink()
+def test_a_log_is_replaced_as_other_results_are(small_run: Path, capsys: Captured) -> None:
+    log = small_run / "detected.circles.log.json"
     log.write_text("notes of my own")
-    capsys.readouterr()
     assert main(["circles", str(small_run)]) == 1
     assert f"{log}: exists already" in capsys.readouterr().err
     assert log.read_text() == "notes of my own"
-    assert not output.exists()
+    assert main(["circles", str(small_run), "--force"]) == 0
+    assert json.loads(log.read_text())["frames"] == 3
 
 
 def test_strict_stops_at_the_first_bad_frame(small_run: Path, capsys: Captured) -> None:

@@ -163,7 +163,8 @@ def test_links_in_the_place_of_a_journal_or_part_are_not_followed(
     (output / name).symlink_to(precious)
     main(command(run_folder, output))
     assert precious.read_bytes() == PREVIOUS
-    assert results(output) == undisturbed
+    refused = name == ".detected.journal"  # as if another run had it
+    assert results(output) == ({} if refused else undisturbed)
 
 
 def test_resuming_what_was_never_begun(
