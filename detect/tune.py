@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from decimal import Decimal, InvalidOperation
 from itertools import chain, islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,9 +76,8 @@ def perform(options: Tune) -> int:
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(run, pairs, settings, options.matching, workers, advance)
-        trials = list(tuned)
-    records = trial_records(grid, trials)
+        trials = list(tune_run(run, pairs, settings, options.matching, workers, advance))
+    records = marked([{**c, **figures_of(found)} for c, (found, _) in zip(grid, trials)])
     head = {
         "version": __version__,
         "run": run.name,
@@ -87,14 +85,14 @@ def perform(options: Tune) -> int:
         "frames": [frame.step.prefix for frame, _ in pairs],
         "gate": asdict(options.matching),
         "camera": run.camera.content_hash,
-        "settings": {name: _plain(value) for name, value in asdict(base).items()},
+        "settings": asdict(base),
         "varied": varied,
     }
-    document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
+    document = json.dumps({**head, "trials": records}, indent=1)
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     contents = {
         "table.json": f"{document}\n".encode(),
-        "curve.png": curve_picture(grid, trials, title),
+        "curve.png": curve_picture(records, varied, title),
     }
     output.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
@@ -107,16 +105,8 @@ def perform(options: Tune) -> int:
                 f"knee: {values}: recall {record['recall']:.3f}, "
                 f"precision {record['precision']:.3f}"
             )
-    failures = sorted({failure for trial in trials for failure in trial.failures})
+    failures = sorted({failure for _, failed in trials for failure in failed})
     return report_failures(len(failures), failures)
-
-
-def _plain(value: Any) -> Any:
-    """A setting for JSON: what it does not have (infinity, tuples) as words."""
-    plain = isinstance(value, bool | int | str) or (
-        isinstance(value, float) and math.isfinite(value)
-    )
-    return value if plain else str(value)
 
 
 #: The value of each parameter that is varied.
@@ -161,16 +151,6 @@ def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
 _MOST_NAMED = 12
 
 
-class Trial(NamedTuple):
-    """Figures of one setting, as in tables, and why frames could not be worked on.
-
-    Those count as frames without detections.
-    """
-
-    figures: dict[str, Any]
-    failures: tuple[str, ...] = ()
-
-
 def tune_run(
     run: Run,
     frames: Sequence[tuple[RunFrame, Frame]],
@@ -178,11 +158,12 @@ def tune_run(
     options: CompareOptions,
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
-) -> Iterator[Trial]:
-    """Detect discs in frames of a run with each setting; yields the trial of each.
+) -> Iterator[tuple[DiscComparison, list[str]]]:
+    """Detect discs in frames of a run with each setting, and compare them.
 
     `frames` come with their reference rows; `on_progress` is called after every frame of every
-    setting.
+    setting. Yields the comparison of each setting, and why frames could not be worked on: they
+    count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame, _ in frames]
@@ -198,46 +179,32 @@ def tune_run(
                 )
                 failures += [] if each.error is None else [each.error]
                 on_progress()
-            result = compare_frames([rows for _, rows in frames], found, options)
-            yield Trial(figures_of(result), tuple(failures))
+            yield compare_frames([rows for _, rows in frames], found, options), failures
 
 
 def figures_of(result: DiscComparison) -> dict[str, Any]:
     """What a table has of a comparison; `matched` are the reference rows that were found."""
-    recall, precision = result.recall, result.precision
-    return {
+    figures = {
         "reference": result.reference,
         "detected": result.detected,
         "matched": result.found,
-        "recall": recall,
-        "precision": precision,
-        "f1": None if recall is None or precision is None else float(f1_score(recall, precision)),
+        "recall": result.recall,
+        "precision": result.precision,
         "error_median_m": result.error_median_m,
         "normalised_error": result.normalised_error.per_dof,
     }
+    # Six significant digits, as in the files of rows.
+    return {
+        name: float(f"{value:.6g}") if isinstance(value, float) else value
+        for name, value in figures.items()
+    }
 
 
-def trial_records(
-    combinations: Sequence[Combination], trials: Sequence[Trial]
-) -> list[dict[str, Any]]:
-    """One record for each trial: the parameters, then the figures, front and knee."""
-    recall, precision = _rates(trials)
-    front, best = pareto_front(recall, precision), knee(recall, precision)
-    records = []
-    for k, (combination, trial) in enumerate(zip(combinations, trials)):
-        # Six significant digits, as in the files of rows.
-        figures = {
-            name: float(f"{value:.6g}") if isinstance(value, float) else value
-            for name, value in trial.figures.items()
-        }
-        records.append({**combination, **figures, "front": k in front, "knee": k == best})
-    return records
-
-
-def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
-    """Harmonic mean of recall and precision; 0 where both are, NaN where one is."""
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    return np.asarray(2.0 * r * p / np.where(r + p == 0.0, 1.0, r + p))
+def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The records of trials, with whether each is on the front, and the knee."""
+    rates = _rates(records)
+    front, best = pareto_front(*rates), knee(*rates)
+    return [{**each, "front": k in front, "knee": k == best} for k, each in enumerate(records)]
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
@@ -271,15 +238,13 @@ def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
         beyond = x + y - 1.0
         if beyond.max() > 1e-9:
             return int(front[np.argmax(beyond)])
-    return int(front[np.argmax(f1_score(r[front], p[front]))])
+    return int(front[np.argmax(r[front] * p[front] / np.maximum(r[front] + p[front], 1e-12))])
 
 
-def curve_picture(
-    combinations: Sequence[Combination], trials: Sequence[Trial], title: str
-) -> bytes:
+def curve_picture(records: Sequence[dict[str, Any]], varied: Iterable[str], title: str) -> bytes:
     """Precision over recall as a PNG file: all trials, their front, and the knee."""
-    recall, precision = _rates(trials)
-    names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
+    recall, precision = _rates(records)
+    names = [", ".join(f"{name} {each[name]}" for name in varied) for each in records]
     front, best = pareto_front(recall, precision), knee(recall, precision)
     with figure_file((6.4, 6.2), "png") as (figure, content):
         axes = figure.subplots()
@@ -301,8 +266,8 @@ def curve_picture(
     return content.getvalue()
 
 
-def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
+def _rates(records: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """(N,) recall and precision, NaN where there is none."""
-    rates = [(trial.figures["recall"], trial.figures["precision"]) for trial in trials]
+    rates = [(each["recall"], each["precision"]) for each in records]
     recall, precision = np.array(rates, np.float64).reshape(-1, 2).T
     return recall, precision

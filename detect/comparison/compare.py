@@ -25,7 +25,6 @@ from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
     DistanceBin,
-    ForwardRange,
     FrameMatch,
     FramePair,
     Kind,
@@ -55,7 +54,7 @@ from redetect.landmarks import (
 from redetect.storage.messages import excerpt
 
 # The forward distances for which the data set's own qualities are known.
-_EDGES_M = (None, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, None)
+_EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files hold six digits: a smaller sigma is no statement about a bearing.
 LEAST_SIGMA_RAD = 1e-12
 
@@ -143,7 +142,6 @@ def compare_frames(
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
-    ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
     return DiscComparison(
         **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
         normalised_error=normalised_error(pairs.offset, second.covariance),
@@ -153,7 +151,7 @@ def compare_frames(
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
-        bins=tuple(_distance_bin(part, sides, pairs) for part in ranges),
+        bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
         extra_beyond=_beyond(extra.xy, second.xy),
         in_image=in_image,
         image_median_px=quantile(image_px),
@@ -213,10 +211,10 @@ def compare_line_frames(
 
 
 def _distance_bin(
-    part: ForwardRange, sides: tuple[CircleArrays, ...], pairs: DiscPairs
+    low: float, high: float, sides: tuple[CircleArrays, ...], pairs: DiscPairs
 ) -> DistanceBin:
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
-    inside = [part.holds(side.xy) for side in sides]
+    inside = [(low <= -side.xy[:, 1]) & (-side.xy[:, 1] < high) for side in sides]
     first, second, missed, extra = (int(mask.sum()) for mask in inside)
     qualities = [side.quality[mask] for side, mask in zip(sides, inside)]
     wanted = quantile(np.concatenate([qualities[0], qualities[2]]))
@@ -224,8 +222,8 @@ def _distance_bin(
     away = pairs.away[inside[0]]
     offset, as_written = pairs.offset[inside[0]], pairs.as_written[inside[0]]
     return DistanceBin(
-        from_m=part.from_m,
-        to_m=part.to_m,
+        from_m=low if np.isfinite(low) else None,
+        to_m=high if np.isfinite(high) else None,
         reference=first + missed,
         missed=missed,
         detected=second + extra,

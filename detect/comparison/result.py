@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 if TYPE_CHECKING:
@@ -75,25 +75,6 @@ class NormalisedError:
 
 
 @dataclass(frozen=True)
-class ForwardRange:
-    """A range of forward distances (m), open at an end that is None."""
-
-    from_m: float | None
-    to_m: float | None
-
-    def holds(self, floor_xy: FloatArray) -> BoolArray:
-        """(N,) which of some positions are in it."""
-        low = -np.inf if self.from_m is None else self.from_m
-        high = np.inf if self.to_m is None else self.to_m
-        return np.asarray((low <= -floor_xy[:, 1]) & (-floor_xy[:, 1] < high))
-
-    def __str__(self) -> str:
-        if self.from_m is None:
-            return f"< {self.to_m:g}"
-        return f">= {self.from_m:g}" if self.to_m is None else f"{self.from_m:g}-{self.to_m:g}"
-
-
-@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
@@ -105,13 +86,17 @@ class FloorDifference:
 
 
 @dataclass(frozen=True)
-class DistanceBin(ForwardRange):
-    """Discs at a range of forward distances; qualities and errors are medians.
+class DistanceBin:
+    """Discs at a range of forward distances (m), open at an end that is None.
+
+    Qualities and errors are medians.
 
     Differences are of matched discs on the floor, as their rows are and levelled alike; the latter
     are None where all rows are levelled alike to begin with.
     """
 
+    from_m: float | None
+    to_m: float | None
     reference: int
     missed: int
     detected: int
@@ -124,6 +109,11 @@ class DistanceBin(ForwardRange):
     quality_difference: float | None
     as_written: FloorDifference
     alike: FloorDifference | None
+
+    def __str__(self) -> str:
+        if self.from_m is None:
+            return f"< {self.to_m:g}"
+        return f">= {self.from_m:g}" if self.to_m is None else f"{self.from_m:g}-{self.to_m:g}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from detect.comparison.result import (
 from detect.drawing.inputs import SeenRows
 from detect.seen import ellipses, summed_steps
 from redetect.array_types import FloatArray
-from redetect.landmarks import Frame, circle_arrays, is_positive_definite
+from redetect.landmarks import circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
@@ -175,10 +175,8 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
 
 
-#: Of the map: ellipses in standard deviations, and its size (inches).
-_SIGMAS = 3.0
-_LARGEST_IN = (_WIDE, 9.0)
-_SMALLEST_IN = 2.5
+#: Size of the map's ellipses, in standard deviations, and their corners.
+_SIGMAS, _CORNERS = 3.0, 32
 
 
 def floor_map(rows: Sequence[SeenRows]) -> Part | None:
@@ -186,56 +184,41 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
 
     Forward at the start is up, left is left. None where there are no discs.
     """
-    frames = [seen.circles for seen in rows if seen.circles is not None]
-    if not any(frame.circles for frame in frames):
+    seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
+    if not any(found.circles for found, _ in seen):
         return None
-    poses = summed_steps(frame.step for frame in frames)
+    poses = summed_steps(found.step for found, _ in seen)
+    outlines, true = [], [np.zeros((0, 2))]
+    for (found, reference), pose in zip(seen, poses[1:]):
+        discs = circle_arrays(found.circles)
+        outlines.append(_from_pose(ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS), pose))
+        if reference is not None:
+            true.append(_from_pose(circle_arrays(reference.circles).xy, pose))
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
-    found = [_placed(frame, pose) for frame, pose in zip(frames, poses[1:])]
-    references = [seen.reference_circles for seen in rows if seen.circles is not None]
-    true = [
-        _placed(frame, pose)[0]
-        for frame, pose in zip(references, poses[1:])
-        if frame is not None and frame.circles
-    ]
-    centres = np.concatenate([xy for xy, _ in found])
-    ellipses = np.concatenate([outlines for _, outlines in found])
-    path = ahead * poses[:, :2]
-    everything = np.concatenate([path, ahead * centres, *(ahead * xy for xy in true)])
-    low, high = everything.min(axis=0) - 0.3, everything.max(axis=0) + 0.3
-    scale = min(np.array(_LARGEST_IN) / (high - low))
-    size = np.maximum(scale * (high - low), _SMALLEST_IN)
-    with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
+    with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
-        axes.plot(path[:, 0], path[:, 1], color=REFERENCE, lw=1.0, label="path by the odometry")
-        if true:
-            x, y = (ahead * np.concatenate(true)).T
-            axes.plot(x, y, "+", color=MARK, ms=6, mew=0.7, label="reference")
-        gaps = np.concatenate([ellipses, np.full((len(ellipses), 1, 2), np.nan)], axis=1)
-        x, y = (ahead * gaps.reshape(-1, 2)).T
-        axes.plot(x, y, color=DATA, lw=0.7, label="found")
-        axes.set_xlim(high[0], low[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal")
-        axes.set_xlabel("to the left / m")
-        axes.set_ylabel("forward / m")
-        axes.grid(alpha=0.25, lw=0.6)
+        path = ahead * poses[:, :2]
+        axes.plot(*path.T, color=REFERENCE, lw=1.0, label="path by the odometry")
+        if len(marks := ahead * np.concatenate(true)):
+            axes.plot(*marks.T, "+", color=MARK, ms=6, mew=0.7, label="reference")
+        closed = np.concatenate(outlines)[:, [*range(_CORNERS), 0]]
+        gaps = np.pad(closed, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        axes.plot(*(ahead * gaps.reshape(-1, 2)).T, color=DATA, lw=0.7, label="found")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.invert_xaxis()
+        _finish(axes, "to the left / m", "forward / m")
         axes.legend(fontsize=8)
     words = (
         f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
         "each frame, along the path that the odometry sums up to."
     )
-    return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
+    return _part(words, content, _WIDE)
 
 
-def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) centres of a frame's discs and (N, P, 2) outlines of their ellipses, from a pose."""
-    discs = circle_arrays(frame.circles)
-    outlines = ellipses(discs.xy, discs.covariance, _SIGMAS, 32)
+def _from_pose(xy: FloatArray, pose: FloatArray) -> FloatArray:
+    """Places (..., 2) in the frame of a robot at a pose, as those in the frame of its start."""
     sine, cosine = np.sin(pose[2]), np.cos(pose[2])
-    turn = np.array([[cosine, sine], [-sine, cosine]])
-    closed = np.concatenate([outlines, outlines[:, :1]], axis=1)
-    return discs.xy @ turn + pose[:2], closed @ turn + pose[:2]
+    return xy @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]
 
 
 class RateCurve(NamedTuple):

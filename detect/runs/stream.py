@@ -332,6 +332,7 @@ class RunFiles:
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
         """Note the next frames."""
+        self._keep = not self._job.strict or all(rows.error is None for _, rows in frames)
         for _, rows in frames:
             self._demand_strictly(rows)
         self._journal.write_frames(frames)
@@ -339,7 +340,6 @@ class RunFiles:
 
     def _demand_strictly(self, rows: FrameRows) -> None:
         if rows.error is not None and self._job.strict:
-            self._keep = False
             raise DetectError(f"{rows.error} (--strict: nothing is written)")
 
     # -- ending -----------------------------------------------------------------------------

@@ -239,7 +239,7 @@ class Bag(Source):
                 yield RunFrame(still(prefix), None, content, time_s, failure)
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The ``.cam`` file beside it, of its name or the only one; else its own, without a pose."""
+        """The ``.cam`` file beside it, of its name or the only one; else its own: no pose."""
         beside = super().calibration(posed=posed)
         if beside is not None or posed:
             return beside
@@ -288,8 +288,6 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
     total = np.zeros((3, 3))
     for pose, twist in poses:
         if before is not None:
-            assert before.covariance is not None
-            assert pose.covariance is not None
             grown = pose.covariance - carried(before.covariance, before, pose)
             scale = float(np.abs(pose.covariance).max())
             if not np.any(grown) or np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:

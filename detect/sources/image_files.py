@@ -120,14 +120,10 @@ def _suffix(name: str) -> str:
     return os.path.splitext(name)[1].lower()  # noqa: PTH122 - a Path for each name is slow
 
 
-def _natural_order(name: str) -> str:
-    """Sort key of names with numbers by value: before its digits, how many there are."""
-
-    def by_value(found: re.Match[str]) -> str:
-        digits = found[0].lstrip("0")
-        return f"\0{chr(1 + len(digits))}{digits}"
-
-    return f"{name[0].isdigit():d}{re.sub('[0-9]+', by_value, name)}"
+def _natural_order(name: str) -> list[tuple[int, str]]:
+    """Sort key of names with numbers by value, which come before letters' places."""
+    parts = re.findall("[0-9]+|[^0-9]+", name)
+    return [(-1, part) if not part.isdigit() else (int(part), "") for part in parts]
 
 
 WILDCARDS = frozenset("*?[")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -46,14 +46,14 @@ _LARGEST_BYTES = 1 << 28
 class TimedPose:
     """Where a robot was: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
-    The (3, 3) covariance is that of (x, y, theta) since the start; None if unknown.
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
     """
 
     time_s: float
     x: float
     y: float
     theta: float
-    covariance: FloatArray | None = None
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 class PoseStream(NamedTuple):
@@ -77,13 +77,12 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     robot_from_fixed = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed[:2, :2] @ moved), turn])
     c = np.zeros((3, 3))
-    if before.covariance is not None and after.covariance is not None:
-        grown = after.covariance - carried(before.covariance, before, after)
-        smallest, _, largest = np.linalg.eigvalsh(grown)
-        scale = float(np.abs(after.covariance).max())
-        if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
-            to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
-            c = to_dataset @ grown @ to_dataset.T
+    grown = after.covariance - carried(before.covariance, before, after)
+    smallest, _, largest = np.linalg.eigvalsh(grown)
+    scale = float(np.abs(after.covariance).max())
+    if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
+        to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
+        c = to_dataset @ grown @ to_dataset.T
     entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
     return Step(prefix, *map(float, (*pose, *entries)))
 
@@ -100,16 +99,13 @@ def carried(
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
     """The pose at a time between two: linear, the heading the shorter way round."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
-    covariance = None
-    if before.covariance is not None and after.covariance is not None:
-        grown = after.covariance - carried(before.covariance, before, after)
-        covariance = carried(before.covariance, before, after, share) + share * grown
+    grown = after.covariance - carried(before.covariance, before, after)
     return TimedPose(
         time_s,
         before.x + share * (after.x - before.x),
         before.y + share * (after.y - before.y),
         before.theta + share * float(wrap_angle(after.theta - before.theta)),
-        covariance,
+        carried(before.covariance, before, after, share) + share * grown,
     )
 
 

@@ -17,14 +17,12 @@ from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
 from detect.settings import CircleSettings
 from detect.tune import (
-    Trial,
     combinations,
     curve_picture,
-    f1_score,
     knee,
+    marked,
     parameter_values,
     pareto_front,
-    trial_records,
 )
 from redetect.landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
@@ -55,11 +53,6 @@ def test_without_a_bend_the_greatest_f1_stands_for_the_knee() -> None:
     assert knee([0.9, 0.3], [0.8, 0.9]) == 0
     assert knee([0.4], [0.5]) == 0
     assert knee([np.nan, 0.5], [0.5, np.nan]) is None
-
-
-def test_harmonic_mean() -> None:
-    np.testing.assert_allclose(f1_score([0.5, 0.0, 1.0], [1.0, 0.0, 1.0]), [2 / 3, 0.0, 1.0])
-    assert np.isnan(f1_score(np.nan, 0.5))
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
@@ -134,16 +127,12 @@ def test_all_combinations_are_tried() -> None:
 
 
 def test_records_mark_front_and_knee() -> None:
-    grid = [{"threshold": k / 10} for k in range(len(CURVE))]
-    trials = [
-        Trial({"recall": r, "precision": p, "error_median_m": 0.0123456789}) for r, p in CURVE
-    ]
-    records = trial_records(grid, trials)
+    trials = [{"threshold": k / 10, "recall": r, "precision": p} for k, (r, p) in enumerate(CURVE)]
+    records = marked(trials)
     assert [r["front"] for r in records] == [True] * 4 + [False] * 3
     assert [r["knee"] for r in records] == [False, True] + [False] * 5
-    assert records[0]["error_median_m"] == 0.0123457
-    picture = curve_picture(grid, trials, "by hand")
-    assert picture == curve_picture(grid, trials, "by hand")
+    picture = curve_picture(records, ["threshold"], "by hand")
+    assert picture == curve_picture(records, ["threshold"], "by hand")
     shown = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     # The ring round the knee (#a8321e).
