@@ -218,7 +218,7 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
 def _from_pose(xy: FloatArray, pose: FloatArray) -> FloatArray:
     """Places (..., 2) in the frame of a robot at a pose, as those in the frame of its start."""
     sine, cosine = np.sin(pose[2]), np.cos(pose[2])
-    return xy @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]
+    return np.asarray(xy @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2])
 
 
 class RateCurve(NamedTuple):

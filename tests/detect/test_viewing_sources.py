@@ -33,11 +33,11 @@ def as_bag(folder: Path, images: Images) -> Path:
 def rows(small_run_template: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Flags that name what was found in the small run, and a reference that differs from it."""
     folder = tmp_path_factory.mktemp("rows")
-    found, reference = folder / "found.circles", folder / "map.circles"
+    found, reference = folder / "detected.circles", folder / "map.circles"
     run = str(small_run_template)
     assert main(["circles", run, "-o", str(found)]) == 0
     assert main(["circles", run, "--preset", "published", "-o", str(reference)]) == 0
-    return ["--circles", str(found), "--reference", str(reference)]
+    return ["--rows", str(folder), "--reference", str(reference)]
 
 
 def looked_at(source: Path, rows: list[str], output: Path) -> dict[str, bytes]:
