@@ -216,9 +216,6 @@ def _distance_bin(
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
     inside = [(low <= -side.xy[:, 1]) & (-side.xy[:, 1] < high) for side in sides]
     first, second, missed, extra = (int(mask.sum()) for mask in inside)
-    qualities = [side.quality[mask] for side, mask in zip(sides, inside)]
-    wanted = quantile(np.concatenate([qualities[0], qualities[2]]))
-    found = quantile(np.concatenate([qualities[1], qualities[3]]))
     away = pairs.away[inside[0]]
     offset, as_written = pairs.offset[inside[0]], pairs.as_written[inside[0]]
     return DistanceBin(
@@ -230,10 +227,7 @@ def _distance_bin(
         extra=extra,
         recall=first / (first + missed) if first + missed else None,
         precision=second / (second + extra) if second + extra else None,
-        reference_quality_median=wanted,
-        detected_quality_median=found,
         error_median_m=quantile(np.linalg.norm(offset, axis=1)),
-        quality_difference=None if wanted is None or found is None else found - wanted,
         as_written=floor_difference(as_written, away),
         alike=floor_difference(offset, away) if pairs.levelled_apart else None,
     )

@@ -132,23 +132,16 @@ def _shown(figure: Any) -> str | None:
 
 
 def _over_distance(c: DiscComparison) -> FigureTable:
-    # Of a width that a terminal of 80 columns has.
-    head = (
-        "metres", "ref.", "missed", "recall", "det.", "extra", "prec.",
-        "error m", "ref. quality", "det. quality", "diff.",
-    )  # fmt: skip
+    head = ("metres", "ref.", "missed", "recall", "det.", "extra", "prec.", "error m")
     rows = []
     for part in c.bins:
         if part.reference or part.detected:
-            figures = (
-                part.recall, part.precision, part.error_median_m, part.reference_quality_median,
-                part.detected_quality_median, part.quality_difference,
-            )  # fmt: skip
-            recall, precision, *medians = (number(value, 3) for value in figures)
-            counts = [str(n) for n in (part.reference, part.missed, part.detected, part.extra)]
-            rows.append((str(part), *counts[:2], recall, *counts[2:], precision, *medians))
-    caption = "By forward distance (position error and quality: medians)"
-    return FigureTable(caption, head, tuple(rows))
+            recall, precision, error = (
+                number(value, 3) for value in (part.recall, part.precision, part.error_median_m)
+            )
+            wanted, found = (part.reference, part.missed), (part.detected, part.extra)
+            rows.append((str(part), *map(str, wanted), recall, *map(str, found), precision, error))
+    return FigureTable("By forward distance (position error: median)", head, tuple(rows))
 
 
 def floor_table(c: DiscComparison) -> FigureTable:

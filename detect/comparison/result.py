@@ -89,8 +89,6 @@ class FloorDifference:
 class DistanceBin:
     """Discs at a range of forward distances (m), open at an end that is None.
 
-    Qualities and errors are medians.
-
     Differences are of matched discs on the floor, as their rows are and levelled alike; the latter
     are None where all rows are levelled alike to begin with.
     """
@@ -103,10 +101,7 @@ class DistanceBin:
     extra: int
     recall: float | None
     precision: float | None
-    reference_quality_median: float | None
-    detected_quality_median: float | None
     error_median_m: float | None
-    quality_difference: float | None
     as_written: FloorDifference
     alike: FloorDifference | None
 
