@@ -294,9 +294,10 @@ _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 def _colours(names: Sequence[str]) -> dict[str, Colour]:
     """Colours that stay apart, always the same; that of the first is of what was found."""
-    places = np.linspace(0, 230, len(names)).astype(np.uint8)
-    found = cv2.applyColorMap(places, cv2.COLORMAP_HSV)[:, 0].tolist()
-    return {name: tuple(colour) for name, colour in zip(names, found)} | {names[0]: LINE_COLOUR}
+    hues = np.linspace(128, 298, len(names)) % 256  # from cyan to yellow: no green
+    colours = cv2.applyColorMap(hues.astype(np.uint8)[:, None], cv2.COLORMAP_HSV)[:, 0]
+    pale = (75 + 0.7 * colours[1:]).astype(int).tolist()
+    return dict(zip(names, [LINE_COLOUR, *map(tuple, pale)], strict=True))
 
 
 _FATE_COLOURS = _colours(FATES)
