@@ -29,17 +29,6 @@ DetectorPreset = Literal["default", "published", "report"]
 LineEnds = Literal["lf", "crlf"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunFlags:
-    """Options of all commands that process the frames of a run."""
-
-    #: Run folder, folder or pattern of images, video or bag, as for `detect circles`.
-    run: Positional[Path]
-    output: Annotated[MaybePath, arg(aliases=["-o"])] = None  #: The file to write.
-    camera: MaybePath = None  #: Calibration, if it is not the one in the run folder.
-    force: bool = False  #: Replace existing files.
-
-
 @dataclass(frozen=True)
 class SourceOptions:
     """Options of a source besides its name."""
@@ -59,10 +48,17 @@ class SourceOptions:
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
 
-    @property
-    def plain(self) -> bool:
-        """Whether nothing is said of steps and times."""
-        return not (self.odometry or self.times or self.image_topic)
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """Options of all commands that process the frames of a run."""
+
+    #: Run folder, folder or pattern of images, video or bag, as for `detect circles`.
+    run: Positional[Path]
+    output: Annotated[MaybePath, arg(aliases=["-o"])] = None  #: The file to write.
+    camera: MaybePath = None  #: Calibration, if it is not the one in the run folder.
+    force: bool = False  #: Replace existing files.
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +70,7 @@ class DetectorFlags(RunFlags):
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, in the bag, or named by --camera.
+        camera:0. With a .cam beside it, or named by --camera.
     output : Path
         The file to write; by default detected.circles, .lines or .markers in the run folder, or
         named after the video or bag and beside it.
@@ -90,7 +86,6 @@ class DetectorFlags(RunFlags):
     jobs: MaybeInt = None
     #: Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     cluster: MaybeStr = None
-    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     #: Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
     strict: bool = False
     #: Take over the frames that an unfinished run of the same command kept, and go on after them.
@@ -172,13 +167,7 @@ class Markers(DetectorFlags):
     Example: detect markers images/m/a --dictionary rawseeds, or:
     detect markers camera:0 --frames 100
 
-    Parameters
-    ----------
-    run : Path
-        Run folder of the data set's layout; a folder of images, or a pattern in quotes
-        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
-        without one, edges are taken to be straight in the images.
+    Without a calibration, edges are taken to be straight in the images.
     """
 
     #: Folder for images with the markers drawn in, once all are detected.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from detect.errors import CompareError, DetectError
-from detect.options import RunFlags, SourceOptions
+from detect.options import RunFlags
 from detect.settings import CircleSettings
 from redetect.storage.bounds import (
     ABOVE_0,
@@ -85,15 +85,8 @@ class RowFiles:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RowsFlags(RunFlags):
-    """Options of all commands that show frames of a run."""
-
-    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SomeFramesFlags(RowsFlags):
-    """Options of those that may leave frames out."""
+class SomeFramesFlags(RunFlags):
+    """Options of commands that may leave frames out."""
 
     every: Annotated[int, whole(1)] = 1  #: Only every n-th frame.
 
@@ -139,7 +132,7 @@ class View(SomeFramesFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(RowsFlags):
+class Report(RunFlags):
     """One HTML page about a run: what was found, and how good it is against reference rows.
 
     Example: detect all images/e, then: detect report images/e -o /tmp/e.html

@@ -81,7 +81,8 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames: Frames
     odometry: Path | None
-    if options.plain and isinstance(source, ImageFiles) and (own := _own_odometry(name)):
+    own = None if options.odometry or options.times else _own_odometry(name)
+    if own is not None and isinstance(source, ImageFiles):
         frames, odometry, has_times = source.along(own), own, False
     else:
         frames, odometry = _frames(source, options)
