@@ -63,25 +63,14 @@ class ImageNames:
                 and matches(entry.name)
                 and (pattern.startswith(".") or not entry.name.startswith("."))
             )
-        self._names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
-        self._places: dict[str, int] = {}
-        for place, name in enumerate(self._names):
+        self.names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
+        self._called: dict[str, str] = {}  # by the name with and without its ending; the first
+        for name in self.names:
             for called in (name, name[: name.rindex(".")]):
-                self._places.setdefault(called, place)
+                self._called.setdefault(called, name)
 
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def path(self, index: int) -> Path:
-        """The image at a place in the order."""
-        return self.folder / self._names[index]
-
-    def find(self, name: str) -> int | None:
-        """The place of the image of a name, with or without its ending; the first of several."""
-        return self._places.get(name)
-
-    def place_of(self, prefix: str) -> int | None:
-        """The place of a step's image, by its name alone; None if there is none.
+    def image_of(self, prefix: str) -> Path | None:
+        """A step's image, by its name alone; None if there is none.
 
         A prefix that leads out of the run is a FrameError: a file of steps must not decide which
         other files are read.
@@ -90,11 +79,11 @@ class ImageNames:
         why = leads_out(name, *map(str, self._homes))
         if why is not None:
             raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
-        return self.find(last_part(name))
+        found = self._called.get(last_part(name))
+        return None if found is None else self.checked(self.folder / found)
 
-    def checked(self, index: int) -> Path:
-        """The image at a place; a link that leads out of the run is a FrameError."""
-        path = self.path(index)
+    def checked(self, path: Path) -> Path:
+        """The path of an image; a link that leads out of the run is a FrameError."""
         if path.is_symlink() and link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
@@ -108,7 +97,7 @@ def images_of_folder(folder: Path) -> ImageNames:
     for place in (folder / "images", folder):
         if place.is_dir():
             found = ImageNames(place)
-            if len(found):
+            if found.names:
                 return found
     kinds = " ".join(sorted(IMAGE_SUFFIXES))
     raise DetectError(
@@ -149,17 +138,13 @@ class RunFrames(Frames):
         for step in read_steps(odometry):
             self.expected += 1
             with suppress(FrameError):  # reported when the frame is processed
-                found = images.place_of(step.prefix)
-                if found is not None:
-                    images.checked(found)
-                    named.add(found)
-        self.left_out = len(images) - len(named)
+                named.add(images.image_of(step.prefix))
+        self.left_out = len(images.names) - len(named - {None})
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         for step in read_steps(self._odometry):
             try:
-                found = self._images.place_of(step.prefix)
-                image = None if found is None else self._images.checked(found)
+                image = self._images.image_of(step.prefix)
                 time_s = None if image is None else self._times.get(image.stem)
                 yield RunFrame(step, image, time_s=time_s)
             except FrameError as error:
@@ -184,21 +169,22 @@ class ImageFiles(Source):
             self._names, self._home = _matching_images(name), name.parent
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
-        # A pattern names its links; a folder may be somebody else's.
-        self._path = self._names.checked if name.is_dir() else self._names.path
+        self._is_pattern = not name.is_dir()
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
-        self.expected = len(self._names)
+        self.expected = len(self._names.names)
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
         self._times = read_times(times_file) if times or times_file.is_file() else {}
         self.has_times = bool(times) or times_file.is_file()
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        for place in range(len(self._names)):
-            stem = self._names.path(place).stem
-            step, time_s = still(frame_prefix(stem)), self._times.get(stem)
+        for name in self._names.names:
+            path = self._names.folder / name
+            step, time_s = still(frame_prefix(path.stem)), self._times.get(path.stem)
             try:
-                yield RunFrame(step, self._path(place), time_s=time_s)
+                if not self._is_pattern:  # which names its links; a folder may be somebody else's
+                    path = self._names.checked(path)
+                yield RunFrame(step, path, time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
@@ -216,7 +202,7 @@ def _matching_images(pattern: Path) -> ImageNames:
     if not pattern.parent.is_dir():
         raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
     found = ImageNames(pattern.parent, pattern.name)
-    if not len(found):
+    if not found.names:
         kinds = " ".join(sorted(IMAGE_SUFFIXES))
         raise DetectError(f"{pattern}: no image matches: expected {kinds}")
     return found
