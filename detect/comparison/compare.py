@@ -53,7 +53,7 @@ from redetect.landmarks import (
 )
 from redetect.storage.messages import excerpt
 
-# The forward distances for which the data set's own qualities are known.
+# Edges of the ranges of forward distances (m).
 _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files hold six digits: a smaller sigma is no statement about a bearing.
 LEAST_SIGMA_RAD = 1e-12
@@ -141,7 +141,7 @@ def compare_frames(
     apart = [] if sight is None else [apart_px(match) for match in matches]
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
-    error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
+    error_m = np.linalg.norm(pairs.offset, axis=1)
     return DiscComparison(
         **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
         normalised_error=normalised_error(pairs.offset, second.covariance),
@@ -152,7 +152,6 @@ def compare_frames(
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
         bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
-        extra_beyond=_beyond(extra.xy, second.xy),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
@@ -166,12 +165,6 @@ def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatA
     """(M, 2) where discs of the reference are on the floor if levelled as the detected ones."""
     xy = circle_arrays(reference).xy
     return xy if view is None else view.levelled_alike(xy)
-
-
-def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
-    """How many positions are farther away than all of those that are known."""
-    farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
-    return int((np.linalg.norm(xy, axis=1) > farthest).sum())
 
 
 def compare_line_frames(

@@ -241,7 +241,6 @@ class DiscComparison(Comparison):
     detected_quality_matched: float | None
     detected_quality_extra: float | None
     bins: tuple[DistanceBin, ...]
-    extra_beyond: int  # extra rows that are farther away than all that are on a reference row
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
