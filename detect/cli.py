@@ -32,7 +32,6 @@ from detect.viewing_options import (
     Draw,
     Explain,
     Export,
-    Grid,
     Report,
     RowFiles,
     Tune,
@@ -54,7 +53,6 @@ EXPERT: dict[type, frozenset[str]] = {
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
     RowFiles: all_but(RowFiles, "rows", "reference"),
     CompareOptions: all_but(CompareOptions, "only_identified"),
-    Grid: all_but(Grid, "threshold", "evidence", "noise_floor", "blur_px", "radius_m"),
 }  # fmt: skip
 
 Detectors = Circles | Lines | Markers | All

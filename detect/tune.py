@@ -43,7 +43,7 @@ from redetect.storage import OutputExistsError, write_bytes
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
-    varied = {name: text for name, text in vars(options.grid).items() if text is not None}
+    varied = dict(map(_name_and_values, options.vary))
     grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
 
@@ -109,6 +109,13 @@ def perform(options: Tune) -> int:
     return report_failures(len(failures), failures)
 
 
+def _name_and_values(word: str) -> tuple[str, str]:
+    name, equals, values = word.partition("=")
+    if not equals:
+        raise DetectError(f"{word!r}: expected NAME=VALUES, as threshold=0.3:0.7:0.1")
+    return name.replace("-", "_"), values
+
+
 #: The value of each parameter that is varied.
 Combination = dict[str, Any]
 
@@ -141,7 +148,7 @@ def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
     """
     if not varied:
         raise DetectError(
-            "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
+            "nothing is varied: expected a parameter and values, as --vary threshold=0.3:0.7:0.1"
         )
     values = {name: parameter_values(name, text) for name, text in varied.items()}
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))

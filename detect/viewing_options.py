@@ -5,9 +5,9 @@ Nothing heavy is imported: `--help` needs it all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -20,7 +20,6 @@ from redetect.storage.bounds import (
     MaybeInt,
     MaybePath,
     MaybePixel,
-    MaybeStr,
     NotNegative,
     Positive,
     demand_fields,
@@ -186,36 +185,14 @@ class Demo:
     force: bool = False  #: Replace existing files.
 
 
-if TYPE_CHECKING:
-
-    class Grid:
-        """One `str` or None for each field of `CircleSettings`."""
-
-else:
-
-    def _grid() -> type:
-        def values_of(name: str) -> object:
-            return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
-
-        return make_dataclass(
-            "Grid",
-            [(f.name, values_of(f.name), field(default=None)) for f in fields(CircleSettings)],
-            namespace={"__doc__": "Parameters to be varied: FROM:TO:STEP, or values with commas."},
-            frozen=True,
-        )
-
-    Grid = _grid()
-
-
 @dataclass(frozen=True, kw_only=True)
 class Tune(SomeFramesFlags):
     """Try parameters over a grid against a reference file: precision and recall, knee marked.
 
-    Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
+    Example: detect tune images/e --vary threshold=0.3:0.7:0.1 --every 8 -o /tmp/tuned
 
-    Any parameter of `detect circles` can be varied: by FROM:TO:STEP, both ends included, or by
-    values with commas between them. All combinations are tried. With --serve, they are turned by
-    hand on a page instead, which needs no reference rows, and labels discs.
+    All combinations of the values of --vary are tried. With --serve, parameters are turned by hand
+    on a page instead, which needs no reference rows, and labels discs.
 
     Parameters
     ----------
@@ -224,6 +201,9 @@ class Tune(SomeFramesFlags):
         (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
+    #: Parameters of `detect circles` and their values: NAME=FROM:TO:STEP, both ends included, or
+    #: NAME=VALUES with commas between them.
+    vary: tuple[str, ...] = ()
     serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
@@ -232,7 +212,6 @@ class Tune(SomeFramesFlags):
     #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
-    grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 
 
 Format = Literal["csv", "parquet", "mcap"]

@@ -156,7 +156,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
         small_run, {**SMALL_RUN_DISCS, "s.0001": [], "s.0002": [(0.0, -1.4), (0.5, -1.4)]}
     )
     folder = tmp_path / "t"
-    arguments = ["tune", str(small_run), "--threshold", "0.4,0.999", "--samples", "8,16"]
+    arguments = ["tune", str(small_run), "--vary", "samples=8,16", "threshold=0.4,0.999"]
     assert main([*arguments, "-o", str(folder)]) == 0
     document = json.loads((folder / "table.json").read_text())
     rows = document["trials"]
@@ -185,7 +185,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
 @pytest.mark.long
 def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
     write_reference(small_run, SMALL_RUN_DISCS)
-    arguments = ["tune", str(small_run), "--threshold", "0.4:0.9:0.25"]
+    arguments = ["tune", str(small_run), "--vary", "threshold=0.4:0.9:0.25"]
     for jobs in ("1", "2"):
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
     for name in ("table.json", "curve.png"):
@@ -196,15 +196,16 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     run = str(small_run)
     tune = ["tune", run, "-o", str(tmp_path / "t")]
     assert_refused(tune, small_run, "nothing is varied", capsys)
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "map.circles", capsys)
+    assert_refused([*tune, "--vary", "threshold"], small_run, "expected NAME=VALUES", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "map.circles", capsys)
     write_reference(small_run, {"other": [(0.0, -1.0)]})
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "none of the 3", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "none of the 3", capsys)
     write_reference(small_run, SMALL_RUN_DISCS)
-    assert_refused([*tune, "--threshold", "2"], small_run, "threshold is 2", capsys)
+    assert_refused([*tune, "--vary", "threshold=2"], small_run, "threshold is 2", capsys)
     assert not (tmp_path / "t").exists()
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "curve.png").write_bytes(b"mine")
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "--force", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "--force", capsys)
     with pytest.raises(SystemExit) as ended:
         main([*tune, "--treshold", "0.5"])
     assert ended.value.code == 2
