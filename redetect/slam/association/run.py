@@ -30,7 +30,6 @@ from redetect.plane import compose, rotation
 from redetect.slam.association.frame_to_frame import (
     LocalAssociation,
     associate_locally,
-    tilt_jacobian,
 )
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -54,7 +53,7 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.association.placing import ANYWHERE, lay_together
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import (
     LandmarkMap,
     Path2D,
@@ -37,7 +37,7 @@ from redetect.slam.commands.files import (
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.frames import Associator, FilterRun, run_filter
-from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.filters.localizer import Localizer
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
@@ -109,15 +109,12 @@ def perform(command: Localize | Ekf) -> int:
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
-    landmark_map = read_map(command.map)
-    map_errors = _map_errors(command)
-    said = []
-    if map_errors == "considered":
+    landmark_map, said = read_map(command.map), []
+    if command.association == "known":
         landmark_map = with_joint_covariance(landmark_map, command.map)
         if landmark_map.joint_covariance is None:
             name = covariance_file(command.map).name
             said.append(f"errors of the map taken as independent: no {name}")
-    jointly = ", jointly" if landmark_map.joint_covariance is not None else ""
     began = time.perf_counter()
     run = localized_run_of(command, recording, landmark_map)
     return _Result(
@@ -125,7 +122,7 @@ def _localized(command: Localize, recording: Recording) -> _Result:
         landmark_map,
         f"{command.run} in {command.map}",
         f"{command.run.name}: localised",
-        {"map_errors": map_errors + jointly},
+        {},
         [*said, _time_line(began, len(recording))],
     )
 
@@ -146,7 +143,9 @@ def localized_run_of(
         start,
         covariance,
         camera_xy_of(recording, command.run, command.camera),
-        map_errors=_map_errors(command),
+        # Considering the map's errors makes the filter slow to pull itself back onto it, which
+        # costs little as long as the pairs are right, and the track if they are to be found.
+        exact=command.association != "known",
     )
     associator = Associator(command.association, command.gate_probability)
     run = run_filter(recording, localizer, associator)
@@ -178,18 +177,9 @@ def _woken_up(
     return woken.pose, woken.covariance
 
 
-def _map_errors(command: Localize) -> MapErrors:
-    """How the map's errors are treated, where that is not said."""
-    if command.map_errors != "auto":
-        return command.map_errors
-    # Considering them makes the filter slow to pull itself back onto the map, which costs little
-    # as long as the pairs are right, and the track if they are to be found.
-    return "considered" if command.association == "known" else "ignored"
-
-
 def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = camera_xy_of(recording, command.run, command.camera)
-    ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
+    ekf = EkfSlam(command.start, camera_xy=camera_xy)
     associator = Associator(command.association, command.gate_probability)
     began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
@@ -203,13 +193,9 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
         )
     figures: dict[str, Any] = {"landmarks": {"discs": discs, "lines": lines}}
     said = [f"landmarks         {discs} discs, {lines} lines"]
-    if command.reference_map:
-        off = map_distance(landmark_map, read_map(command.reference_map))
-        figures["distance_from_reference_map"] = off
-        said.append(
-            "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
-            "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
-        )
+    waiting = len(ekf.line_slots) - lines
+    if waiting:
+        said.append(f"                  {waiting} lines more, seen under too little parallax")
     return _Result(
         run,
         landmark_map,
@@ -243,29 +229,6 @@ def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
             ("max", np.max(distance)),
             ("last", distance[-1]),
         )
-    }
-
-
-def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
-    """How far landmarks are from those of another map with the same identifiers."""
-    offsets, covariances = [], []
-    for some, others in (
-        (landmark_map.discs, reference.discs),
-        (landmark_map.lines, reference.lines),
-    ):
-        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
-        offsets.append(some.xy[own] - others.xy[other])
-        covariances.append(some.covariance[own])
-    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
-    if not len(offset):
-        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
-    distance = np.hypot(*offset.T)
-    return {
-        "landmarks": float(len(distance)),
-        "rms_m": math.sqrt(float(np.mean(distance**2))),
-        "median_m": float(np.median(distance)),
-        "max_m": float(np.max(distance)),
-        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
     }
 
 
