@@ -20,10 +20,8 @@ from redetect.least_squares.solver import LossKind
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import (
-    FEWEST_SHARED,
     Estimate,
     Graph,
-    check_connected,
     first_sight,
     graph_of_recording,
     with_lines,
@@ -112,6 +110,8 @@ def as_json(table: ChiSquared) -> dict[str, float | int | None]:
 
 Solver = Literal["separable", "gtsam"]
 
+# Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
+_FEWEST_SHARED = 2
 # Near enough to the minimum for the final optimisation.
 _COARSE = 1e-3
 # Multiples of the scale of a loss that is not convex, from nearly least squares down.
@@ -224,7 +224,7 @@ def map_run(
     begin = first_sight(graph, start)
     plain = Weighting()
     if len(recording.lost):
-        begin = _with_parts_in_place(recording, graph, begin)
+        begin = _with_parts_in_place(recording, graph, begin, name)
     descend = _descent(solver, wanted.loss)
     trail: list[Solution] = []
 
@@ -268,11 +268,14 @@ def map_run(
     )
 
 
-def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) -> Estimate:
+def _with_parts_in_place(
+    recording: Recording, graph: Graph, begin: Estimate, name: str
+) -> Estimate:
     """A start at which parts between which odometry is lost lie on each other, by their discs.
 
     Each part is mapped by itself. The first stays; next is always the part that has most discs in
-    common with those that lie.
+    common with those that lie. Verticals may join a part, too, which then begins where odometry has
+    it. `SlamError` where a part shares fewer than two landmarks with the others.
     """
     lost, discs = recording.lost, len(graph.disc_ids)
     part = np.searchsorted(lost, graph.disc_pose - 1, side="right")
@@ -282,19 +285,32 @@ def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) ->
     found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).estimate
     places = np.full((len(lost) + 1, discs, 2), np.nan)
     places[own // discs, own % discs] = found.disc_xy
-    poses, xy = found.poses, places[0]
+    lines: list[set[int]] = [set() for _ in places]
+    of_rows = np.searchsorted(lost, recording.lines.frame, side="right")
+    for k, ids in zip(of_rows, recording.lines.ids):
+        lines[k].update(ids)
+    poses, xy, known = found.poses, places[0], lines[0]
     waiting = set(range(1, len(places)))
     while waiting:
         shared = {k: np.isfinite(xy + places[k])[:, 0] for k in waiting}
-        k = max(waiting, key=lambda k: np.count_nonzero(shared[k]))
-        if np.count_nonzero(shared[k]) < FEWEST_SHARED:  # it is verticals that join it
-            break
+        counts = {k: np.array([shared[k].sum(), len(known & lines[k])]) for k in waiting}
+        k = max(waiting, key=lambda k: (counts[k][0] >= _FEWEST_SHARED, *counts[k]))
+        if counts[k].sum() < _FEWEST_SHARED:
+            first = min(waiting)
+            step = int(lost[first - 1])
+            raise SlamError(
+                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its "
+                f"odometry is lost, and the parts before and after share {counts[first].sum()} "
+                f"landmarks: expected at least {_FEWEST_SHARED}"
+            )
         waiting.remove(k)
-        motion = fitted(places[k, shared[k]], xy[shared[k]])
-        here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
-        poses[here, :2] = apply(motion, poses[here, :2])
-        poses[here, 2] += motion[2]
-        xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
+        known = known | lines[k]
+        if counts[k][0] >= _FEWEST_SHARED:
+            motion = fitted(places[k, shared[k]], xy[shared[k]])
+            here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
+            poses[here, :2] = apply(motion, poses[here, :2])
+            poses[here, 2] += motion[2]
+            xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
     return replace(begin, poses=poses, disc_xy=np.where(np.isfinite(xy), xy, begin.disc_xy))
 
 
@@ -364,7 +380,6 @@ def _check_usable(
                 f"{name}: bearings do not say how the camera is mounted: expected discs alone"
             )
         check_rows_fit_camera(camera, recording.circles.xy)
-    check_connected(recording, name)
 
 
 def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:
