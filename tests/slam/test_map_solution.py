@@ -177,8 +177,8 @@ def test_lines_without_parallax_and_lines_always_joined_are_left_out() -> None:
     kept = [k for k, (i,) in enumerate(lines.ids) if i != 1] + seen_one
     kept.sort()
     ids = tuple((2, 3) if lines.ids[k][0] in (2, 3) else lines.ids[k] for k in kept)
-    rows = LineRows(lines.frame[kept], lines.bearing_rad[kept], lines.sigma_rad[kept], ids)
-    placed = place_lines(run.poses, rows, CAMERA_XY, least_parallax_rad=np.radians(12.0))
+    rows = LineRows(lines.frame[kept], lines.bearing_rad[kept], np.full(len(kept), 0.03), ids)
+    placed = place_lines(run.poses, rows, CAMERA_XY)
     assert placed.unplaced.tolist() == [1, 2, 3]
     np.testing.assert_allclose(placed.xy, run.line_xy[placed.ids - 1], atol=1e-9)
 
