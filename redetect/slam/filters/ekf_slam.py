@@ -21,6 +21,7 @@ from itertools import count
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 from scipy.linalg.blas import dgemm
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -128,12 +129,9 @@ class EkfSlam(Filter):
             [np.tile(np.eye(2), (len(points), 1, 1)), -line_xy[..., None]], 2
         )
         by_lines = by_points @ by_numbers / points[:, 2, None, None]
-        d, e = of_discs.size, len(of_lines)
-        jacobian = np.zeros((d + 2 * e, d + 4 * e))
-        jacobian[:d, :d] = np.eye(d)
-        jacobian[d:, d:].reshape(e, 2, e, 4)[np.arange(e), :, np.arange(e)] = by_lines
+        jacobian = block_diag(np.eye(of_discs.size), *by_lines)
         joint = jacobian @ self.block(np.append(of_discs.ravel(), of_lines.ravel())) @ jacobian.T
-        every = np.arange(len(of_discs) + e)
+        every = np.arange(len(of_discs) + len(of_lines))
         xy = np.concatenate([self._state[of_discs], line_xy])
         own = joint.reshape(len(every), 2, len(every), 2)[every, :, every]
 

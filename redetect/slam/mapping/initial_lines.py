@@ -49,9 +49,11 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
     xy = np.full((len(every), 2), np.nan)
     for some in (near, np.ones(len(seen), dtype=bool)):
         use = some & np.isnan(xy[label, 0])
+        own, bearing, sigma = seen[use], rows.bearing_rad, rows.sigma_rad
         found, ahead, miss = meeting_points(
-            *(poses[pose[use]], rows.bearing_rad[seen[use]], rows.sigma_rad[seen[use]]),
-            *(label[use], len(every), camera_xy, MOST_SIGMA_M**-2),
+            *(poses[pose[use]], bearing[own], sigma[own], label[use], len(every)),
+            camera_xy,
+            MOST_SIGMA_M**-2,
         )
         agrees = (ahead > 0.0) & (miss <= MOST_MISS)
         count, right = (np.bincount(label[use], w, len(every)) for w in (None, agrees))

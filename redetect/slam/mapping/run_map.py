@@ -16,7 +16,7 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from redetect.least_squares.solver import LossKind
+from redetect.least_squares.solver import LossKind, Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import (
@@ -28,7 +28,7 @@ from redetect.slam.mapping.graph import (
 )
 from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.solve import Marginals, Solution, joint_covariance, marginals, solve
+from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -226,11 +226,11 @@ def map_run(
     if len(recording.lost):
         begin = _with_parts_in_place(recording, graph, begin, name)
     descend = _descent(solver, wanted.loss)
-    trail: list[Solution] = []
+    trail: list[Minimum[Estimate]] = []
 
-    def keep(solution: Solution) -> Estimate:
+    def keep(solution: Minimum[Estimate]) -> Estimate:
         trail.append(solution)
-        return solution.estimate
+        return solution.at
 
     more = len(recording.lines) > 0
     only_start = more or wanted != plain or solver != "separable"
@@ -249,7 +249,7 @@ def map_run(
         for weighting in _on_the_way(fixed):
             estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
-    as_calibrated = trail[-1].cost
+    as_calibrated = trail[-1].costs[-1]
     if wanted.calibrate:
         estimate = keep(descend(graph, estimate, wanted))
     covariance = marginals(graph, estimate, wanted)
@@ -262,9 +262,9 @@ def map_run(
         covariance=covariance,
         table=chi_squared(graph, estimate, wanted, len(recording.lost)),
         left_out=_left_out(recording, graph, placed),
-        cost=trail[-1].cost,
+        cost=trail[-1].costs[-1],
         steps=sum(len(solution.costs) - 1 for solution in trail),
-        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].cost),
+        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].costs[-1]),
     )
 
 
@@ -282,7 +282,7 @@ def _with_parts_in_place(
     own, index = np.unique(part * discs + graph.disc_index, return_inverse=True)
     alone = replace(graph, disc_ids=own, disc_index=index)
     begun = first_sight(alone, begin.poses[0])
-    found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).estimate
+    found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).at
     places = np.full((len(lost) + 1, discs, 2), np.nan)
     places[own // discs, own % discs] = found.disc_xy
     lines: list[set[int]] = [set() for _ in places]
@@ -319,7 +319,7 @@ def _with_lines(
     recording: Recording,
     estimate: Estimate,
     placed: InitialLines,
-    keep: Callable[[Solution], Estimate],
+    keep: Callable[[Minimum[Estimate]], Estimate],
 ) -> tuple[Graph, Estimate]:
     """The problem with the lines that stay well placed while all is fitted together."""
     ids, xy = placed.ids, placed.xy
@@ -349,7 +349,9 @@ def _on_the_way(wanted: Weighting) -> list[Weighting]:
     return [Weighting(), *wider]
 
 
-def _descent(solver: Solver, loss: LossKind) -> Callable[[Graph, Estimate, Weighting], Solution]:
+def _descent(
+    solver: Solver, loss: LossKind
+) -> Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]:
     if solver == "gtsam":
         return solve_gtsam
     # A robust loss converges slowly at last: reweighting is no Newton's method.
