@@ -133,6 +133,7 @@ class Ekf(FilterFlags):
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
     """
 
+    reference_map: MaybePath = None  # A map.csv to measure the distance of the landmarks from.
     # Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
 

@@ -122,8 +122,8 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
     ids = ids_of(swaying)
     blind = associate_locally(swaying, AssociateSettings(sigma_scale=1.0))
     told = associate_locally(swaying, AssociateSettings(sigma_scale=1.0, tilt_sigma_deg=0.7))
-    assert score_association(blind.circle_labels, ids).pair_recall < 0.9
-    score = score_association(told.circle_labels, ids)
+    assert score_association(blind[0], ids).pair_recall < 0.9
+    score = score_association(told[0], ids)
     assert score.pair_recall > 0.95
     assert score.pair_precision > 0.98
 
@@ -132,11 +132,13 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
 def test_well_separated_landmarks_are_followed_without_a_mistake(method: Method) -> None:
     path = circuit(0.9)
     recording = drive(path, scattered(1, 60, 0.6), scattered(2, 25, 1.0), seed=3)
-    found = associate_locally(recording, AssociateSettings(method=method), camera_xy=CAMERA_XY)
-    discs = score_association(found.circle_labels, ids_of(recording))
+    of_discs, of_lines = associate_locally(
+        recording, AssociateSettings(method=method), camera_xy=CAMERA_XY
+    )
+    discs = score_association(of_discs, ids_of(recording))
     assert (discs.pair_precision, discs.wrong_merges) == (1.0, 0)
     assert discs.pair_recall > 0.98
-    lines = score_association(found.line_labels, list(recording.lines.ids))
+    lines = score_association(of_lines, list(recording.lines.ids))
     assert lines.pair_precision > (0.99 if method == "joint" else 0.95)
     assert lines.pair_recall > 0.8
 

@@ -9,9 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.landmarks.map_file import Path2D, read_map, read_path
+from redetect.landmarks.map_file import (
+    LandmarkMap,
+    Landmarks,
+    Path2D,
+    no_landmarks,
+    read_map,
+    read_path,
+)
 from redetect.slam.cli import main
-from redetect.slam.commands.filters import path_distance
+from redetect.slam.commands.filters import map_distance, path_distance
+from redetect.slam.errors import SlamError
 
 STEP = "STEP a.{k} 0.0 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
 DISC = "LANDMARK_C {x} -2 0.9 0.002 0.0001 0.003 {id}\n"
@@ -104,17 +112,39 @@ def test_distances_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str
     file = tiny(tmp_path / "a.circles")
     assert main(["ekf", str(file), "-o", str(tmp_path / "one")]) == 0
     reference = ["--reference", str(tmp_path / "one/path.csv")]
+    reference += ["--reference-map", str(tmp_path / "one/map.csv")]
     assert main(["ekf", str(file), "-o", str(tmp_path / "two"), *reference]) == 0
     printed = capsys.readouterr().out
     assert "position rms 0.000 m" in printed
+    assert "landmarks rms 0.000 m" in printed
+    content = json.loads((tmp_path / "two/ekf.json").read_text())
+    assert content["distance_from_reference_map"]["landmarks"] == 2
 
 
-def test_distance_of_paths() -> None:
+def test_distance_of_paths_and_maps() -> None:
     path = Path2D(("start", "a"), np.array([[0.0, 0, 0], [3.0, 4.0, 3.1]]))
     distance = path_distance(path, np.array([[0.0, 0, 0], [0.0, 0.0, -3.1]]))
     assert distance["position_max_m"] == distance["position_last_m"] == 5.0
     assert distance["position_rms_m"] == pytest.approx(np.sqrt(12.5))
     assert distance["heading_last_rad"] == pytest.approx(2 * np.pi - 6.2)
+
+    def discs(ids: list[int], xy: list[list[float]]) -> LandmarkMap:
+        covariance = np.tile(0.25 * np.eye(2), (len(ids), 1, 1))
+        some = Landmarks(np.array(ids), np.array(xy), covariance, np.ones(len(ids), dtype=np.int64))
+        return LandmarkMap(some, no_landmarks())
+
+    found = map_distance(
+        discs([3, 1], [[0.0, 1], [5, 5]]), discs([1, 2, 3], [[5.0, 5], [9, 9], [0, 0]])
+    )
+    assert found == {
+        "landmarks": 2.0,
+        "rms_m": pytest.approx(np.sqrt(0.5)),
+        "median_m": 0.5,
+        "max_m": 1.0,
+        "normalised": pytest.approx(1.0),
+    }
+    with pytest.raises(SlamError, match="no landmark is in both"):
+        map_distance(discs([1], [[0.0, 0]]), discs([2], [[0.0, 0]]))
 
 
 @pytest.mark.parametrize(

@@ -92,8 +92,9 @@ def dense(
         pose = move(pose, recording.steps[k])
         F = np.eye(size)
         F[:3, :3] = by_pose
-        F[0, 2], F[1, 2] = predicted[1] - pose[1], pose[0] - predicted[0]
-        predicted = pose
+        if np.any(P[3:, 3:]):
+            F[0, 2], F[1, 2] = predicted[1] - pose[1], pose[0] - predicted[0]
+            predicted = pose
         P = F @ P @ F.T
         P[:3, :3] += by_step @ recording.step_covariance[k] @ by_step.T
         H, v, R = [], [], []

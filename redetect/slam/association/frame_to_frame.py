@@ -9,7 +9,7 @@ evaluated at first estimates, so that it cancels.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,23 +28,18 @@ _FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
 _MOST_LANDMARKS = 40
 
 
-@dataclass(frozen=True, eq=False)
-class LocalAssociation:
-    """Result of the association from frame to frame."""
-
-    # (n,): the landmark of each row, numbered from 0 in order of first sight.
-    circle_labels: IntArray
-    line_labels: IntArray
-
-
 def associate_locally(
     recording: Recording,
     settings: AssociateSettings | None = None,
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
-) -> LocalAssociation:
-    """Label the rows of a run, frame by frame, ignoring IDs in the file."""
+) -> tuple[IntArray, IntArray]:
+    """Label the rows of a run, frame by frame, ignoring IDs in the file.
+
+    Returns the landmark of each row of a disc (n,) and of a line (m,), both numbered from 0 in the
+    order of first sight.
+    """
     setting = settings or AssociateSettings()
     circles = recording.circles
     scaled = replace(circles, covariance=setting.sigma_scale**2 * circles.covariance)
@@ -73,9 +68,7 @@ def associate_locally(
             ekf.measure(none._replace(lines=replace(rows.lines, ids=ids)))
         if progress:
             progress(frame + 1)
-    return LocalAssociation(
-        np.array(disc_labels, dtype=np.int64), np.array(line_labels, dtype=np.int64)
-    )
+    return np.array(disc_labels, dtype=np.int64), np.array(line_labels, dtype=np.int64)
 
 
 def _labels(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect import slam
 from redetect.array_types import FloatArray
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import (
     LandmarkMap,
     Path2D,
@@ -47,15 +47,8 @@ from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 ERROR_PICTURE = "errors.png"
 
 
-class _Result(NamedTuple):
-    """What a filter found."""
-
-    run: FilterRun
-    landmark_map: LandmarkMap
-    source: str  # of the path, for its head
-    title: str  # of the pictures
-    figures: dict[str, Any]  # of its own, for the JSON file
-    said: list[str]  # of its own, for the terminal
+#: What a filter found: the run, the map, and what else is said of it.
+_Result = tuple[FilterRun, LandmarkMap, list[str]]
 
 
 def perform(command: Localize | Ekf) -> int:
@@ -69,11 +62,15 @@ def perform(command: Localize | Ekf) -> int:
         names += [MAP_NAME, covariance_file(Path(MAP_NAME)).name]
     demand_free([output / name for name in names], overwrite=command.force)
     recording = recording_of(command)
+    began = time.perf_counter()
     if isinstance(command, Localize):
-        result = _localized(command, recording)
+        run, landmark_map, said = _localized(command, recording)
+        source, title = f"{command.run} in {command.map}", "localised"
     else:
-        result = _mapped(command, recording)
-    run = result.run
+        run, landmark_map, said = _mapped(command, recording)
+        source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
+    seconds = time.perf_counter() - began
+    said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference, distance = None, None
     if command.reference:
         reference = read_path(command.reference)
@@ -85,46 +82,47 @@ def perform(command: Localize | Ekf) -> int:
         distance = path_distance(run.path, reference.poses)
 
     output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam {name} {slam.__version__}: {result.source}"]
+    head = [f"slam {name} {slam.__version__}: {source}"]
     write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
-    content = {
+    content: dict[str, Any] = {
         "version": slam.__version__,
         "settings": flags_of(command),
         "figures": _figures(run, distance),
-        **result.figures,
     }
+    if isinstance(command, Ekf):
+        counts = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
+        content["landmarks"] = counts
+        if command.reference_map:
+            off = map_distance(landmark_map, read_map(command.reference_map))
+            content["distance_from_reference_map"] = off
+            said.append(
+                "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
+                "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
+            )
     write_json(output / f"{name}.json", content, overwrite=command.force)
-    print("\n".join([*_table(run, distance), *result.said]))
+    print("\n".join([*_table(run, distance), *said]))
     drawing: dict[str, Any] = {
-        "title": result.title,
+        "title": f"{command.run.name}: {title}",
         "overwrite": command.force,
         "interactive": command.interactive,
     }
-    draw_map(output / MAP_PICTURE, result.landmark_map, run.path, reference=reference, **drawing)
+    draw_map(output / MAP_PICTURE, landmark_map, run.path, reference=reference, **drawing)
     if reference is not None:
         draw_errors(output / ERROR_PICTURE, run.path, reference.poses, **drawing)
     if isinstance(command, Ekf):
-        write_map(output / MAP_NAME, result.landmark_map, head, overwrite=command.force)
+        write_map(output / MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
-    landmark_map, said = read_map(command.map), []
+    landmark_map = read_map(command.map)
+    said: list[str] = []
     if command.association == "known":
         landmark_map = with_joint_covariance(landmark_map, command.map)
         if landmark_map.joint_covariance is None:
             name = covariance_file(command.map).name
             said.append(f"errors of the map taken as independent: no {name}")
-    began = time.perf_counter()
-    run = localized_run_of(command, recording, landmark_map)
-    return _Result(
-        run,
-        landmark_map,
-        f"{command.run} in {command.map}",
-        f"{command.run.name}: localised",
-        {},
-        [*said, _time_line(began, len(recording))],
-    )
+    return localized_run_of(command, recording, landmark_map), landmark_map, said
 
 
 def localized_run_of(
@@ -181,9 +179,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = camera_xy_of(recording, command.run, command.camera)
     ekf = EkfSlam(command.start, camera_xy=camera_xy)
     associator = Associator(command.association, command.gate_probability)
-    began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
-    time_line = _time_line(began, len(recording))
     landmark_map = ekf.landmark_map()
     discs, lines = len(landmark_map.discs), len(landmark_map.lines)
     if not discs and not lines:
@@ -191,24 +187,11 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
             f"{command.run}: no landmark in the map: expected rows with identifiers, or "
             "--association joint"
         )
-    figures: dict[str, Any] = {"landmarks": {"discs": discs, "lines": lines}}
     said = [f"landmarks         {discs} discs, {lines} lines"]
     waiting = len(ekf.line_slots) - lines
     if waiting:
         said.append(f"                  {waiting} lines more, seen under too little parallax")
-    return _Result(
-        run,
-        landmark_map,
-        str(command.run),
-        f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end",
-        figures,
-        [*said, time_line],
-    )
-
-
-def _time_line(began: float, steps: int) -> str:
-    seconds = time.perf_counter() - began
-    return f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s"
+    return run, landmark_map, said
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
@@ -229,6 +212,29 @@ def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
             ("max", np.max(distance)),
             ("last", distance[-1]),
         )
+    }
+
+
+def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
+    """How far landmarks are from those of another map with the same identifiers."""
+    offsets, covariances = [], []
+    for some, others in (
+        (landmark_map.discs, reference.discs),
+        (landmark_map.lines, reference.lines),
+    ):
+        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
+        offsets.append(some.xy[own] - others.xy[other])
+        covariances.append(some.covariance[own])
+    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
+    if not len(offset):
+        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
+    distance = np.hypot(*offset.T)
+    return {
+        "landmarks": float(len(distance)),
+        "rms_m": math.sqrt(float(np.mean(distance**2))),
+        "median_m": float(np.median(distance)),
+        "max_m": float(np.max(distance)),
+        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
     }
 
 

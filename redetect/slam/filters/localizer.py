@@ -55,7 +55,9 @@ class Localizer(Filter):
         self._grow(len(places))
         self.size = len(self._state)
         self._state[POSE_SIZE:] = self._linearised[POSE_SIZE:] = places
-        if len(places) and not exact:
+        if exact:  # it is known how such a map is turned: derivatives are those at the latest pose
+            self._linearised = self._state
+        elif len(places):
             joint = landmark_map.joint_covariance
             if joint is None:
                 joint = block_diag(*discs.covariance, *lines.covariance)
