@@ -223,7 +223,9 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
     for k, numbers in enumerate(ids):
         if len(numbers) == 1:
             first.setdefault(numbers[0], k)
-    return np.isin(np.arange(len(ids)), list(first.values()))
+    chosen = np.zeros(len(ids), dtype=np.bool_)
+    chosen[list(first.values())] = True
+    return chosen
 
 
 def _numbers_of(slots: dict[int, int], size: int) -> IntArray:

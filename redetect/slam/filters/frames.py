@@ -208,7 +208,9 @@ class Filter(ABC):
         numbers = np.concatenate([_POSE, of_discs.ravel(), of_lines.ravel()])
         jacobian = np.zeros((2 * d + e, len(numbers)))
         seen = disc_in_robot(pose, self._state[of_discs])
-        jacobian[: 2 * d, 3 : 3 + 2 * d] = np.kron(np.eye(d), turn.T)
+        by_disc = np.zeros((d, 2, d, 2))
+        by_disc[np.arange(d), :, np.arange(d)] = turn.T
+        jacobian[: 2 * d, 3 : 3 + 2 * d] = by_disc.reshape(2 * d, 2 * d)
         jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
         sway = np.zeros((len(jacobian), 2))
         if self.tilt_sigma_rad:
