@@ -246,7 +246,7 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
 def _extent(
     drawn: list[tuple[LandmarkMap, Path2D]], reference: Path2D | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners of the picture (m): all paths and discs, and room for verticals near them."""
+    """Corners of the picture (m): all paths and discs, and a margin for verticals near them."""
     points = [xy for some, path in drawn for xy in (path.poses[:, :2], some.discs.xy)]
     if reference is not None:
         points.append(reference.poses[:, :2])

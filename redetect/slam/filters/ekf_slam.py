@@ -47,7 +47,8 @@ LARGEST_RANGE_SIGMA = 0.05
 # within two of these (1/m).
 _INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
 
-# Bearings are linearised anew at what they say, up to so many times, until that hardly changes.
+# Most iterations of an update with bearings, below which change it ends, and the largest change of
+# an inverse distance in one of them (1/m).
 _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
 _POSE = np.arange(POSE_SIZE)
