@@ -23,7 +23,7 @@ from detect.errors import DetectError
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, wrap_angle
-from redetect.storage.bounded import read_text
+from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
@@ -39,7 +39,6 @@ _INDEFINITE, _ROUNDING = 1e-8, 1e-12
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
-_LARGEST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +142,7 @@ class PosesOverTime:
 
 def tum_poses(path: Path) -> Generator[TimedPose, None, None]:
     """The poses of a TUM trajectory."""
-    for place, row in _number_rows(path, "TUM trajectory", "t x y z qx qy qz qw"):
+    for place, row in rows_of_numbers(path, "TUM trajectory", "t x y z qx qy qz qw", DetectError):
         time_s, x, y, _, *quaternion = row
         if max(abs(x), abs(y)) > FARTHEST:
             raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
@@ -158,7 +157,8 @@ def tick_poses(
     """The poses of a robot with two driven wheels by its counters; arcs from row to row."""
     x = y = theta = 0.0
     last: tuple[float, float] | None = None
-    for place, (time_s, left, right) in _number_rows(path, "file of wheel ticks", "t left right"):
+    rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
+    for place, (time_s, left, right) in rows:
         if last is not None:
             ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
             way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
@@ -170,28 +170,6 @@ def tick_poses(
             theta += 2.0 * half_turn
         last = (left, right)
         yield TimedPose(time_s, x, y, theta)
-
-
-def _number_rows(path: Path, what: str, columns: str) -> Iterator[tuple[str, list[float]]]:
-    """The place and the finite numbers of each row of a file of some columns.
-
-    Between them are blanks or commas; ``#`` begins a comment.
-    """
-    count = len(columns.split())
-    lines = read_text(path, _LARGEST_BYTES, what, DetectError).split("\n")
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise DetectError(
-                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
-            )
-        yield f"{path}:{number}", values
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
