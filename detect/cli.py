@@ -32,7 +32,6 @@ from detect.viewing_options import (
     Draw,
     Explain,
     Export,
-    Grid,
     Report,
     RowFiles,
     Tune,
@@ -47,14 +46,13 @@ EXPERT: dict[type, frozenset[str]] = {
     SourceOptions: all_but(SourceOptions, "odometry", "times", "frames"),
     DiscIdOptions: all_but(DiscIdOptions, "ids_from"),
     CircleSettings: all_but(
-        CircleSettings, "radius_m", "polarity", "threshold", "evidence", "blur_px",
+        CircleSettings, "radius_m", "polarity", "evidence",
         "calibration_px", "tilt_sigma_deg",
     ),
     LineSettings: all_but(LineSettings, "threshold", "join_px"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
     RowFiles: all_but(RowFiles, "rows", "reference"),
     CompareOptions: all_but(CompareOptions, "only_identified"),
-    Grid: all_but(Grid, "threshold", "evidence", "noise_floor", "blur_px", "radius_m"),
 }  # fmt: skip
 
 Detectors = Circles | Lines | Markers | All

@@ -29,6 +29,26 @@ DetectorPreset = Literal["default", "published", "report"]
 LineEnds = Literal["lf", "crlf"]
 
 
+@dataclass(frozen=True)
+class SourceOptions:
+    """Options of a source besides its name."""
+
+    #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
+    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
+    #: rows of image files, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    odometry: str = ""
+    wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
+    metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
+    #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
+    times: str = ""
+    image_topic: str = ""  #: The images of a bag, if there are several topics of them.
+    #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
+    frames: Annotated[int, whole(0)] = 0
+
+    def __post_init__(self) -> None:
+        demand_fields(self, DetectError)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
     """Options of all commands that process the frames of a run."""
@@ -38,47 +58,7 @@ class RunFlags:
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None  #: The file to write.
     camera: MaybePath = None  #: Calibration, if it is not the one in the run folder.
     force: bool = False  #: Replace existing files.
-
-
-@dataclass(frozen=True, kw_only=True)
-class PickedFrames:
-    """Selects the frames of a run."""
-
-    every: int = 1  #: Only every n-th frame.
-    images: tuple[str, ...] = ()  #: Only the frames of these images, by their names.
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """Options of a source besides its name."""
-
-    #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
-    #: rows, a nav_msgs/Odometry topic of the bag (/odom), or none.
-    odometry: str = ""
-    wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
-    metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
-    #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
-    times: str = ""
-    image_topic: str = ""  #: The images of a bag, if there are several topics of them.
-    #: The frame of the robot's base, on the floor, in a bag that holds the calibration itself
-    #: (camera_info and tf_static); by default base_footprint.
-    base_frame: str = ""
-    #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
-    frames: Annotated[int, whole(0)] = 0
-    #: Significant bits of 16-bit images, 8 to 16; 0: the fewest of 8, 10, 12, 14 or 16 that hold
-    #: the values of the first images.
-    bits: int = 0
-
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
-        if self.bits and not 8 <= self.bits <= 16:
-            raise DetectError(f"bits is {self.bits}: expected 8 to 16, or 0")
-
-    @property
-    def plain(self) -> bool:
-        """Whether nothing is said of steps and times."""
-        return not (self.odometry or self.times or self.image_topic or self.base_frame)
+    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +70,7 @@ class DetectorFlags(RunFlags):
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, in the bag, or named by --camera.
+        camera:0. With a .cam beside it, or named by --camera.
     output : Path
         The file to write; by default detected.circles, .lines or .markers in the run folder, or
         named after the video or bag and beside it.
@@ -106,7 +86,6 @@ class DetectorFlags(RunFlags):
     jobs: MaybeInt = None
     #: Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
     cluster: MaybeStr = None
-    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
     #: Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
     strict: bool = False
     #: Take over the frames that an unfinished run of the same command kept, and go on after them.
@@ -122,12 +101,7 @@ class DiscIdOptions:
     #: A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
     #: fall on,
     ids_from_map: MaybePath = None
-    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`),
-    #: with this standard deviation of map and path added to the covariances, metres.
-    id_slack_m: NotNegative = 0.1
-
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
+    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +124,8 @@ class Circles(DetectorFlags):
     #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    draw: MaybePath = None  #: Folder for images with the outlines and qualities drawn in.
+    #: Folder for images with the outlines and qualities drawn in, once all is detected.
+    draw: MaybePath = None
     #: Write the rows with their pixels and evidence as JSON as well; -: to standard output, alone.
     json: MaybePath = None
     parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
@@ -177,9 +152,11 @@ class Lines(DetectorFlags):
     ids_from: MaybePath = None
     #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
     join_threshold: MaybeFloat = None
-    #: Folder for images with the lines and their standard deviations drawn in.
+    #: Folder for images with the lines and their standard deviations drawn in, once all is
+    #: detected.
     draw: MaybePath = None
-    rejected: bool = False  #: Draw all tracks instead, the rejected ones with the reason.
+    #: Draw all tracks instead, the rejected ones with the reason; detects once more.
+    rejected: bool = False
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
@@ -190,17 +167,12 @@ class Markers(DetectorFlags):
     Example: detect markers images/m/a --dictionary rawseeds, or:
     detect markers camera:0 --frames 100
 
-    Parameters
-    ----------
-    run : Path
-        Run folder of the data set's layout; a folder of images, or a pattern in quotes
-        ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera, the lens's distortion is taken off;
-        without one, edges are taken to be straight in the images.
+    Without a calibration, edges are taken to be straight in the images.
     """
 
-    #: Folder for images with the markers drawn in, and with what was rejected.
+    #: Folder for images with the markers drawn in, once all are detected.
     draw: MaybePath = None
+    rejected: bool = False  #: Draw what was rejected as well; detects once more.
     parameters: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 

@@ -117,6 +117,16 @@ class Sight:
         """(..., 2) pixels where positions (..., 2) of detected rows were seen."""
         return image_positions(self.camera, xy, self.detected_by)
 
+    def levelled_alike(self, reference_xy: FloatArray) -> FloatArray:
+        """(N, 2) reference positions levelled as the detected ones are; as they are where the
+        levelled ray does not meet the floor.
+        """
+        if self.reference_by == self.detected_by:
+            return reference_xy
+        xy = self.camera.floor_from_pixel(self.reference_px(reference_xy))
+        xy = xy if self.detected_by is None else level_seen(self.camera, xy, self.detected_by)
+        return np.where(np.isfinite(xy), xy, reference_xy)
+
     def gates(self, reference_xy: FloatArray) -> FloatArray:
         """(N, 2) half the width and height of discs' images, at least `LEAST_GATE_PX`, pixels."""
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))

@@ -5,22 +5,22 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from decimal import Decimal, InvalidOperation
 from itertools import chain, islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from detect import __version__
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
-from detect.drawing.inputs import select_frames
+from detect.drawing.inputs import every_nth
 from detect.errors import DetectError
-from detect.report.figures import draw_rates, f1_score, knee, pareto_front
+from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import CircleSettings
@@ -43,14 +43,14 @@ from redetect.storage import OutputExistsError, write_bytes
 def perform(options: Tune) -> int:
     """Carry the command out; returns the exit code."""
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
-    varied = {name: text for name, text in vars(options.grid).items() if text is not None}
+    varied = dict(map(_name_and_values, options.vary))
     grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
 
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
-    _, selection = select_frames(run.frames, options.images, options.every)
+    _, selection = every_nth(run.frames, options.every)
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 
@@ -76,9 +76,8 @@ def perform(options: Tune) -> int:
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     with progress_bar("trials", count) as advance:
-        tuned = tune_run(run, pairs, settings, options.matching, workers, advance)
-        trials = list(tuned)
-    records = trial_records(grid, trials)
+        trials = list(tune_run(run, pairs, settings, options.matching, workers, advance))
+    records = marked([{**c, **figures_of(found)} for c, (found, _) in zip(grid, trials)])
     head = {
         "version": __version__,
         "run": run.name,
@@ -86,14 +85,14 @@ def perform(options: Tune) -> int:
         "frames": [frame.step.prefix for frame, _ in pairs],
         "gate": asdict(options.matching),
         "camera": run.camera.content_hash,
-        "settings": {name: _plain(value) for name, value in asdict(base).items()},
+        "settings": asdict(base),
         "varied": varied,
     }
-    document = json.dumps({**head, "trials": records}, indent=1, allow_nan=False)
+    document = json.dumps({**head, "trials": records}, indent=1)
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     contents = {
         "table.json": f"{document}\n".encode(),
-        "curve.png": curve_picture(grid, trials, title),
+        "curve.png": curve_picture(records, varied, title),
     }
     output.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
@@ -106,16 +105,15 @@ def perform(options: Tune) -> int:
                 f"knee: {values}: recall {record['recall']:.3f}, "
                 f"precision {record['precision']:.3f}"
             )
-    failures = sorted({failure for trial in trials for failure in trial.failures})
+    failures = sorted({failure for _, failed in trials for failure in failed})
     return report_failures(len(failures), failures)
 
 
-def _plain(value: Any) -> Any:
-    """A setting for JSON: what it does not have (infinity, tuples) as words."""
-    plain = isinstance(value, bool | int | str) or (
-        isinstance(value, float) and math.isfinite(value)
-    )
-    return value if plain else str(value)
+def _name_and_values(word: str) -> tuple[str, str]:
+    name, equals, values = word.partition("=")
+    if not equals:
+        raise DetectError(f"{word!r}: expected NAME=VALUES, as evidence=-1:3:0.5")
+    return name.replace("-", "_"), values
 
 
 #: The value of each parameter that is varied.
@@ -150,7 +148,7 @@ def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
     """
     if not varied:
         raise DetectError(
-            "nothing is varied: expected a parameter with its values, as --threshold 0.3:0.7:0.1"
+            "nothing is varied: expected a parameter and values, as --vary evidence=-1:3:0.5"
         )
     values = {name: parameter_values(name, text) for name, text in varied.items()}
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
@@ -160,16 +158,6 @@ def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
 _MOST_NAMED = 12
 
 
-class Trial(NamedTuple):
-    """Figures of one setting, as in tables, and why frames could not be worked on.
-
-    Those count as frames without detections.
-    """
-
-    figures: dict[str, Any]
-    failures: tuple[str, ...] = ()
-
-
 def tune_run(
     run: Run,
     frames: Sequence[tuple[RunFrame, Frame]],
@@ -177,11 +165,12 @@ def tune_run(
     options: CompareOptions,
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
-) -> Iterator[Trial]:
-    """Detect discs in frames of a run with each setting; yields the trial of each.
+) -> Iterator[tuple[DiscComparison, list[str]]]:
+    """Detect discs in frames of a run with each setting, and compare them.
 
     `frames` come with their reference rows; `on_progress` is called after every frame of every
-    setting.
+    setting. Yields the comparison of each setting, and why frames could not be worked on: they
+    count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame, _ in frames]
@@ -197,58 +186,95 @@ def tune_run(
                 )
                 failures += [] if each.error is None else [each.error]
                 on_progress()
-            result = compare_frames([rows for _, rows in frames], found, options)
-            yield Trial(figures_of(result), tuple(failures))
+            yield compare_frames([rows for _, rows in frames], found, options), failures
 
 
 def figures_of(result: DiscComparison) -> dict[str, Any]:
     """What a table has of a comparison; `matched` are the reference rows that were found."""
-    recall, precision = result.recall, result.precision
-    return {
+    figures = {
         "reference": result.reference,
         "detected": result.detected,
         "matched": result.found,
-        "recall": recall,
-        "precision": precision,
-        "f1": None if recall is None or precision is None else float(f1_score(recall, precision)),
+        "recall": result.recall,
+        "precision": result.precision,
         "error_median_m": result.error_median_m,
         "normalised_error": result.normalised_error.per_dof,
     }
+    # Six significant digits, as in the files of rows.
+    return {
+        name: float(f"{value:.6g}") if isinstance(value, float) else value
+        for name, value in figures.items()
+    }
 
 
-def trial_records(
-    combinations: Sequence[Combination], trials: Sequence[Trial]
-) -> list[dict[str, Any]]:
-    """One record for each trial: the parameters, then the figures, front and knee."""
-    recall, precision = _rates(trials)
-    front, best = pareto_front(recall, precision), knee(recall, precision)
-    records = []
-    for k, (combination, trial) in enumerate(zip(combinations, trials)):
-        # Six significant digits, as in the files of rows.
-        figures = {
-            name: float(f"{value:.6g}") if isinstance(value, float) else value
-            for name, value in trial.figures.items()
-        }
-        records.append({**combination, **figures, "front": k in front, "knee": k == best})
-    return records
+def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The records of trials, with whether each is on the front, and the knee."""
+    rates = _rates(records)
+    front, best = pareto_front(*rates), knee(*rates)
+    return [{**each, "front": k in front, "knee": k == best} for k, each in enumerate(records)]
 
 
-def curve_picture(
-    combinations: Sequence[Combination], trials: Sequence[Trial], title: str
-) -> bytes:
+def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
+    """(M,) indices of settings that none beats in recall or precision without losing in the other.
+
+    By rising recall; of equals the first. Recalls and precisions (N,) are NaN where there are none.
+    """
+    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
+    known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
+    # By falling recall, then falling precision: points no better than before are dominated.
+    order = known[np.lexsort((known, -p[known], -r[known]))]
+    before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
+    return order[p[order] > before][::-1]
+
+
+def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
+    """The setting at the knee of the curve of precision over recall; None without any.
+
+    That is the point of the front farthest beyond the chord between the front's ends, both axes
+    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
+    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
+    harmonic mean of recall and precision is used instead.
+    """
+    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
+    front = pareto_front(r, p)
+    if not len(front):
+        return None
+    if len(front) > 2:
+        x = (r[front] - r[front[0]]) / (r[front[-1]] - r[front[0]])
+        y = (p[front] - p[front[-1]]) / (p[front[0]] - p[front[-1]])
+        beyond = x + y - 1.0
+        if beyond.max() > 1e-9:
+            return int(front[np.argmax(beyond)])
+    return int(front[np.argmax(r[front] * p[front] / np.maximum(r[front] + p[front], 1e-12))])
+
+
+def curve_picture(records: Sequence[dict[str, Any]], varied: Iterable[str], title: str) -> bytes:
     """Precision over recall as a PNG file: all trials, their front, and the knee."""
+    recall, precision = _rates(records)
+    names = [", ".join(f"{name} {each[name]}" for name in varied) for each in records]
+    front, best = pareto_front(recall, precision), knee(recall, precision)
     with figure_file((6.4, 6.2), "png") as (figure, content):
         axes = figure.subplots()
-        names = [", ".join(f"{name} {value}" for name, value in c.items()) for c in combinations]
-        draw_rates(axes, *_rates(trials), names, _MOST_NAMED)
+        axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
+        label = "none is better in both"
+        axes.plot(recall[front], precision[front], "--", color=DATA, lw=1.2, label=label)
+        if best is not None:
+            at = (recall[best], precision[best])
+            axes.plot(*at, "o", mfc="none", mec=MARK, mew=2.0, ms=12, label=f"knee: {names[best]}")
+        for k in front[:: max(1, -(-(len(front) - 1) // (_MOST_NAMED - 1)))]:
+            at = (recall[k], precision[k])
+            axes.annotate(
+                names[k], at, (-7, -9), textcoords="offset points", ha="right", fontsize=7
+            )
+        axes.set(xlabel="recall", ylabel="precision", title=title)
+        axes.grid(alpha=0.25, lw=0.6)
         axes.margins(0.15)
-        axes.set_title(title, fontsize=10)
         figure.legend(loc="outside lower center", fontsize=8, ncols=1)
     return content.getvalue()
 
 
-def _rates(trials: Sequence[Trial]) -> tuple[FloatArray, FloatArray]:
+def _rates(records: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """(N,) recall and precision, NaN where there is none."""
-    rates = [(trial.figures["recall"], trial.figures["precision"]) for trial in trials]
+    rates = [(each["recall"], each["precision"]) for each in records]
     recall, precision = np.array(rates, np.float64).reshape(-1, 2).T
     return recall, precision

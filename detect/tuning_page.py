@@ -3,7 +3,7 @@
 ``detect tune RUN --serve`` starts a server of the standard library for one person's browser on the
 same machine. It listens on the loopback alone, and answers only who knows the token in the page's
 address and asks for this machine by name: no other user, and no other page in the browser, gets
-anything. What is detected is what every other command would detect (`detect.discs.unfound`).
+anything. What is detected is what every other command would detect.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from detect.circles import detect_circles, disc_table
 from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
-from detect.levelling import with_common
+from detect.runs.frame import detect_batch
+from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import circle_on_floor, ellipses
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
@@ -80,12 +80,12 @@ class TuningSession:
     def detect(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """The discs of a frame under some settings, and the candidates that are none."""
         settings = checked_settings("circles", values, CircleSettings)
-        image, camera = self.image(number), self.run.camera
-        table = disc_table(camera, settings)
-        found = detect_circles(image, camera, table, settings)
-        if settings.refine:
-            found = with_common(found, camera, settings.calibration_px, by_verticals=False)
-        explained = explain_discs(image, camera, settings)
+        plan = FramePlan(self.run.camera, circles=settings, levelling="none")
+        (frame,) = detect_batch([FrameTask(self.frames[number])], plan)
+        if frame.image is None or frame.discs is None:
+            raise DetectError(str(frame.error))
+        found = frame.discs
+        explained = explain_discs(frame.image, self.run.camera, settings)
         discs = [
             {
                 "x": float(xy[0]),

@@ -1,21 +1,18 @@
-"""The command ``detect view``: frames and rows over time, for Rerun."""
+"""The command ``detect view``: drawn frames, and the floor, over time, for Rerun."""
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from camera import Camera
-from detect.comparison.compare import numbers
-from detect.drawing.frame import ends_of, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, open_rows, select_frames
+from detect.drawing.frame import draw_rows
+from detect.drawing.inputs import SeenRows, every_nth, open_rows
 from detect.errors import DetectError, FrameError
-from detect.seen import circle_on_floor, image_positions, summed_steps
+from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
@@ -25,11 +22,9 @@ from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.storage import demand_place, write_bytes
 
-_EDGE, _LINE, _SIGMA, _MAP = (255, 170, 0), (60, 220, 60), (255, 170, 0), (80, 140, 220)
+_EDGE, _LINE, _MAP = (255, 170, 0), (60, 220, 60), (80, 140, 220)
 # Times of this and more are assumed to be UNIX time: no recording is three years long.
 _EARLIEST_DATE_S = 1e8
-# Rerun counts from the corner of the top left pixel, not from its centre.
-_CORNER = 0.5
 
 
 def perform(options: View) -> int:
@@ -40,8 +35,8 @@ def perform(options: View) -> int:
     source = open_rows(run, options.files)
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.images, options.every)
-    radius_m = source.circle_settings.radius_m
+    expected, selection = every_nth(run.frames, options.every)
+    sight, settings = source.sight(run.camera), source.circle_settings
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
     failures: list[str] = []
@@ -51,7 +46,6 @@ def perform(options: View) -> int:
             _show(recording)
         else:
             recording.save(str(raw))
-        rr.send_blueprint(_layout(), recording=recording)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         path = rr.LineStrips3D([poses * [1.0, 1.0, 0.0]])
         recording.log("world/path", path, static=True)
@@ -64,14 +58,15 @@ def perform(options: View) -> int:
                 if frame.time_s is not None:
                     recording.set_time("time", **_clock(frame.time_s))
                 rows = source.of(frame.step.prefix)
-                _log_world(rr, recording, rows, poses[position + 1], radius_m)
+                _log_world(rr, recording, rows, poses[position + 1], settings.radius_m)
                 try:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
                     continue
-                recording.log("camera/image", rr.Image(image).compress(jpeg_quality=85))
-                _log_image(rr, recording, run.camera, rows, radius_m)
+                picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
+                coloured = np.ascontiguousarray(picture[:, :, ::-1])
+                recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()
         recording.flush()
         recording.disconnect()
@@ -114,57 +109,9 @@ def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius
         rings = circle_on_floor(circle_arrays(rows.circles.circles).xy, radius_m)
         strips = list(np.pad(rings, ((0, 0), (0, 0), (0, 1))))
         recording.log("world/robot/discs", rr.LineStrips3D(strips, colors=_EDGE))
-        recording.log("count/discs", rr.Scalars([float(len(rings))]))
-    if rows.lines is not None:
-        recording.log("count/verticals", rr.Scalars([float(len(rows.lines.lines))]))
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
-
-
-def _log_image(rr: Any, recording: Any, camera: Camera, rows: SeenRows, radius_m: float) -> None:
-    def log(name: str, curves: Iterable[FloatArray], **style: Any) -> None:
-        strips = [curve + _CORNER for curve in curves]
-        recording.log(f"camera/image/{name}", rr.LineStrips2D(strips, **style))
-
-    if rows.circles is not None:
-        places = circle_arrays(rows.circles.circles)
-        rings = circle_on_floor(places.xy, radius_m)
-        rings = np.concatenate([rings, rings[:, :1]], axis=1)
-        seen = image_positions(camera, rings, rows.circles.levelled_by)
-        shown = np.isfinite(seen).all(axis=(1, 2))
-        labels = [f"{quality:.2f}" for quality in places.quality[shown]]
-        log("discs", seen[shown], colors=_EDGE, labels=labels)
-    if rows.lines is not None:
-        lines = rows.lines.lines
-        curves = line_curves(camera, ends_of(lines))
-        bars = sigma_bars(camera, ends_of(lines), numbers(lines, "sigma"))
-        log("verticals", curves[np.isfinite(curves).all(axis=(1, 2))], colors=_LINE)
-        log("sigma", bars[np.isfinite(bars).all(axis=(1, 2))], colors=_SIGMA)
-    if rows.markers is not None:
-        squares = [
-            np.array([(c.u, c.v) for c in (*row.corners, row.corners[0])])
-            for row in rows.markers.markers
-        ]
-        labels = [f"{row.id}" for row in rows.markers.markers]
-        log("markers", squares, colors=_LINE, labels=labels)
-
-
-def _layout() -> Any:
-    """The frame to the left, wide; the floor, counts and tilt to the right of it."""
-    import rerun.blueprint as rrb
-
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial2DView(origin="camera/image", name="frame"),
-            rrb.Vertical(
-                rrb.Spatial3DView(origin="world", name="floor"),
-                rrb.TimeSeriesView(origin="count", name="rows in the frame"),
-                rrb.TimeSeriesView(origin="tilt", name="tilt (deg)"),
-            ),
-            column_shares=[2, 1],
-        )
-    )
 
 
 def _show(recording: Any) -> None:

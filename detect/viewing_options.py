@@ -5,14 +5,14 @@ Nothing heavy is imported: `--help` needs it all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from detect.errors import CompareError
-from detect.options import PickedFrames, RunFlags, SourceOptions
+from detect.errors import CompareError, DetectError
+from detect.options import RunFlags
 from detect.settings import CircleSettings
 from redetect.storage.bounds import (
     ABOVE_0,
@@ -20,7 +20,6 @@ from redetect.storage.bounds import (
     MaybeInt,
     MaybePath,
     MaybePixel,
-    MaybeStr,
     NotNegative,
     Positive,
     demand_fields,
@@ -78,10 +77,6 @@ class RowFiles:
     #: Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
     #: they exist; by default the run's.
     rows: MaybePath = None
-    circles: MaybePath = None  #: Rows of discs, if not detected.circles there.
-    lines: MaybePath = None  #: Rows of verticals, if not detected.lines there.
-    markers: MaybePath = None  #: Rows of square markers, if not detected.markers there.
-    tilt: MaybePath = None  #: Tilts of the frames, if not detected.tilt there.
     #: Reference rows of discs, by default map.circles in the run folder if it exists.
     reference: MaybePath = None
     #: Reference rows of verticals, by default map.lines in the run folder if it exists.
@@ -89,14 +84,17 @@ class RowFiles:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RowsFlags(RunFlags):
-    """Options of all commands that show frames of a run."""
+class SomeFramesFlags(RunFlags):
+    """Options of commands that may leave frames out."""
 
-    source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+    every: Annotated[int, whole(1)] = 1  #: Only every n-th frame.
+
+    def __post_init__(self) -> None:
+        demand_fields(self, DetectError)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draw(PickedFrames, RowsFlags):
+class Draw(SomeFramesFlags):
     """Draw rows from files into the images: PNG files, or a video. Nothing is detected again.
 
     Example: detect all images/e, then: detect draw images/e -o /tmp/drawn --every 10
@@ -113,7 +111,7 @@ class Draw(PickedFrames, RowsFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(PickedFrames, RowsFlags):
+class View(SomeFramesFlags):
     """Frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
 
     Example: detect all images/e, then: detect view images/e -o /tmp/e.rrd
@@ -133,7 +131,7 @@ class View(PickedFrames, RowsFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(RowsFlags):
+class Report(RunFlags):
     """One HTML page about a run: what was found, and how good it is against reference rows.
 
     Example: detect all images/e, then: detect report images/e -o /tmp/e.html
@@ -187,36 +185,14 @@ class Demo:
     force: bool = False  #: Replace existing files.
 
 
-if TYPE_CHECKING:
-
-    class Grid:
-        """One `str` or None for each field of `CircleSettings`."""
-
-else:
-
-    def _grid() -> type:
-        def values_of(name: str) -> object:
-            return Annotated[MaybeStr, arg(metavar="VALUES", help=f"Values of {name}.")]
-
-        return make_dataclass(
-            "Grid",
-            [(f.name, values_of(f.name), field(default=None)) for f in fields(CircleSettings)],
-            namespace={"__doc__": "Parameters to be varied: FROM:TO:STEP, or values with commas."},
-            frozen=True,
-        )
-
-    Grid = _grid()
-
-
 @dataclass(frozen=True, kw_only=True)
-class Tune(PickedFrames, RowsFlags):
+class Tune(SomeFramesFlags):
     """Try parameters over a grid against a reference file: precision and recall, knee marked.
 
-    Example: detect tune images/e --threshold 0.3:0.7:0.1 --every 8 -o /tmp/tuned
+    Example: detect tune images/e --vary evidence=-1:3:0.5 --every 8 -o /tmp/tuned
 
-    Any parameter of `detect circles` can be varied: by FROM:TO:STEP, both ends included, or by
-    values with commas between them. All combinations are tried. With --serve, they are turned by
-    hand on a page instead, which needs no reference rows, and labels discs.
+    All combinations of the values of --vary are tried. With --serve, parameters are turned by hand
+    on a page instead, which needs no reference rows, and labels discs.
 
     Parameters
     ----------
@@ -225,6 +201,9 @@ class Tune(PickedFrames, RowsFlags):
         (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
+    #: Parameters of `detect circles` and their values: NAME=FROM:TO:STEP, both ends included, or
+    #: NAME=VALUES with commas between them.
+    vary: tuple[str, ...] = ()
     serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
@@ -233,7 +212,6 @@ class Tune(PickedFrames, RowsFlags):
     #: frames to process, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
-    grid: OmitArgPrefixes[Grid] = field(default_factory=Grid)
 
 
 Format = Literal["csv", "parquet", "mcap"]

@@ -1,7 +1,7 @@
 """Compares detected discs, or lines, with reference rows of the same run.
 
-Whether the same disc is seen is one question; where on the floor each side puts it is a second one:
-its differences, and the tilt and height of the camera that would explain them.
+Whether the same disc is seen is one question; where on the floor each side puts it is a second one,
+answered twice: as the rows are, and levelled alike, by the tilt that levelled the detected ones.
 
 Discs are paired in the image, each where it was seen, or on the floor; lines by bearing. A detected
 line can represent several that were joined: unpaired reference lines within its sigma are found,
@@ -20,18 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from detect.comparison.floor import floor_difference, floor_pairs, normalised_error, quantile
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
     DiscPairs,
     DistanceBin,
-    ForwardRange,
     FrameMatch,
     FramePair,
     Kind,
     LineComparison,
     LinePairs,
+    floor_difference,
+    normalised_error,
+    quantile,
 )
 from detect.errors import CompareError
 from detect.seen import Sight
@@ -52,8 +53,8 @@ from redetect.landmarks import (
 )
 from redetect.storage.messages import excerpt
 
-# The forward distances for which the data set's own qualities are known.
-_EDGES_M = (None, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, None)
+# Edges of the ranges of forward distances (m).
+_EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files hold six digits: a smaller sigma is no statement about a bearing.
 LEAST_SIGMA_RAD = 1e-12
 
@@ -132,43 +133,38 @@ def compare_frames(
         circle_arrays([row for m in matches for row in m.missed]),
         circle_arrays([row for m in matches for row in m.extra]),
     )
-    lean, pairs = floor_pairs(
-        None if sight is None else sight.camera,
-        first.xy,
-        second.xy,
-        second.covariance,
-        np.repeat(np.arange(len(matches)), [len(match.matched) for match in matches]),
-    )
+    alike = [_alike_xy(match.paired[0], match.frame.view) for match in matches]
+    alike_xy = np.concatenate([np.zeros((0, 2)), *alike])
+    away = first.xy - (np.zeros(2) if sight is None else sight.camera.centre[:2])
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    pairs = DiscPairs(first.xy, second.xy - first.xy, second.xy - alike_xy, second.covariance, away)
     apart = [] if sight is None else [apart_px(match) for match in matches]
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
-    error_m = np.concatenate([np.zeros(0), *(match.errors for match in matches)])
-    ranges = [ForwardRange(*ends) for ends in pairwise(_EDGES_M)]
+    error_m = np.linalg.norm(pairs.offset, axis=1)
     return DiscComparison(
         **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
+        normalised_error=normalised_error(pairs.offset, second.covariance),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
-        normalised_error=normalised_error(pairs.offset, second.covariance),
         reference_quality_matched=quantile(first.quality),
         reference_quality_missed=quantile(missed.quality),
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
-        bins=tuple(_distance_bin(part, sides, pairs, lean is not None) for part in ranges),
-        extra_beyond=_beyond(extra.xy, second.xy),
+        bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
         reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
-        lean=lean,
         pairs=pairs,
     )
 
 
-def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
-    """How many positions are farther away than all of those that are known."""
-    farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
-    return int((np.linalg.norm(xy, axis=1) > farthest).sum())
+def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatArray:
+    """(M, 2) where discs of the reference are on the floor if levelled as the detected ones."""
+    xy = circle_arrays(reference).xy
+    return xy if view is None else view.levelled_alike(xy)
 
 
 def compare_line_frames(
@@ -198,9 +194,9 @@ def compare_line_frames(
     ]
     return LineComparison(
         **common,
+        normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
         bearing_median_deg=quantile(error_deg),
         bearing_95_deg=quantile(error_deg, 0.95),
-        normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
         ends_median=quantile(np.concatenate(ends)),
         beta_median_deg=quantile(np.degrees(np.abs(difference("beta")))),
         pairs=LinePairs(bearing_rad, error_rad, sigma_rad),
@@ -208,29 +204,25 @@ def compare_line_frames(
 
 
 def _distance_bin(
-    part: ForwardRange, sides: tuple[CircleArrays, ...], pairs: DiscPairs, has_lean: bool
+    low: float, high: float, sides: tuple[CircleArrays, ...], pairs: DiscPairs
 ) -> DistanceBin:
     """The bin of a range; `sides` are matched reference and detected rows, missed and extra."""
-    inside = [part.holds(side.xy) for side in sides]
+    inside = [(low <= -side.xy[:, 1]) & (-side.xy[:, 1] < high) for side in sides]
     first, second, missed, extra = (int(mask.sum()) for mask in inside)
-    qualities = [side.quality[mask] for side, mask in zip(sides, inside)]
-    wanted = quantile(np.concatenate([qualities[0], qualities[2]]))
-    found = quantile(np.concatenate([qualities[1], qualities[3]]))
+    away = pairs.away[inside[0]]
+    offset, as_written = pairs.offset[inside[0]], pairs.as_written[inside[0]]
     return DistanceBin(
-        from_m=part.from_m,
-        to_m=part.to_m,
+        from_m=low if np.isfinite(low) else None,
+        to_m=high if np.isfinite(high) else None,
         reference=first + missed,
         missed=missed,
         detected=second + extra,
         extra=extra,
         recall=first / (first + missed) if first + missed else None,
         precision=second / (second + extra) if second + extra else None,
-        reference_quality_median=wanted,
-        detected_quality_median=found,
-        error_median_m=quantile(np.linalg.norm(pairs.offset[inside[0]], axis=1)),
-        quality_difference=None if wanted is None or found is None else found - wanted,
-        before=floor_difference(pairs.offset[inside[0]], pairs.away[inside[0]]),
-        after=floor_difference(pairs.left[inside[0]], pairs.away[inside[0]]) if has_lean else None,
+        error_median_m=quantile(np.linalg.norm(offset, axis=1)),
+        as_written=floor_difference(as_written, away),
+        alike=floor_difference(offset, away) if pairs.levelled_apart else None,
     )
 
 
@@ -350,7 +342,8 @@ def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
         joined = np.zeros(len(left), dtype=np.bool_)
-        errors = np.linalg.norm(circle_arrays(second).xy - circle_arrays(first).xy, axis=1)
+        apart = circle_arrays(second).xy - _alike_xy(first, frame.view)
+        errors = np.linalg.norm(apart, axis=1)
     return FrameMatch(
         frame,
         matched=list(zip(first, second)),

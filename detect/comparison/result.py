@@ -1,17 +1,18 @@
-"""Options and results of comparisons of the discs, or of the lines, of two runs."""
+"""Results of comparisons of the discs, or of the lines, of two runs, and figures of errors."""
 
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 if TYPE_CHECKING:
     from detect.seen import Sight
@@ -43,7 +44,9 @@ class FrameMatch(NamedTuple):
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that fit something that does not count
-    errors: FloatArray  # of the pairs: distance on the floor (m), or difference in bearing (deg)
+    #: Of the pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
+    #: (deg).
+    errors: FloatArray
 
     @property
     def largest_error(self) -> float | None:
@@ -72,25 +75,6 @@ class NormalisedError:
 
 
 @dataclass(frozen=True)
-class ForwardRange:
-    """A range of forward distances (m), open at an end that is None."""
-
-    from_m: float | None
-    to_m: float | None
-
-    def holds(self, floor_xy: FloatArray) -> BoolArray:
-        """(N,) which of some positions are in it."""
-        low = -np.inf if self.from_m is None else self.from_m
-        high = np.inf if self.to_m is None else self.to_m
-        return np.asarray((low <= -floor_xy[:, 1]) & (-floor_xy[:, 1] < high))
-
-    def __str__(self) -> str:
-        if self.from_m is None:
-            return f"< {self.to_m:g}"
-        return f">= {self.from_m:g}" if self.to_m is None else f"{self.from_m:g}-{self.to_m:g}"
-
-
-@dataclass(frozen=True)
 class FloorDifference:
     """Detected minus reference positions: distance (median, 95 %), and medians of directions."""
 
@@ -102,38 +86,29 @@ class FloorDifference:
 
 
 @dataclass(frozen=True)
-class DistanceBin(ForwardRange):
-    """Discs at a range of forward distances; qualities and errors are medians.
+class DistanceBin:
+    """Discs at a range of forward distances (m), open at an end that is None.
 
-    Differences are of matched discs on the floor, before and after the common lean.
+    Differences are of matched discs on the floor, as their rows are and levelled alike; the latter
+    are None where all rows are levelled alike to begin with.
     """
 
+    from_m: float | None
+    to_m: float | None
     reference: int
     missed: int
     detected: int
     extra: int
     recall: float | None
     precision: float | None
-    reference_quality_median: float | None
-    detected_quality_median: float | None
     error_median_m: float | None
-    quality_difference: float | None
-    before: FloorDifference
-    after: FloorDifference | None
+    as_written: FloorDifference
+    alike: FloorDifference | None
 
-
-@dataclass(frozen=True)
-class CommonLean:
-    """Tilt, as in a ``.tilt`` file, and height of the camera that explain the differences."""
-
-    pitch_deg: float
-    pitch_sigma_deg: float
-    roll_deg: float
-    roll_sigma_deg: float
-    raised_m: float
-    raised_sigma_m: float
-    left: FloorDifference
-    normalised_error: NormalisedError
+    def __str__(self) -> str:
+        if self.from_m is None:
+            return f"< {self.to_m:g}"
+        return f">= {self.from_m:g}" if self.to_m is None else f"{self.from_m:g}-{self.to_m:g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +116,15 @@ class DiscPairs:
     """N matched discs on the floor (m)."""
 
     reference_xy: FloatArray  # (N, 2)
-    offset: FloatArray  # (N, 2) detected minus reference positions
-    left: FloatArray  # (N, 2) the same after the common lean
+    as_written: FloatArray  # (N, 2) detected minus reference positions
+    offset: FloatArray  # (N, 2) the same, both levelled alike: the errors
     covariance: FloatArray  # (N, 2, 2) what errors are measured in
     away: FloatArray  # (N, 2) unit vectors along which the camera sees them
+
+    @property
+    def levelled_apart(self) -> bool:
+        """Whether some rows are not levelled alike as they are written."""
+        return not np.array_equal(self.as_written, self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +137,7 @@ class LinePairs:
 
 
 @dataclass(frozen=True)
-class Comparison(ABC):
+class Comparison:
     """How a run's detected rows compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Rows are counted as in
@@ -183,6 +163,7 @@ class Comparison(ABC):
     on_lookalikes: int | None  # extra rows on what resembles a disc, where that is known
     recall: float | None
     precision: float | None
+    normalised_error: NormalisedError
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
@@ -202,14 +183,14 @@ class Comparison(ABC):
                 f" {alike} are on things known to look like a disc, and "
                 f"{self.extra - alike or 'none'} on nothing known."
             )
-        return found, extra, *self._error_sentences()
+        return found, extra, self._errors(), _agreement(self.normalised_error)
 
-    @abstractmethod
-    def _error_sentences(self) -> tuple[str, str]:
-        """How large errors are, and whether covariances say so."""
+    def _errors(self) -> str:
+        """How large errors are."""
+        raise NotImplementedError
 
-    def to_json(self) -> str:
-        """All figures as JSON: same keys in the same order, numbers finite or null.
+    def figures(self) -> dict[str, Any]:
+        """All figures by name, for JSON: the same names in the same order.
 
         Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those
         that only one file has.
@@ -227,7 +208,12 @@ class Comparison(ABC):
                 for match in self.worst_frames(WORST_FRAMES)
             ],
         }
-        return json.dumps(figures, indent=2, allow_nan=False, default=asdict) + "\n"
+        plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
+        return plain
+
+    def to_json(self) -> str:
+        """`figures` as JSON; numbers are finite or null."""
+        return f"{json.dumps(self.figures(), indent=2)}\n"
 
     def _repr_html_(self) -> str:
         return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
@@ -250,31 +236,27 @@ class DiscComparison(Comparison):
 
     error_median_m: float | None
     error_95_m: float | None
-    normalised_error: NormalisedError
     reference_quality_matched: float | None
     reference_quality_missed: float | None
     detected_quality_matched: float | None
     detected_quality_extra: float | None
     bins: tuple[DistanceBin, ...]
-    extra_beyond: int  # extra rows that are farther away than all that are on a reference row
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
     reference_levelled: int  # frames whose rows are levelled by a tilt
     detected_levelled: int
-    lean: CommonLean | None
     pairs: DiscPairs = field(repr=False)
 
-    def _error_sentences(self) -> tuple[str, str]:
+    def _errors(self) -> str:
         median, most = (
             None if value is None else 1000.0 * value
             for value in (self.error_median_m, self.error_95_m)
         )
-        errors = (
+        return (
             f"Positions on the floor err by {number(median, 1)} mm (median), "
             f"95 % of them by less than {number(most, 1)} mm."
         )
-        return errors, _agreement(self.normalised_error)
 
 
 @dataclass(frozen=True)
@@ -286,17 +268,15 @@ class LineComparison(Comparison):
 
     bearing_median_deg: float | None
     bearing_95_deg: float | None
-    normalised_error: NormalisedError
     ends_median: float | None  # normalised image coordinates, top and bottom alike
     beta_median_deg: float | None
     pairs: LinePairs = field(repr=False)
 
-    def _error_sentences(self) -> tuple[str, str]:
-        errors = (
+    def _errors(self) -> str:
+        return (
             f"Bearings err by {number(self.bearing_median_deg, 3)} degrees (median), 95 % of them "
             f"by less than {number(self.bearing_95_deg, 3)}."
         )
-        return errors, _agreement(self.normalised_error)
 
 
 def number(value: float | None, decimals: int) -> str:
@@ -317,19 +297,34 @@ def _agreement(error: NormalisedError) -> str:
     return f"The stated covariances are too {size}: {figure}."
 
 
-def unmet_demands(
-    comparison: Comparison,
-    *,
-    min_recall: float | None = None,
-    min_precision: float | None = None,
-) -> tuple[str, ...]:
-    """A sentence for each demand that a comparison fails, as it does without rows to judge by."""
-    demands = (
-        ("recall", comparison.recall, min_recall),
-        ("precision", comparison.precision, min_precision),
-    )
-    return tuple(
-        f"{name} is {'unknown' if value is None else f'{value:.4f}'}: at least {least:g} demanded"
-        for name, value, least in demands
-        if least is not None and (value is None or value < least)
+def quantile(values: FloatArray, q: float = 0.5) -> float | None:
+    """Quantile of `values`, interpolated linearly; by default the median."""
+    return float(np.quantile(values, q)) if len(values) else None
+
+
+def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
+
+    Errors whose covariance (N, n, n) is not positive definite are left out.
+    """
+    usable = is_positive_definite(covariance)
+    left_out = int((~usable).sum())
+    dof = offset[usable].size
+    if dof == 0:
+        return NormalisedError(per_dof=None, dof=0, band=None, left_out=left_out)
+    squared = squared_mahalanobis(offset[usable], covariance[usable])
+    low, high = (float(chdtri(dof, 1.0 - p)) / dof for p in (0.025, 0.975))
+    return NormalisedError(float(squared.sum()) / dof, dof, (low, high), left_out)
+
+
+def floor_difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
+    """Figures of differences (N, 2) on the floor (m), seen along unit vectors `away` (N, 2)."""
+    size = np.asarray(np.linalg.norm(offset, axis=1))
+    return FloorDifference(
+        pairs=len(offset),
+        median_m=quantile(size),
+        most_m=quantile(size, 0.95),
+        along_m=quantile((offset * away).sum(axis=1)),
+        # Forward is -Y and left is X: left of a direction is it turned from -Y to X.
+        across_m=quantile(away[:, 0] * offset[:, 1] - away[:, 1] * offset[:, 0]),
     )

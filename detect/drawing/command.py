@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from math import isfinite
 from pathlib import Path
@@ -11,10 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detect.drawing.frame import draw_rows, png_of
-from detect.drawing.inputs import open_rows, picture_name, select_frames
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
+from detect.drawing.inputs import RunRows, every_nth, open_rows, picture_name
 from detect.errors import DetectError, FrameError
-from detect.sources.interface import Run, read_image
+from detect.runs.frame import detect_batch, tables_of
+from detect.runs.plan import FramePlan, FrameTask
+from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import Draw
@@ -31,15 +33,14 @@ def perform(options: Draw) -> int:
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     rows = open_rows(run, options.files)
-    sight = rows.sight(run.camera) if isinstance(run, Run) else None
-    if sight is None and set(rows.detected) != {"markers"}:
+    if not isinstance(run, Run) and set(rows.detected) != {"markers"}:
         raise DetectError(
             f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
             "only markers can be drawn without"
         )
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
-    expected, selection = select_frames(run.frames, options.images, options.every)
+    expected, selection = every_nth(run.frames, options.every)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 
@@ -50,15 +51,7 @@ def perform(options: Draw) -> int:
         if options.video is not None:
             video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
         advance = stack.enter_context(progress_bar("pictures", expected))
-        for _, frame in selection:
-            try:
-                image = read_image(frame, None if sight is None else sight.camera)
-            except FrameError as error:
-                failures.append(str(error))
-                continue
-            prefix = frame.step.prefix
-            name = picture_name(prefix)
-            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
+        for name, picture in pictures(run, rows, (frame for _, frame in selection), failures):
             if options.output is not None:
                 path = options.output / f"{name}.png"
                 write_bytes(path, png_of(picture), overwrite=options.force)
@@ -70,6 +63,52 @@ def perform(options: Draw) -> int:
         if where is not None:
             print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
     return report_failures(len(failures), failures)
+
+
+def pictures(
+    run: ImageRun,
+    rows: RunRows,
+    frames: Iterable[RunFrame],
+    failures: list[str],
+    plan: FramePlan | None = None,
+) -> Iterator[tuple[str, ByteArray]]:
+    """The pictures of frames with their rows, and their names; `failures` gets why some have none.
+
+    With the plan of their detection, verticals are drawn as tracks, and markers with what is none.
+    """
+    sight = rows.sight(run.camera) if isinstance(run, Run) else None
+    for frame in frames:
+        try:
+            image = read_image(frame, None if sight is None else sight.camera)
+        except FrameError as error:
+            failures.append(str(error))
+            continue
+        prefix = frame.step.prefix
+        name = picture_name(prefix)
+        picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
+        if plan is not None:
+            (found,) = detect_batch([FrameTask(frame)], plan)
+            verticals = tables_of(plan).verticals
+            if found.lines is not None and verticals is not None:
+                picture = draw_tracks(image, verticals, found.lines)
+            if found.markers is not None:
+                picture = draw_candidates(picture, found.markers)
+        yield name, picture
+
+
+def draw_run(
+    run: ImageRun,
+    files: Mapping[str, Path],
+    folder: Path,
+    plan: FramePlan | None,
+    *,
+    overwrite: bool,
+) -> None:
+    """Draw what was detected in a run, in `files` by kind; with a plan, what was rejected, too."""
+    with progress_bar("pictures", run.frames.expected) as advance:
+        for name, picture in pictures(run, RunRows(files), run.frames, [], plan):
+            write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
+            advance()
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -19,13 +20,14 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
 from detect.comparison.result import FrameMatch
-from detect.discs.unfound import Candidate
+from detect.discs.unfound import Candidate, Stage
 from detect.drawing.inputs import SeenRows
-from detect.lines import ACCEPTED, JOINED, LineDetections
+from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.seen import Sight, circle_on_floor, ellipses
 from detect.settings import CircleSettings
+from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
@@ -288,32 +290,18 @@ def with_legend(
 
 
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
-_FATE_COLOURS: dict[str, Colour] = {
-    ACCEPTED: LINE_COLOUR,
-    JOINED: (255, 190, 0),
-    "short": (120, 120, 120),
-    "no maximum": (200, 0, 120),
-    "little evidence": (200, 120, 60),
-    "off the track": (200, 0, 200),
-    "not straight": (0, 140, 255),
-    "off the horizon": (200, 200, 0),
-    "uncertain": (0, 200, 200),
-    "soft": (160, 80, 200),
-    "not vertical": (0, 0, 255),
-    "same edge": (60, 120, 60),
-    "beside a stronger edge": (0, 90, 160),
-}
 
 
-_STAGE_COLOURS: dict[str, Colour] = {
-    "disc": LINE_COLOUR,
-    "polarity": (255, 120, 60),
-    "steps": (150, 150, 150),
-    "glance": (200, 200, 0),
-    "rim": (0, 140, 255),
-    "evidence": (0, 0, 255),
-    "beside a better disc": (60, 120, 60),
-}
+def _colours(names: Sequence[str]) -> dict[str, Colour]:
+    """Colours that stay apart, always the same; that of the first is of what was found."""
+    hues = np.linspace(128, 298, len(names)) % 256  # from cyan to yellow: no green
+    colours = cv2.applyColorMap(hues.astype(np.uint8)[:, None], cv2.COLORMAP_HSV)[:, 0]
+    pale = (75 + 0.7 * colours[1:]).astype(int).tolist()
+    return dict(zip(names, [LINE_COLOUR, *map(tuple, pale)], strict=True))
+
+
+_FATE_COLOURS = _colours(FATES)
+_STAGE_COLOURS = _colours(get_args(Stage))
 
 
 def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -> ByteArray:

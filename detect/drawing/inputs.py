@@ -1,12 +1,13 @@
-"""Rows of a run from files, the heads of these files, and which frames are selected."""
+"""Rows of a run from files, and the heads of these files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 
 from camera import Camera
 from detect.errors import DetectError
@@ -96,7 +97,9 @@ class SeenRows:
 class RunRows:
     """The files of a run's rows, detected and reference by kind; in memory: offsets of frames."""
 
-    def __init__(self, detected: dict[str, Path], reference: dict[str, Path]) -> None:
+    def __init__(
+        self, detected: Mapping[str, Path], reference: Mapping[str, Path] = MappingProxyType({})
+    ) -> None:
         self.detected = detected
         self.reference = reference
         self.heads = {kind: read_head(path) for kind, path in detected.items()}
@@ -127,26 +130,19 @@ class RunRows:
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     """Find the files of a run's rows, and index them.
 
-    Raises DetectError if one that is named does not exist, or there is none at all, and
+    Raises DetectError if there is none, or reference rows that are named are not there, and
     redetect.landmarks.LandmarkFileError if one is malformed.
     """
-    detected: dict[str, Path] = {}
     usual = {
         kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
         for kind in KINDS
     }
-    for kind in KINDS:
-        named: Path | None = getattr(options, kind)
-        path = named or usual[kind]
-        if path.is_file():
-            detected[kind] = path
-        elif named is not None:
-            raise DetectError(f"{path}: no such file: expected detected {kind}")
+    detected = {kind: path for kind, path in usual.items() if path.is_file()}
     if not detected:
         raise DetectError(
             f"{usual['circles']}: no such file, nor .lines, .markers or .tilt: expected one of "
             "them: run detect all (or circles, lines, markers) on the same images first, or name "
-            "files"
+            "their folder by --rows"
         )
     reference: dict[str, Path] = {}
     for kind, named in (("circles", options.reference), ("lines", options.reference_lines)):
@@ -166,22 +162,7 @@ def picture_name(prefix: str) -> str:
 # -- frames -----------------------------------------------------------------------------------
 
 
-def select_frames(
-    frames: Frames, wanted: Sequence[str], every: int
-) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
-    """Their number, if it is known, and the selected frames with their positions in the run.
-
-    Every n-th of those that are `wanted` by names of images, or of all. Raises DetectError if a
-    name is no image's.
-    """
-    if every < 1:
-        raise DetectError(f"every is {every}: expected 1 or more")
-    if not wanted:
-        expected = None if frames.expected is None else -(-frames.expected // every)
-        return expected, islice(enumerate(frames), 0, None, every)
-    names = [image_name(frame.step.prefix) for frame in frames]
-    asked = {image_name(word): word for word in wanted}
-    for name in asked.keys() - set(names):
-        raise DetectError(f"frame {asked[name]!r}: expected the name of an image of the run")
-    kept = frozenset([k for k, name in enumerate(names) if name in asked][::every])
-    return len(kept), ((k, frame) for k, frame in enumerate(frames) if k in kept)
+def every_nth(frames: Frames, every: int) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
+    """How many every n-th frames are, if that is known, and these with their places in the run."""
+    expected = None if frames.expected is None else -(-frames.expected // every)
+    return expected, islice(enumerate(frames), 0, None, every)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from detect.comparison.compare import LEAST_SIGMA_RAD, match_frame
+from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
 from detect.comparison.result import (
     DiscComparison,
     DiscPairs,
@@ -17,8 +17,8 @@ from detect.comparison.result import (
 )
 from detect.drawing.inputs import SeenRows
 from detect.seen import ellipses, summed_steps
-from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import Frame, circle_arrays, is_positive_definite
+from redetect.array_types import FloatArray
+from redetect.landmarks import circle_arrays, is_positive_definite
 from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
@@ -31,69 +31,6 @@ if TYPE_CHECKING:
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
 
 
-def draw_rates(
-    axes: Axes, recall: FloatArray, precision: FloatArray, names: Sequence[str], most_named: int
-) -> None:
-    """Draw precision over recall (N,): all settings, their front with some names, and the knee."""
-    front, best = pareto_front(recall, precision), knee(recall, precision)
-    axes.plot(recall, precision, "o", color=DATA, ms=4, label="tried")
-    axes.plot(
-        recall[front], precision[front], "--", color=DATA, lw=1.2, label="none is better in both"
-    )
-    if best is not None:
-        axes.plot(
-            recall[best], precision[best], "o", mfc="none", mec=MARK, mew=2.0, ms=12,
-            label=f"knee: {names[best]}",
-        )  # fmt: skip
-    for k in front[:: max(1, -(-(len(front) - 1) // (most_named - 1)))]:
-        axes.annotate(
-            names[k], (recall[k], precision[k]), xytext=(-7, -9), textcoords="offset points",
-            ha="right", fontsize=7,
-        )  # fmt: skip
-    axes.set(xlabel="recall", ylabel="precision")
-    axes.grid(alpha=0.25, lw=0.6)
-
-
-def f1_score(recall: ArrayLike, precision: ArrayLike) -> FloatArray:
-    """Harmonic mean of recall and precision; 0 where both are, NaN where one is."""
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    return np.asarray(2.0 * r * p / np.where(r + p == 0.0, 1.0, r + p))
-
-
-def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) indices of settings that none beats in recall or precision without losing in the other.
-
-    By rising recall; of equals the first. Recalls and precisions (N,) are NaN where there are none.
-    """
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
-    # By falling recall, then falling precision: points no better than before are dominated.
-    order = known[np.lexsort((known, -p[known], -r[known]))]
-    before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
-    return order[p[order] > before][::-1]
-
-
-def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
-    """The setting at the knee of the curve of precision over recall; None without any.
-
-    That is the point of the front farthest beyond the chord between the front's ends, both axes
-    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
-    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
-    harmonic mean of recall and precision is used instead.
-    """
-    r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
-    front = pareto_front(r, p)
-    if not len(front):
-        return None
-    if len(front) > 2:
-        x = (r[front] - r[front[0]]) / (r[front[-1]] - r[front[0]])
-        y = (p[front] - p[front[-1]]) / (p[front[0]] - p[front[-1]])
-        beyond = x + y - 1.0
-        if beyond.max() > 1e-9:
-            return int(front[np.argmax(beyond)])
-    return int(front[np.argmax(f1_score(r[front], p[front]))])
-
-
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _HISTOGRAM_REACH = 5.0
@@ -101,26 +38,17 @@ _MOST_DOTS = 4000
 
 
 def rates_figure(curve: RateCurve) -> Part:
-    """Recall and precision over the least quality, and precision over recall with the knee."""
-    with figure_file((_WIDE, 3.1), "svg") as (figure, content):
-        left, right = figure.subplots(1, 2)
-        at = curve.threshold
-        left.plot(at, curve.recall, color=DATA, lw=1.4, label="recall")
-        left.plot(at, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision")
-        draw_rates(right, curve.recall, curve.precision, [f"{t:.3g}" for t in at], most_named=2)
-        right.legend(fontsize=8)
-        best = knee(curve.recall, curve.precision)
-        if best is not None:
-            left.axvline(at[best], color=MARK, lw=0.9, ls=":", label=f"knee: {at[best]:.3g}")
-        _finish(left, "least quality", "share")
-        left.legend(fontsize=8)
-        for limits in (left.set_ylim, right.set_ylim, right.set_xlim):
-            limits(0.0, 1.05)
-    words = (
-        "Recall and precision of the rows of a least quality; on the right one over the other. The "
-        "knee is the point farthest beyond the chord between the ends."
-    )
-    return _part(words, content, 3.1)
+    """Recall and precision over the least quality."""
+    with figure_file((_WIDE, 2.8), "svg") as (figure, content):
+        axes = figure.subplots()
+        axes.plot(curve.threshold, curve.recall, color=DATA, lw=1.4, label="recall")
+        axes.plot(
+            curve.threshold, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision"
+        )
+        axes.set_ylim(0.0, 1.05)
+        _finish(axes, "least quality", "share")
+        axes.legend(fontsize=8)
+    return _part("Recall and precision of the rows of a least quality.", content, 2.8)
 
 
 def whitened_figure(residuals: FloatArray, what: str) -> Part:
@@ -150,14 +78,14 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
     return _part(words, content, 2.8)
 
 
-def floor_figure(pairs: DiscPairs, *, lean: bool) -> Part:
-    """Differences on the floor over distance, along and across the view; also after a lean."""
+def floor_figure(pairs: DiscPairs) -> Part:
+    """Differences on the floor over distance, along and across the view; also levelled alike."""
     left_of = np.column_stack([-pairs.away[:, 1], pairs.away[:, 0]])
     distance = np.hypot(*pairs.reference_xy.T)
-    # Both of one panel are of the same scale, so that what a lean explains is seen.
-    series = [("as the rows are", pairs.offset, SECOND, "s--")]
-    if lean:
-        series.append(("after the common lean", pairs.left, DATA, "o-"))
+    # Both of one panel are of the same scale, so that what levelling explains is seen.
+    series = [("as the rows are", pairs.as_written, SECOND, "s--")]
+    if pairs.levelled_apart:
+        series.append(("levelled alike", pairs.offset, DATA, "o-"))
     with figure_file((_WIDE, 3.1), "svg") as (figure, content):
         both = figure.subplots(1, 2)
         for axes, direction, name in (
@@ -166,10 +94,9 @@ def floor_figure(pairs: DiscPairs, *, lean: bool) -> Part:
         ):
             ends = []
             for label, offset, colour, mark in series:
-                usable = np.isfinite(offset).all(axis=1)
-                error = 1e3 * (offset * direction).sum(axis=1)[usable]
-                _dots(axes, distance[usable], error, colour)
-                middle, half, _ = binned(distance[usable], error)
+                error = 1e3 * (offset * direction).sum(axis=1)
+                _dots(axes, distance, error, colour)
+                middle, half, _ = binned(distance, error)
                 axes.plot(middle, half, mark, color=colour, lw=1.4, ms=4, label=label)
                 ends += [*np.quantile(error, [0.01, 0.99])] if len(error) else []
             axes.axhline(0.0, color=REFERENCE, lw=0.8)
@@ -248,10 +175,8 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
 
 
-#: Of the map: ellipses in standard deviations, and its size (inches).
-_SIGMAS = 3.0
-_LARGEST_IN = (_WIDE, 9.0)
-_SMALLEST_IN = 2.5
+#: Size of the map's ellipses, in standard deviations, and their corners.
+_SIGMAS, _CORNERS = 3.0, 32
 
 
 def floor_map(rows: Sequence[SeenRows]) -> Part | None:
@@ -259,98 +184,76 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
 
     Forward at the start is up, left is left. None where there are no discs.
     """
-    frames = [seen.circles for seen in rows if seen.circles is not None]
-    if not any(frame.circles for frame in frames):
+    seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
+    if not any(found.circles for found, _ in seen):
         return None
-    poses = summed_steps(frame.step for frame in frames)
+    poses = summed_steps(found.step for found, _ in seen)
+    outlines, true = [], [np.zeros((0, 2))]
+    for (found, reference), pose in zip(seen, poses[1:]):
+        discs = circle_arrays(found.circles)
+        outlines.append(_from_pose(ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS), pose))
+        if reference is not None:
+            true.append(_from_pose(circle_arrays(reference.circles).xy, pose))
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
-    found = [_placed(frame, pose) for frame, pose in zip(frames, poses[1:])]
-    references = [seen.reference_circles for seen in rows if seen.circles is not None]
-    true = [
-        _placed(frame, pose)[0]
-        for frame, pose in zip(references, poses[1:])
-        if frame is not None and frame.circles
-    ]
-    centres = np.concatenate([xy for xy, _ in found])
-    ellipses = np.concatenate([outlines for _, outlines in found])
-    path = ahead * poses[:, :2]
-    everything = np.concatenate([path, ahead * centres, *(ahead * xy for xy in true)])
-    low, high = everything.min(axis=0) - 0.3, everything.max(axis=0) + 0.3
-    scale = min(np.array(_LARGEST_IN) / (high - low))
-    size = np.maximum(scale * (high - low), _SMALLEST_IN)
-    with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
+    with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
-        axes.plot(path[:, 0], path[:, 1], color=REFERENCE, lw=1.0, label="path by the odometry")
-        if true:
-            x, y = (ahead * np.concatenate(true)).T
-            axes.plot(x, y, "+", color=MARK, ms=6, mew=0.7, label="reference")
-        gaps = np.concatenate([ellipses, np.full((len(ellipses), 1, 2), np.nan)], axis=1)
-        x, y = (ahead * gaps.reshape(-1, 2)).T
-        axes.plot(x, y, color=DATA, lw=0.7, label="found")
-        axes.set_xlim(high[0], low[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal")
-        axes.set_xlabel("to the left / m")
-        axes.set_ylabel("forward / m")
-        axes.grid(alpha=0.25, lw=0.6)
+        path = ahead * poses[:, :2]
+        axes.plot(*path.T, color=REFERENCE, lw=1.0, label="path by the odometry")
+        if len(marks := ahead * np.concatenate(true)):
+            axes.plot(*marks.T, "+", color=MARK, ms=6, mew=0.7, label="reference")
+        closed = np.concatenate(outlines)[:, [*range(_CORNERS), 0]]
+        gaps = np.pad(closed, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        axes.plot(*(ahead * gaps.reshape(-1, 2)).T, color=DATA, lw=0.7, label="found")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.invert_xaxis()
+        _finish(axes, "to the left / m", "forward / m")
         axes.legend(fontsize=8)
     words = (
         f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
         "each frame, along the path that the odometry sums up to."
     )
-    return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
+    return _part(words, content, _WIDE)
 
 
-def _placed(frame: Frame, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) centres of a frame's discs and (N, P, 2) outlines of their ellipses, from a pose."""
-    discs = circle_arrays(frame.circles)
-    outlines = ellipses(discs.xy, discs.covariance, _SIGMAS, 32)
+def _from_pose(xy: FloatArray, pose: FloatArray) -> FloatArray:
+    """Places (..., 2) in the frame of a robot at a pose, as those in the frame of its start."""
     sine, cosine = np.sin(pose[2]), np.cos(pose[2])
-    turn = np.array([[cosine, sine], [-sine, cosine]])
-    closed = np.concatenate([outlines, outlines[:, :1]], axis=1)
-    return discs.xy @ turn + pose[:2], closed @ turn + pose[:2]
+    return np.asarray(xy @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2])
 
 
 class RateCurve(NamedTuple):
-    """Recall and precision (NaN without rows) of the `kept` rows of at least each quality."""
+    """Recall and precision (NaN without rows) of the rows of at least each quality."""
 
     threshold: FloatArray
     recall: FloatArray
     precision: FloatArray
-    kept: IntArray
 
 
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality; they are paired anew for each."""
+    """Recall and precision of discs of at least each quality."""
     levels = np.asarray(qualities, np.float64)
-    found, kept = np.zeros((2, len(levels)), np.int64)
+    found, beside = np.zeros((2, len(levels)), np.int64)
     for match in comparison.frames:
-        passed = match.frame.detected
-        for k in np.argsort(levels, kind="stable"):
-            fewer = [row for row in passed if row.quality >= levels[k]]
-            if len(fewer) < len(passed):
-                passed = fewer
-                match = match_frame(match.frame._replace(detected=passed), comparison.options)
-            found[k] += len(match.matched)
-            kept[k] += len(match.matched) + len(match.extra)
+        found += (levels[:, None] <= numbers(match.paired[1], "quality")).sum(axis=1)
+        beside += (levels[:, None] <= numbers(match.extra, "quality")).sum(axis=1)
     with np.errstate(invalid="ignore"):
-        recall, precision = found / np.float64(comparison.reference), found / kept
-    return RateCurve(levels, recall, precision, kept)
+        recall, precision = found / np.float64(comparison.reference), found / (found + beside)
+    return RateCurve(levels, recall, precision)
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
     """(M,) errors in units of their covariances: standard normal if these are right.
 
-    Two independent components for each disc with a positive definite covariance, after the common
-    lean; one for each line with a positive sigma.
+    Two independent components for each disc with a positive definite covariance; one for each line
+    with a positive sigma.
     """
     if isinstance(comparison, LineComparison):
         usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD
         return comparison.pairs.error_rad[usable] / comparison.pairs.sigma_rad[usable]
     pairs = comparison.pairs
-    usable = is_positive_definite(pairs.covariance) & np.isfinite(pairs.left).all(axis=1)
+    usable = is_positive_definite(pairs.covariance)
     factor = np.linalg.cholesky(pairs.covariance[usable])
-    return np.linalg.solve(factor, pairs.left[usable][:, :, None]).ravel()
+    return np.linalg.solve(factor, pairs.offset[usable][:, :, None]).ravel()
 
 
 def binned(at: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -111,7 +111,6 @@ _NAMES = {
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
-_TABLE_POINTS = 5
 
 
 def report_page(inputs: ReportInputs, worst: int) -> bytes:
@@ -156,15 +155,14 @@ def _discs(inputs: ReportInputs) -> list[Part]:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [_summary_of(result)]
     quality = [row.quality for match in result.frames for row in match.frame.detected]
-    levels = np.linspace(min(quality), max(quality), _CURVE_POINTS) if quality else np.zeros(0)
-    parts += _rates(figures.rates_over(result, np.unique(levels)))
+    if len(set(quality)) > 1:
+        levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
+        parts.append(figures.rates_figure(figures.rates_over(result, levels)))
     if result.matched:
-        parts.append(figures.floor_figure(result.pairs, lean=result.lean is not None))
-    what = "two components for each matched disc"
-    if result.lean is not None:
-        what += ", after the common lean"
-        parts.append(Part("table", *floor_table(result)))
-    return [*parts, *_honesty(result, what)]
+        parts.append(figures.floor_figure(result.pairs))
+        if result.pairs.levelled_apart:
+            parts.append(Part("table", *floor_table(result)))
+    return [*parts, *_honesty(result, "two components for each matched disc")]
 
 
 def _lines(inputs: ReportInputs) -> list[Part]:
@@ -182,29 +180,8 @@ def _lines(inputs: ReportInputs) -> list[Part]:
 def _summary_of(result: Comparison) -> Part:
     """What `detect compare` says."""
     rows = tuple(summary_rows(result).items())
-    return Part(
-        "table", "Detected rows against reference rows", ("what", "value"), rows, left=(0, 1)
-    )
-
-
-def _rates(curve: figures.RateCurve) -> list[Part]:
-    count = len(curve.threshold)
-    if not count:
-        return [Part("note", "No rows: no rates over the quality.")]
-    best = figures.knee(curve.recall, curve.precision)
-    chosen = set(np.linspace(0, count - 1, _TABLE_POINTS).astype(int).tolist())
-    chosen |= {best} - {None}
-    rows = tuple(
-        (
-            f"{curve.threshold[k]:.3g}" + (" (knee)" if k == best else ""),
-            str(curve.kept[k]),
-            *("-" if np.isnan(v) else f"{v:.3f}" for v in (curve.recall[k], curve.precision[k])),
-        )
-        for k in sorted(chosen)
-    )
-    head = ("least quality", "rows kept", "recall", "precision")
-    table = Part("table", "Rates over the quality", head, rows)
-    return [table] if count < 2 else [figures.rates_figure(curve), table]
+    words = " ".join(result.sentences())
+    return Part("table", words, ("what", "value"), rows, left=(0, 1))
 
 
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:

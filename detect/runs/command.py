@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.drawing.inputs import read_head
+from detect.drawing.inputs import KINDS, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.runs.outputs import frames_tilt_place
-from detect.runs.plan import Drawing, FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
+from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
-from detect.sources.opening import open_run, open_source
+from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
 from redetect.landmarks import read_tilts
 
@@ -44,8 +44,18 @@ def perform(command: DetectorFlags) -> int:
         resume=command.resume,
     )
     workers = _workers(command, job)
+    pictures = getattr(command, "draw", None)
+    if pictures is not None:
+        demand_recording(command.run)
+        make_folder(pictures)
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
+    if pictures is not None:
+        from detect.drawing.command import draw_run  # loads the detectors
+
+        files = {kind: path for kind, path in job.places.items() if kind in KINDS}
+        plan = job.plan if getattr(command, "rejected", False) else None
+        draw_run(job.run, files, pictures, plan, overwrite=command.force)
     _print_results(job, summary)
     for hint in _hints(job, summary):
         print(hint, file=sys.stderr)
@@ -71,10 +81,10 @@ def _circles(command: Circles, run: Run) -> Job:
     if command.json is not None:
         places["json"] = command.json
     settings = _with_radius(command.parameters, run) if command.find_radius else command.parameters
-    plan = FramePlan(run.camera, circles=settings, drawing="discs")
+    plan = FramePlan(run.camera, circles=settings)
     tilts = None if command.tilt is None else read_tilts(command.tilt)
     known = replace(_known_discs(command.ids), tilts=tilts)
-    return Job(run, plan, places, known, command.draw)
+    return Job(run, plan, places, known)
 
 
 def _lines(command: Lines, run: Run) -> Job:
@@ -83,18 +93,17 @@ def _lines(command: Lines, run: Run) -> Job:
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
-    drawing: Drawing = "tracks" if command.rejected else "lines"
-    plan = FramePlan(run.camera, lines=settings, drawing=drawing)
+    plan = FramePlan(run.camera, lines=settings)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     known = Known(lines=_frames(command.ids_from))
-    return Job(run, plan, places, known, command.draw)
+    return Job(run, plan, places, known)
 
 
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
     camera = run.camera if isinstance(run, Run) else None
-    plan = FramePlan(camera, markers=command.parameters, drawing="markers")
-    return Job(run, plan, {"markers": _output(command, run, "markers")}, pictures=command.draw)
+    plan = FramePlan(camera, markers=command.parameters)
+    return Job(run, plan, {"markers": _output(command, run, "markers")})
 
 
 def _all(command: All, run: Run) -> Job:
@@ -159,7 +168,7 @@ def _known_discs(options: DiscIdOptions) -> Known:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
-    known = Known(discs=_frames(options.ids_from), slack_m=options.id_slack_m)
+    known = Known(discs=_frames(options.ids_from))
     if options.ids_from is not None:
         known = replace(known, discs_level=read_head(options.ids_from).level)
     if options.ids_from_map is not None and options.path is not None:
@@ -173,9 +182,9 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        return cluster_workers(command.cluster, large=job.ships_images)
+        return cluster_workers(command.cluster, large=frames.ships_images)
     jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
-    return local_workers(jobs, large=job.ships_images, shared=True)
+    return local_workers(jobs, large=frames.ships_images, shared=True)
 
 
 def _print_results(job: Job, summary: RunSummary) -> None:

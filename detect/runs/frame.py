@@ -8,14 +8,12 @@ compiler, and starts without them.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby, islice, zip_longest
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +44,12 @@ from detect.runs.plan import (
     rows_of_failure,
     time_row,
 )
-from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
 from redetect.landmarks import (
     CircleLandmark,
-    Frame,
     FrameTilt,
     Landmark,
     LandmarkError,
@@ -63,8 +59,6 @@ from redetect.landmarks import (
     format_outline_tilt,
     format_record,
     format_tilt,
-    frames_of_rows,
-    parse_rows,
     tilt_as_written,
 )
 
@@ -190,6 +184,8 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
 #: Prefix, lines and tilt of a frame.
 _Tilted = tuple[str, int, FrameTilt | None]
 
+#: Standard deviation of where a map's discs are seen, besides their covariances: its path's (m).
+_MAP_SIGMA_M = 0.1
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
@@ -201,7 +197,7 @@ def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRow
     rows: list[FrameRows] = []
     for own, group in groupby(tasks, lambda task: task.plan or plan):
         alike, camera, at_once = list(group), own.camera, 1
-        if camera is not None and own.drawing is None:
+        if camera is not None:
             at_once = max(1, PIXELS_AT_ONCE // (camera.width * camera.height))
         for first in range(0, len(alike), at_once):
             batch = alike[first : first + at_once]
@@ -225,7 +221,6 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                 "markers": len(found.markers or ()),
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
-            picture=_drawn(rows, found, plan),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
@@ -280,7 +275,7 @@ def _disc_rows(
         taken = {number for own in ids for number in own}
         left = [disc for disc in known.mapped if disc.id not in taken]
         without = [k for k, own in enumerate(ids) if own == (-1,)]
-        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, known.slack_m)
+        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, _MAP_SIGMA_M)
         for k, number in zip(without, found.tolist()):
             ids[k] = (number,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
@@ -300,27 +295,6 @@ def _disc_records(
         }
         for pixel, evidence, row in zip(found.pixels.tolist(), found.evidence.tolist(), rows)
     ]
-
-
-def _drawn(rows: Mapping[str, str], found: FrameDetections, plan: FramePlan) -> bytes | None:
-    """The picture of a plan, a PNG file."""
-    if found.image is None or plan.drawing is None:
-        return None
-    from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
-    from detect.drawing.inputs import SeenRows
-
-    table = tables_of(plan).verticals
-    if plan.drawing == "tracks" and found.lines is not None and table:
-        return png_of(draw_tracks(found.image, table, found.lines))
-    kind = "circles" if plan.drawing == "discs" else "markers" if plan.markers else "lines"
-    frame = _frame_of(rows[kind])
-    settings = plan.circles or CircleSettings()
-    sight = Sight(plan.camera, settings.radius_m) if plan.camera else None
-    frames: dict[str, Any] = {kind: frame}
-    seen = SeenRows(**frames, tilt=found.tilt)
-    name = Path(frame.step.prefix).name
-    picture = draw_rows(found.image, sight, seen, settings, name)
-    return png_of(picture if found.markers is None else draw_candidates(picture, found.markers))
 
 
 def level_run(
@@ -404,12 +378,6 @@ def _levelled(
     for k, row in zip(np.flatnonzero(down).tolist(), level):
         texts[frame_of_row[k]] += f"{format_record(row)} {' '.join(words[k][7:])}\n"
     return texts
-
-
-def _frame_of(text: str) -> Frame:
-    """A frame from its rows."""
-    (frame,) = frames_of_rows(parse_rows(io.BytesIO(text.encode("utf-8", "surrogateescape"))))
-    return frame
 
 
 def _lines(text: str) -> list[str]:

@@ -1,8 +1,8 @@
 """The files that a run is written to: each its kind, its place, its head, its rows; and the log.
 
 The log, ``<output>.log.json``, states the program and its settings, the frames that could not be
-processed and why, how much was found, and the size and hash of the other files. Nothing in it
-depends on the time of day or on the workers: the same run writes the same bytes.
+processed and why, and how much was found. Nothing in it depends on the time of day or on the
+workers: the same run writes the same bytes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ LEVELLED = "corrected for the tilt of the frames that have one"
 #: The kind of the tilts that a second pass makes (`detect.runs.frame`).
 RUN_TILT = "run tilt"
 
-_LOG_BEGIN = b'{\n "program": "redetect",'
 _ROBOT = "Robot frame: origin on the floor, X left, Y backward (forward is -Y), metres, radians."
 _STEP = "STEP <image> <dX> <dY> <dPhi> <cXX> <cXY> <cYY> <cXPhi> <cYPhi> <cPhiPhi>"
 _TILT_ROWS = (
@@ -189,21 +188,8 @@ def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
 # -- the log --------------------------------------------------------------------------------
 
 
-def is_log(path: Path) -> bool:
-    """Whether there is a log at a path, which may be replaced: no other file, and no link."""
-    if path.is_symlink() or not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        return stream.read(len(_LOG_BEGIN)) == _LOG_BEGIN
-
-
-def log_text(
-    job: Job,
-    summary: RunSummary,
-    failures: Sequence[Mapping[str, object]],
-    written: Sequence[Mapping[str, object]],
-) -> str:
-    """The content of a log: `failures` of frames, and what was `written`."""
+def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, object]]) -> str:
+    """The content of a log; `failures` are those of frames."""
     plan = job.plan
     settings = {"circles": plan.circles, "lines": plan.lines, "markers": plan.markers}
     document = {
@@ -220,7 +206,6 @@ def log_text(
         "images_left_out": summary.images_without_step,
         "found": {kind: summary.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
         "rejected": dict(sorted(summary.rejected.items())),
-        "outputs": written,
         "exit_code": EXIT_FRAMES_FAILED if summary.failed else 0,
     }
     return f"{json.dumps(document, indent=1)}\n"

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -59,7 +59,6 @@ class KnownOfFrame(NamedTuple):
     discs: tuple[CircleLandmark, ...] = ()
     discs_level: bool = False
     mapped: tuple[MappedDisc, ...] = ()
-    slack_m: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,6 @@ class Known:
     discs_level: bool = False  # whether these are corrected for the tilt
     #: Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
     mapped: ByPrefix[Sequence[MappedDisc]] | None = None
-    slack_m: float = 0.1  # standard deviation of where these are, besides their covariances
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
@@ -84,7 +82,6 @@ class Known:
             discs.circles if discs else (),
             self.discs_level,
             tuple(self.mapped.get(prefix) or ()) if self.mapped else (),
-            self.slack_m,
         )
 
 
@@ -141,8 +138,6 @@ class MapByImage:
         return [MappedDisc(number, *values) for number, values in zip(ids, numbers)]
 
 
-Drawing = Literal["discs", "lines", "tracks", "markers"]
-
 #: Number of failures whose messages a summary keeps.
 KEPT_FAILURES = 100
 
@@ -159,9 +154,6 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: What is drawn into the image, if pictures have a place: "tracks" are all of the lines', with
-    #: why some are no lines.
-    drawing: Drawing | None = None
     #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
     #: done, of the run.
     levelling: Levelling = "frame"
@@ -177,7 +169,6 @@ class Job:
     #: The files to write: "circles", "lines", "tilt", "markers", "json" (the discs once more).
     places: Mapping[str, Path]
     known: Known = field(default_factory=Known)
-    pictures: Path | None = None  # folder for those of the plan
     #: What log, journal and times are called but for their endings; None: the first of the places.
     base: Path | None = None
     command: str = ""  # what the log calls the run
@@ -185,11 +176,6 @@ class Job:
     overwrite: bool = False
     strict: bool = False  # whether the first frame that cannot be worked on ends the run
     resume: bool = False  # whether the frames that an unfinished run kept are taken over
-
-    @property
-    def ships_images(self) -> bool:
-        """Whether tasks or their results are as large as images."""
-        return self.pictures is not None or self.run.frames.ships_images
 
     def beside(self, ending: str) -> Path:
         """A file beside the results that is called like them."""
@@ -218,7 +204,6 @@ class FrameRows(NamedTuple):
     found: Mapping[str, int] = {}  # how many "discs", "lines", "tilts" and "markers"
     rejected: Mapping[str, int] = {}  # how many candidates for markers, by cause
     error: str | None = None  # why there are no landmarks
-    picture: bytes | None = None  # a PNG file
 
 
 @dataclass

@@ -39,15 +39,15 @@ import numpy as np
 
 from detect import __version__
 from detect.errors import DetectError
-from detect.runs.outputs import Output, is_log, log_text, outputs_of
+from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
 from detect.sources.interface import RunFrame
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
-_JOURNAL_VERSION = 6
+_JOURNAL_VERSION = 7
 
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
@@ -71,8 +71,8 @@ class Journal:
         self.file.stream.flush()
 
     def write_frames(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Write the rows of frames that are done, without their pictures."""
-        self.write(*([task_digest(task), *rows[:-1]] for task, rows in frames))
+        """Write the rows of frames that are done."""
+        self.write(*([task_digest(task), *rows] for task, rows in frames))
 
     def write_complete(self, parts: Sequence[int], *, overwrite: bool) -> None:
         """Note that the results are on the disk, in these parts, and only have to be renamed."""
@@ -142,7 +142,7 @@ def task_digest(task: FrameTask) -> str:
     Of an image file, name, size and time of change count.
     """
     frame = task.frame
-    beside = (frame.step, _file_of(frame), frame.time_s, frame.bits, frame.failure, task.known)
+    beside = (frame.step, _file_of(frame), frame.time_s, frame.failure, task.known)
     return _digest_of(repr(beside), b"" if frame.content is None else bytes(frame.content))
 
 
@@ -183,12 +183,8 @@ def detect_run(
         are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
-    if job.pictures is None:
-        plan = replace(plan, drawing=None)
-    else:
-        make_folder(job.pictures)
     job = replace(job, plan=plan)
-    workers = workers or local_workers(1, large=job.ships_images)
+    workers = workers or local_workers(1, large=job.run.frames.ships_images)
     summary = RunSummary()
 
     def count(rows: FrameRows) -> None:
@@ -200,10 +196,6 @@ def detect_run(
         files = stack.enter_context(RunFiles(job))
         tasks = files.take_over(stack.enter_context(closing(_tasks(job))), count)
         for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
-            for _, rows in frames:
-                if job.pictures is not None and rows.picture is not None:
-                    path = job.pictures / f"{Path(rows.prefix).name}.png"
-                    write_bytes(path, rows.picture, overwrite=files.may_replace_pictures)
             files.add(frames)
             for _, rows in frames:
                 count(rows)
@@ -241,8 +233,8 @@ class RunFiles:
         self._base, self._log_path = job.beside(""), job.beside(".log.json")
         self._paths = [*(output.path for output in self._outputs), self._log_path]
         self._made_by = made_by(self._outputs, job.plan)
-        self._overwrite, self._resumable = job.overwrite, True
-        self._frames = self._taken_over = 0
+        self._overwrite, self._keep = job.overwrite, True
+        self._frames = 0
         self._resumes = self._done = False
         self._journal: Journal
 
@@ -295,21 +287,18 @@ class RunFiles:
             part = left_part(path, number=number)
             if part is not None:
                 with part:
-                    part.replace(path, overwrite=overwrite or self._may_replace(path))
+                    part.replace(path, overwrite=overwrite)
 
     def _begin(self) -> None:
         file = new_part(self._base, "journal", named=self._paths[0])
         self._journal = Journal(file)
         try:
             if file.number > 0:
-                self._resumable = False
-                if not self._overwrite:
-                    place = self._base.with_name(f".{self._base.name}.journal")
-                    raise DetectError(
-                        f"{place}: another run is writing these files: wait for it, or, if it was "
-                        "killed on another machine, remove this file"
-                    )
-                _log.info("another run is writing these files: this one cannot be resumed")
+                place = self._base.with_name(f".{self._base.name}.journal")
+                raise DetectError(
+                    f"{place}: another run is writing these files: wait for it, or, if it was "
+                    "killed on another machine, remove this file"
+                )
             self._journal.write([self._made_by])
         except BaseException:
             file.remove()
@@ -318,11 +307,7 @@ class RunFiles:
     def _demand_places(self) -> None:
         """Refuse to replace what must not be, or cannot be."""
         for path in self._paths:
-            demand_place(path, overwrite=self._may_replace(path))
-
-    def _may_replace(self, path: Path) -> bool:
-        """Whether an existing file may be replaced: the log always, if it is one."""
-        return self._overwrite or (path == self._log_path and is_log(path))
+            demand_place(path, overwrite=self._overwrite)
 
     # -- frames -----------------------------------------------------------------------------
 
@@ -342,23 +327,14 @@ class RunFiles:
             self._frames += 1
             count(rows)
         self._journal.cut()
-        self._taken_over = self._frames
         _log.info("%d frames of an unfinished run are taken over", self._frames)
         return chain(beyond, tasks)
 
-    @property
-    def may_replace_pictures(self) -> bool:
-        """Whether pictures may be replaced: a resumed run may have drawn the next ones."""
-        return self._overwrite or (self._resumes and self._frames == self._taken_over)
-
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
         """Note the next frames."""
-        try:
-            for _, rows in frames:
-                self._demand_strictly(rows)
-        except DetectError:
-            self._resumable = False  # nothing is kept
-            raise
+        self._keep = not self._job.strict or all(rows.error is None for _, rows in frames)
+        for _, rows in frames:
+            self._demand_strictly(rows)
         self._journal.write_frames(frames)
         self._frames += len(frames)
 
@@ -390,13 +366,12 @@ class RunFiles:
                         separators[output.kind] = output.between
             for output, part in results:
                 part.stream.write(output.encoded(output.tail))
-            written = [_described(output, part) for output, part in results]
             failures = [
                 {"frame": number, "prefix": rows.prefix, "reason": rows.error}
                 for number, (_, rows) in enumerate(self._journal.frames())
                 if rows.error is not None
             ]
-            parts[-1].stream.write(log_text(self._job, summary, failures, written).encode())
+            parts[-1].stream.write(log_text(self._job, summary, failures).encode())
             for part in parts:
                 part.sync()
             self._place(parts)
@@ -408,7 +383,7 @@ class RunFiles:
             self._journal.write_complete([part.number for part in parts], overwrite=self._overwrite)
             try:
                 for path, part in zip(self._paths, parts):
-                    part.replace(path, overwrite=self._may_replace(path))
+                    part.replace(path, overwrite=self._overwrite)
             except OutputExistsError:
                 raise
             except BaseException:
@@ -420,7 +395,7 @@ class RunFiles:
         journal = self._journal.file
         if (
             self._done
-            or not self._resumable
+            or not self._keep
             or isinstance(error, OutputExistsError)  # another process was faster
             or not (self._frames or self._resumes)
             or journal.stream.closed
@@ -431,11 +406,3 @@ class RunFiles:
         journal.close()
         if self._frames:
             _log.info("%d frames are kept: --resume goes on after them", self._frames)
-
-
-def _described(output: Output, part: PartFile) -> dict[str, object]:
-    """Name, size and hash of a result, for the log."""
-    size = part.stream.tell()
-    part.stream.seek(0)
-    sha256 = hashlib.file_digest(part.stream, "sha256").hexdigest()
-    return {"name": output.path.name, "bytes": size, "sha256": sha256}

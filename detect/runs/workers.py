@@ -193,8 +193,8 @@ def _cores() -> int:
 def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Workers:
     """Processes of this machine; 1 is this process itself.
 
-    Of `large` tasks, which carry images or bring pictures back, each has one frame. With `shared`,
-    one that has to compile has the kernels compiled by two or three others at the same time.
+    Of `large` tasks, which carry images, each has one frame. With `shared`, one that has to compile
+    has the kernels compiled by two or three others at the same time.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")

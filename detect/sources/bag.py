@@ -4,11 +4,8 @@ The images are one topic of sensor_msgs/Image or sensor_msgs/CompressedImage, in
 recording; the odometry is a topic of nav_msgs/Odometry, read beside them. The time of a message is
 that of its header or, where that is zero, of its recording.
 
-A bag may also hold the calibration: camera_info, and by tf_static where the camera is. The
-intrinsics are converted to the project's model, and refused where that cannot follow them. The
-pose is the chain of static transforms from the robot's base *on the floor* to the camera's optical
-frame (x right, y down, z forward), brought to the data set's axes. Without one, only what needs no
-floor can be detected.
+A bag may also hold the lens's calibration, camera_info: it is converted to the project's model, and
+refused where that cannot follow it. Only what needs no floor can be detected with it alone.
 """
 
 from __future__ import annotations
@@ -23,24 +20,20 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
-from camera.uncertainty import with_pose
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import (
     RunFrame,
     Source,
     gray_of_pixels,
     numbered_prefix,
-    significant_bits,
     still,
 )
 from detect.sources.poses import (
-    DATASET_FROM_ROBOTICS,
     FARTHEST,
     PoseStream,
     TimedPose,
@@ -195,14 +188,11 @@ def compressed_content(message: Any, name: object) -> bytes:
     return bytes(message.data)
 
 
-#: What ROS calls the robot's base on the floor (REP 105, REP 120).
-BASE_FRAME = "base_footprint"
 #: Largest deviation of a conversion from the camera_info, anywhere in the image.
 LIMIT_PX = 0.05
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ODOMETRY, _INFO = "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
-_STATIC = ("/tf_static", "tf2_msgs/msg/TFMessage")
 
 # x, y and the rotation about z, in the 6x6 covariances of ROS.
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
@@ -213,21 +203,16 @@ _INDEFINITE = 1e-9
 class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
-    The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; topic and frame as in
-    `SourceOptions`. 16-bit images have as many significant bits as the first one needs, if not
-    named.
+    The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; the topic as in
+    `SourceOptions`.
     """
 
-    def __init__(
-        self, path: Path, image_topic: str = "", bits: int | None = None, base_frame: str = ""
-    ) -> None:
+    def __init__(self, path: Path, image_topic: str = "") -> None:
         self.path = path
         self.name = str(path)
         self.stem = path.name if path.is_dir() else path.stem
         self.beside = path.parent, self.stem
         self.output_base = path.with_name(f"{self.stem}.detected")
-        self._bits = bits
-        self._base_frame = base_frame or BASE_FRAME
         with opened_bag(path) as reader:
             self.topic = chosen_topic(
                 reader, path, (_IMAGE, _COMPRESSED), image_topic, "images", "--image-topic"
@@ -235,7 +220,6 @@ class Bag(Source):
             self.expected = sum(c.msgcount for c in reader.connections if c.topic == self.topic)
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        bits = self._bits
         with opened_bag(self.path) as reader:
             said = messages(reader, self.path, self.topic)
             for number, (kind, recorded_s, message) in enumerate(said):
@@ -249,19 +233,17 @@ class Bag(Source):
                         if kind == _COMPRESSED:
                             content = compressed_content(message, name)
                         else:
-                            pixels = pixels_of_message(message, name)
-                            bits = bits or significant_bits(pixels)
-                            content = gray_of_pixels(pixels, name, bits)
+                            content = gray_of_pixels(pixels_of_message(message, name), name)
                 except FrameError as error:
                     failure = str(error)
-                # Of compressed images the bits are those of PNG files: 16, or named.
-                step = still(prefix)
-                yield RunFrame(step, None, content, time_s, self._bits or 16, failure)
+                yield RunFrame(still(prefix), None, content, time_s, failure)
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The ``.cam`` file beside it: of its name, or the only one; else what it holds itself."""
+        """The ``.cam`` file beside it, of its name or the only one; else its own: no pose."""
         beside = super().calibration(posed=posed)
-        return beside or _recorded_calibration(self.path, self.topic, self._base_frame, posed)
+        if beside is not None or posed:
+            return beside
+        return _recorded_calibration(self.path, self.topic)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
@@ -306,8 +288,6 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
     total = np.zeros((3, 3))
     for pose, twist in poses:
         if before is not None:
-            assert before.covariance is not None
-            assert pose.covariance is not None
             grown = pose.covariance - carried(before.covariance, before, pose)
             scale = float(np.abs(pose.covariance).max())
             if not np.any(grown) or np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:
@@ -321,10 +301,10 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
         before = pose
 
 
-def _recorded_calibration(path: Path, image_topic: str, base: str, posed: bool) -> Camera | None:
+def _recorded_calibration(path: Path, image_topic: str) -> Camera | None:
     """The calibration that a bag holds of the camera of a topic of images; None if there is none.
 
-    If it must be posed, one is refused that no static transforms lead to from the base.
+    It says nothing of the camera's pose.
     """
     with opened_bag(path) as reader:
         topic = _info_topic(reader, image_topic)
@@ -332,24 +312,11 @@ def _recorded_calibration(path: Path, image_topic: str, base: str, posed: bool) 
             return None
         name = f"{path}: {one_line(topic, LONGEST_NAME)}"
         found = next(messages(reader, path, topic), None)
-        with understood(name):
-            # Drivers that are not calibrated publish a matrix of zeros.
-            if found is None or not np.any(_field(found[2], "k")):
-                return None
-            message = found[2]
-            optical = str(message.header.frame_id)
-        transforms = static_transforms(reader, path)
-    pose = pose_in_dataset(transforms, base, optical)
-    if pose is None and posed:
-        raise DetectError(
-            f"{name} says nothing of the camera's pose above the floor, and no static "
-            f"transforms lead from {base!r} to {optical!r}: name a .cam file by --camera (`camera "
-            "convert` and `camera floor` make one), or the robot's base on the floor by "
-            "--base-frame"
-        )
     with understood(name):
-        camera = _camera_of_info(message, name)
-        return camera if pose is None else with_pose(camera, pose)
+        # Drivers that are not calibrated publish a matrix of zeros.
+        if found is None or not np.any(_field(found[2], "k")):
+            return None
+        return _camera_of_info(found[2], name)
 
 
 def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
@@ -380,48 +347,6 @@ def _camera_of_info(message: Any, name: str) -> Camera:
         )
     assert isinstance(converted.camera, Camera)
     return converted.camera
-
-
-def static_transforms(reader: AnyReader, path: Path) -> dict[str, tuple[str, FloatArray]]:
-    """Parent and 4x4 parent_from_child of each child frame, of a bag's ``/tf_static``."""
-    found: dict[str, tuple[str, FloatArray]] = {}
-    if all((c.topic, c.msgtype) != _STATIC for c in reader.connections):
-        return found
-    with understood(f"{path}: {_STATIC[0]}"):
-        for _, _, message in messages(reader, path, _STATIC[0]):
-            for item in message.transforms:
-                t, q = item.transform.translation, item.transform.rotation
-                placed = np.eye(4)
-                placed[:3, :3] = rotation_of(q.x, q.y, q.z, q.w)
-                placed[:3, 3] = (t.x, t.y, t.z)
-                found[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), placed)
-    return found
-
-
-def pose_in_dataset(
-    transforms: dict[str, tuple[str, FloatArray]], base: str, optical: str
-) -> FloatArray | None:
-    """The (3, 4) `robot_from_camera` of an optical frame; None if no chain leads to the base."""
-    placed, frame = np.eye(4), optical.lstrip("/")
-    for _ in range(len(transforms) + 1):
-        if frame == base:
-            return np.asarray(DATASET_FROM_ROBOTICS @ placed[:3], dtype=np.float64)
-        if frame not in transforms:
-            return None
-        frame, parent_from_child = transforms[frame]
-        with np.errstate(over="ignore", invalid="ignore"):  # no camera is so far away
-            placed = parent_from_child @ placed
-    return None  # a circle
-
-
-def rotation_of(qx: float, qy: float, qz: float, qw: float) -> FloatArray:
-    """The rotation matrix of a quaternion of any length but zero; else a ValueError."""
-    q = np.array([qx, qy, qz, qw], dtype=np.float64)
-    largest = np.abs(q).max()
-    if not 0.0 < largest < np.inf:
-        raise ValueError(f"a rotation of {qx:g}, {qy:g}, {qz:g}, {qw:g}")
-    # Squares of very large or small numbers overflow or underflow.
-    return np.asarray(Rotation.from_quat(q / largest).as_matrix())
 
 
 def _field(message: Any, letter: str) -> FloatArray:

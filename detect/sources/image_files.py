@@ -19,7 +19,6 @@ from detect.sources.interface import (
     RunFrame,
     Source,
     frame_prefix,
-    significant_bits_of_file,
     still,
 )
 from redetect.landmarks import read_steps
@@ -64,25 +63,14 @@ class ImageNames:
                 and matches(entry.name)
                 and (pattern.startswith(".") or not entry.name.startswith("."))
             )
-        self._names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
-        self._places: dict[str, int] = {}
-        for place, name in enumerate(self._names):
+        self.names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
+        self._called: dict[str, str] = {}  # by the name with and without its ending; the first
+        for name in self.names:
             for called in (name, name[: name.rindex(".")]):
-                self._places.setdefault(called, place)
+                self._called.setdefault(called, name)
 
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def path(self, index: int) -> Path:
-        """The image at a place in the order."""
-        return self.folder / self._names[index]
-
-    def find(self, name: str) -> int | None:
-        """The place of the image of a name, with or without its ending; the first of several."""
-        return self._places.get(name)
-
-    def place_of(self, prefix: str) -> int | None:
-        """The place of a step's image, by its name alone; None if there is none.
+    def image_of(self, prefix: str) -> Path | None:
+        """A step's image, by its name alone; None if there is none.
 
         A prefix that leads out of the run is a FrameError: a file of steps must not decide which
         other files are read.
@@ -91,11 +79,11 @@ class ImageNames:
         why = leads_out(name, *map(str, self._homes))
         if why is not None:
             raise FrameError(f"{excerpt(prefix)}: the prefix {why}: expected an image of the run")
-        return self.find(last_part(name))
+        found = self._called.get(last_part(name))
+        return None if found is None else self.checked(self.folder / found)
 
-    def checked(self, index: int) -> Path:
-        """The image at a place; a link that leads out of the run is a FrameError."""
-        path = self.path(index)
+    def checked(self, path: Path) -> Path:
+        """The path of an image; a link that leads out of the run is a FrameError."""
         if path.is_symlink() and link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
@@ -109,7 +97,7 @@ def images_of_folder(folder: Path) -> ImageNames:
     for place in (folder / "images", folder):
         if place.is_dir():
             found = ImageNames(place)
-            if len(found):
+            if found.names:
                 return found
     kinds = " ".join(sorted(IMAGE_SUFFIXES))
     raise DetectError(
@@ -121,20 +109,13 @@ def _suffix(name: str) -> str:
     return os.path.splitext(name)[1].lower()  # noqa: PTH122 - a Path for each name is slow
 
 
-def _natural_order(name: str) -> str:
-    """Sort key of names with numbers by value: before its digits, how many there are."""
-
-    def by_value(found: re.Match[str]) -> str:
-        digits = found[0].lstrip("0")
-        return f"\0{chr(1 + len(digits))}{digits}"
-
-    return f"{name[0].isdigit():d}{re.sub('[0-9]+', by_value, name)}"
+def _natural_order(name: str) -> list[tuple[int, str]]:
+    """Sort key of names with numbers by value, which come before letters' places."""
+    parts = re.findall("[0-9]+|[^0-9]+", name)
+    return [(-1, part) if not part.isdigit() else (int(part), "") for part in parts]
 
 
 WILDCARDS = frozenset("*?[")
-
-# Number of images, spread over all, that determine the significant bits.
-_SAMPLES = 5
 
 
 class RunFrames(Frames):
@@ -147,30 +128,25 @@ class RunFrames(Frames):
         self,
         images: ImageNames,
         odometry: Path,
-        bits: int,
         times: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self._images, self._odometry = images, odometry
-        self._bits, self._times = bits, times
+        self._times = times
         # Errors in the odometry are raised here, before any work is done.
         named = set()
         self.expected = 0
         for step in read_steps(odometry):
             self.expected += 1
             with suppress(FrameError):  # reported when the frame is processed
-                found = images.place_of(step.prefix)
-                if found is not None:
-                    images.checked(found)
-                    named.add(found)
-        self.left_out = len(images) - len(named)
+                named.add(images.image_of(step.prefix))
+        self.left_out = len(images.names) - len(named - {None})
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         for step in read_steps(self._odometry):
             try:
-                found = self._images.place_of(step.prefix)
-                image = None if found is None else self._images.checked(found)
+                image = self._images.image_of(step.prefix)
                 time_s = None if image is None else self._times.get(image.stem)
-                yield RunFrame(step, image, time_s=time_s, bits=self._bits)
+                yield RunFrame(step, image, time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
 
@@ -179,14 +155,13 @@ class ImageFiles(Source):
     """Images in natural order of their names.
 
     Calibration and times (``<folder>.times``, if not named) are in the run's folder, and results
-    are written there: the folder of the images, or the one above ``images/``. 16-bit images have
-    the significant bits that some of them need, if not named.
+    are written there: the folder of the images, or the one above ``images/``.
     """
 
     ships_images = False
     times_own = False
 
-    def __init__(self, name: Path, times: str = "", bits: int | None = None) -> None:
+    def __init__(self, name: Path, times: str = "") -> None:
         self.name = str(name)
         if name.is_dir():
             self._names, self._home = images_of_folder(name), name
@@ -194,36 +169,28 @@ class ImageFiles(Source):
             self._names, self._home = _matching_images(name), name.parent
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
-        # A pattern names its links; a folder may be somebody else's.
-        self._path = self._names.checked if name.is_dir() else self._names.path
+        self._is_pattern = not name.is_dir()
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
-        self.expected = len(self._names)
+        self.expected = len(self._names.names)
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
         self._times = read_times(times_file) if times or times_file.is_file() else {}
         self.has_times = bool(times) or times_file.is_file()
-        self._bits = bits_of_images(self._names) if bits is None else bits
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        for place in range(len(self._names)):
-            stem = self._names.path(place).stem
-            step, time_s = still(frame_prefix(stem)), self._times.get(stem)
+        for name in self._names.names:
+            path = self._names.folder / name
+            step, time_s = still(frame_prefix(path.stem)), self._times.get(path.stem)
             try:
-                yield RunFrame(step, self._path(place), time_s=time_s, bits=self._bits)
+                if not self._is_pattern:  # which names its links; a folder may be somebody else's
+                    path = self._names.checked(path)
+                yield RunFrame(step, path, time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
     def along(self, odometry: Path) -> RunFrames:
         """The images that a file of STEP rows names, in its order."""
-        return RunFrames(self._names, odometry, self._bits, self._times)
-
-
-def bits_of_images(names: ImageNames) -> int:
-    """Significant bits of 16-bit images: what some, spread over all, need; 16 if there are none."""
-    last = len(names) - 1
-    places = {round(k * last / (_SAMPLES - 1)) for k in range(_SAMPLES)}
-    found = [significant_bits_of_file(names.path(place)) for place in places if last >= 0]
-    return max((bits for bits in found if bits is not None), default=16)
+        return RunFrames(self._names, odometry, self._times)
 
 
 def _matching_images(pattern: Path) -> ImageNames:
@@ -235,7 +202,7 @@ def _matching_images(pattern: Path) -> ImageNames:
     if not pattern.parent.is_dir():
         raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
     found = ImageNames(pattern.parent, pattern.name)
-    if not len(found):
+    if not found.names:
         kinds = " ".join(sorted(IMAGE_SUFFIXES))
         raise DetectError(f"{pattern}: no image matches: expected {kinds}")
     return found

@@ -5,9 +5,9 @@ be long: frames are made on demand.
 
 Images of any kind become the 8-bit grey images of the detectors. Colour becomes
 0.299 R + 0.587 G + 0.114 B, as OpenCV has it (of a JPEG, the brightness that it stores). Of images
-with more than 8 bits, the 8 highest of their *significant* bits are kept: a 12-bit camera's values
-are stored in 16-bit files, and would be nearly black if all 16 were used. No image takes more
-memory than images of its run do, whatever its file is or claims to be.
+with 16 bits, the 8 highest of those that their values need are kept: a 12-bit camera's values are
+stored in 16-bit files, and would be nearly black otherwise. No image takes more memory than images
+of its run do, whatever its file is or claims to be.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ class RunFrame:
     #: The encoded image or (H, W) uint8 grey values, where it comes from no file of its own.
     content: bytes | GreyImage | None = field(default=None, compare=False, repr=False)
     time_s: float | None = None  # when it was taken, where that is known
-    bits: int = 16  # significant bits of a file with more than 8
     failure: str | None = None  # why there is no image, although there should be
 
 
@@ -68,7 +67,6 @@ class Source(Frames):
 
     name: str  # in messages
     output_base: Path  # results are called this, with an ending of their own
-    size: tuple[int, int] | None = None  # width and height, where they are known beforehand
     beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
     times_own = True  # images have times by themselves; of others, they can be named
     has_times = True
@@ -76,7 +74,7 @@ class Source(Frames):
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside it, or that it holds; None if there is none.
 
-        One of several is refused, and, if `posed`, one whose pose above the floor is not known.
+        One of several is refused; if `posed`, one whose pose above the floor is not known is none.
         """
         return None if self.beside is None else camera_in(*self.beside)
 
@@ -150,19 +148,19 @@ def read_image(
     if isinstance(frame.content, np.ndarray):
         image = frame.content
     elif frame.content is not None:
-        image = decode_gray(frame.content, name, frame.bits, size)
+        image = decode_gray(frame.content, name, size)
     elif frame.image is None:
         raise FrameError(f"{frame.step.prefix}: no image of that name in the run")
     else:
         path = os.path.join(working_folder or "", frame.image)  # noqa: PTH118 - faster than a Path
-        image = decode_gray(bounded_content(path, frame.image, size), name, frame.bits, size)
+        image = decode_gray(bounded_content(path, frame.image, size), name, size)
     if camera is not None and image.shape != (camera.height, camera.width):
         raise wrong_size(name, (image.shape[1], image.shape[0]), (camera.width, camera.height))
     return image
 
 
-#: Significant bits of a 16-bit image.
-BIT_DEPTHS = (8, 10, 12, 14, 16)
+#: Bits that cameras give; the fewest that hold the values of a 16-bit image are its own.
+_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
 # A file is at most as large as its uncompressed pixels, 16 bits in four channels, twice over for
 # formats that grow, plus thumbnails and other metadata that cameras write.
@@ -170,9 +168,7 @@ _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 
 
-def decode_gray(
-    content: bytes, name: object, bits: int = 16, size: tuple[int, int] | None = None
-) -> GreyImage:
+def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
     Parameters
@@ -180,15 +176,13 @@ def decode_gray(
     content : bytes
     name : object
         The image's name in messages.
-    bits : int
-        Significant bits of images that have more than 8 bits.
     size : (int, int) or None
         Width and height that are expected: an image that claims others is not decoded.
 
     Raises
     ------
     FrameError
-        If there is no image in it, it is cut off, or its values need more bits.
+        If there is no image in it, or it is cut off.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
@@ -198,15 +192,15 @@ def decode_gray(
     image = decoded_image(content)
     if image is None:
         raise FrameError(f"{name}: cannot be decoded: expected an image")
-    return gray_of_pixels(image, name, bits)
+    return gray_of_pixels(image, name)
 
 
-def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> GreyImage:
+def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
     """Bring pixels to (H, W) uint8 grey values, contiguous and writable.
 
     They are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps
-    opacity, of 8 or 16 bits, any byte order and strides; else, or if they need more bits, a
-    FrameError. `name` and `bits` as of `decode_gray`.
+    opacity, of 8 or 16 bits, any byte order and strides; else a FrameError. `name` as of
+    `decode_gray`.
     """
     dtype = pixels.dtype.newbyteorder("=")
     if dtype not in (np.uint8, np.uint16):
@@ -229,29 +223,8 @@ def gray_of_pixels(pixels: NDArray[Any], name: object, bits: int = 16) -> GreyIm
     if dtype == np.uint8:
         return gray
     largest = int(gray.max())
-    if largest >> bits:
-        raise FrameError(
-            f"{name}: a value of {largest} needs more than {bits} bits: "
-            "name the significant bits of these images by --bits"
-        )
+    bits = next(depth for depth in _BIT_DEPTHS if not largest >> depth)
     return (gray >> (bits - 8)).astype(np.uint8)
-
-
-def significant_bits(pixels: NDArray[Any]) -> int:
-    """The smallest of `BIT_DEPTHS` that holds all values of an image; 8 for an 8-bit image."""
-    largest = int(pixels.max(initial=0))
-    return next((bits for bits in BIT_DEPTHS if not largest >> bits), BIT_DEPTHS[-1])
-
-
-def significant_bits_of_file(path: Path) -> int | None:
-    """The significant bits of an image file; None if it is no image of 16 bits."""
-    try:
-        content = bounded_content(path, path, None)
-        demand_bounded(content, path, None)
-    except FrameError:
-        return None  # reported when the file is processed
-    image = decoded_image(content)
-    return None if image is None or image.dtype != np.uint16 else significant_bits(image)
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:

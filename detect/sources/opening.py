@@ -18,7 +18,6 @@ from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FirstFrames,
     FramesAlongPoses,
-    FramesAlongRows,
     PoseStream,
     tick_poses,
     tum_poses,
@@ -82,7 +81,8 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames: Frames
     odometry: Path | None
-    if options.plain and isinstance(source, ImageFiles) and (own := _own_odometry(name)):
+    own = None if options.odometry or options.times else _own_odometry(name)
+    if own is not None and isinstance(source, ImageFiles):
         frames, odometry, has_times = source.along(own), own, False
     else:
         frames, odometry = _frames(source, options)
@@ -92,12 +92,6 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     if camera is None:
         return run
-    if source.size is not None and source.size != (camera.width, camera.height):
-        raise DetectError(
-            f"{source.name}: is {source.size[0]}x{source.size[1]} px: expected "
-            f"{camera.width}x{camera.height}, the calibration's size: "
-            "name the calibration of this video by --camera"
-        )
     return run.calibrated(camera)
 
 
@@ -108,22 +102,19 @@ def _own_odometry(folder: Path) -> Path | None:
 
 
 def _source(name: Path, options: SourceOptions) -> Source:
-    bits = options.bits or None
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in _BAG_SUFFIXES
     if is_bag and name.exists():
         from detect.sources.bag import Bag  # takes as long as everything else
 
-        return Bag(name, options.image_topic, bits, options.base_frame)
+        return Bag(name, options.image_topic)
     if options.image_topic and not is_bag:
         raise DetectError(f"{name}: --image-topic {options.image_topic}: only bags have topics")
-    if options.base_frame and not is_bag:
-        raise DetectError(f"{name}: --base-frame {options.base_frame}: only bags have frames")
     if live := _LIVE.fullmatch(str(name)):
         return LiveCamera(int(live[1]))
     if name.is_file() and name.suffix.lower() not in IMAGE_SUFFIXES:
         return VideoFile(name)
     if name.exists() or WILDCARDS & set(str(name)):
-        return ImageFiles(name, options.times, bits)
+        return ImageFiles(name, options.times)
     raise DetectError(
         f"{name}: no such folder or file: expected a run folder, a folder of images, a pattern "
         "of images in quotes ('drive/*.png'), a video, a bag (.bag, .mcap), or camera:0"
@@ -148,10 +139,12 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
-        path = Path(named)
-        if isinstance(source, ImageFiles):
-            return source.along(path), path
-        return FramesAlongRows(source, path), path
+        if not isinstance(source, ImageFiles):
+            raise DetectError(
+                f"{named}: STEP rows are those of image files: expected a trajectory (.tum), "
+                f"ticks (.ticks), a bag's topic or none for {source.name}"
+            )
+        return source.along(Path(named)), Path(named)
     else:
         poses = None if named else source.poses(None)
     if poses is None:

@@ -4,7 +4,7 @@ A pose (x, y, theta) has the robot's X forward and Y left, as in ROS; a STEP its
 backward, in the robot's frame before it. Turning by the same angle is the same in both. Poses may
 come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from
 the counters of two wheels, rows ``t left right``. The robot moves on the floor: of its attitude the
-heading is taken, of its position x and y. Or the steps themselves are in a file.
+heading is taken, of its position x and y.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -20,11 +20,10 @@ from typing import NamedTuple
 import numpy as np
 
 from detect.errors import DetectError
-from detect.sources.image_files import last_part
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
-from redetect.landmarks import Step, read_steps, wrap_angle
-from redetect.storage.bounded import read_text
+from redetect.landmarks import Step, wrap_angle
+from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), such that products of two remain finite.
 FARTHEST = 1e12
@@ -40,21 +39,20 @@ _INDEFINITE, _ROUNDING = 1e-8, 1e-12
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
-_LARGEST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
     """Where a robot was: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
-    The (3, 3) covariance is that of (x, y, theta) since the start; None if unknown.
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
     """
 
     time_s: float
     x: float
     y: float
     theta: float
-    covariance: FloatArray | None = None
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 class PoseStream(NamedTuple):
@@ -78,13 +76,12 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     robot_from_fixed = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     pose = DATASET_FROM_ROBOTICS @ np.array([*(robot_from_fixed[:2, :2] @ moved), turn])
     c = np.zeros((3, 3))
-    if before.covariance is not None and after.covariance is not None:
-        grown = after.covariance - carried(before.covariance, before, after)
-        smallest, _, largest = np.linalg.eigvalsh(grown)
-        scale = float(np.abs(after.covariance).max())
-        if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
-            to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
-            c = to_dataset @ grown @ to_dataset.T
+    grown = after.covariance - carried(before.covariance, before, after)
+    smallest, _, largest = np.linalg.eigvalsh(grown)
+    scale = float(np.abs(after.covariance).max())
+    if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
+        to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
+        c = to_dataset @ grown @ to_dataset.T
     entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
     return Step(prefix, *map(float, (*pose, *entries)))
 
@@ -101,16 +98,13 @@ def carried(
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
     """The pose at a time between two: linear, the heading the shorter way round."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
-    covariance = None
-    if before.covariance is not None and after.covariance is not None:
-        grown = after.covariance - carried(before.covariance, before, after)
-        covariance = carried(before.covariance, before, after, share) + share * grown
+    grown = after.covariance - carried(before.covariance, before, after)
     return TimedPose(
         time_s,
         before.x + share * (after.x - before.x),
         before.y + share * (after.y - before.y),
         before.theta + share * float(wrap_angle(after.theta - before.theta)),
-        covariance,
+        carried(before.covariance, before, after, share) + share * grown,
     )
 
 
@@ -148,7 +142,7 @@ class PosesOverTime:
 
 def tum_poses(path: Path) -> Generator[TimedPose, None, None]:
     """The poses of a TUM trajectory."""
-    for place, row in _number_rows(path, "TUM trajectory", "t x y z qx qy qz qw"):
+    for place, row in rows_of_numbers(path, "TUM trajectory", "t x y z qx qy qz qw", DetectError):
         time_s, x, y, _, *quaternion = row
         if max(abs(x), abs(y)) > FARTHEST:
             raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
@@ -163,7 +157,8 @@ def tick_poses(
     """The poses of a robot with two driven wheels by its counters; arcs from row to row."""
     x = y = theta = 0.0
     last: tuple[float, float] | None = None
-    for place, (time_s, left, right) in _number_rows(path, "file of wheel ticks", "t left right"):
+    rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
+    for place, (time_s, left, right) in rows:
         if last is not None:
             ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
             way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
@@ -175,28 +170,6 @@ def tick_poses(
             theta += 2.0 * half_turn
         last = (left, right)
         yield TimedPose(time_s, x, y, theta)
-
-
-def _number_rows(path: Path, what: str, columns: str) -> Iterator[tuple[str, list[float]]]:
-    """The place and the finite numbers of each row of a file of some columns.
-
-    Between them are blanks or commas; ``#`` begins a comment.
-    """
-    count = len(columns.split())
-    lines = read_text(path, _LARGEST_BYTES, what, DetectError).split("\n")
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise DetectError(
-                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
-            )
-        yield f"{path}:{number}", values
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
@@ -230,34 +203,6 @@ class FramesAlongPoses(Frames):
                     image = replace(image, step=step_between(image.step.prefix, last, pose))
                 yield image
                 last = pose
-
-
-class FramesAlongRows(Frames):
-    """The frames of a source whose STEP rows are in a file, by the last parts of their prefixes.
-
-    Images without a row are no part of the run; rows without an image are frames that cannot be
-    worked on, at the end.
-    """
-
-    why_left_out = "images are not named by a STEP row: left out"
-
-    def __init__(self, source: Source, path: Path) -> None:
-        self._source = source
-        self._steps = {last_part(step.prefix.strip('"')): step for step in read_steps(path)}
-        self.ships_images, self.expected = source.ships_images, source.expected
-
-    def __iter__(self) -> Generator[RunFrame, None, None]:
-        self.left_out = 0
-        steps = dict(self._steps)
-        with closing(iter(self._source)) as images:
-            for image in images:
-                step = steps.pop(image.step.prefix, None)
-                if step is None:
-                    self.left_out += 1
-                else:
-                    yield replace(image, step=step)
-        for step in steps.values():
-            yield RunFrame(step, None)
 
 
 class FirstFrames(Frames):

@@ -37,8 +37,6 @@ class VideoFile(Source):
         self.output_base = path.with_name(f"{path.stem}.detected")
         with _opened(path) as capture:
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-            width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-            self.size = (width, int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         self.expected = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
 
     def __iter__(self) -> Generator[RunFrame, None, None]:

@@ -304,22 +304,6 @@ def camera_of(camera: CameraLike) -> Camera:
     return camera if isinstance(camera, Camera) else read_camera(camera)
 
 
-def grey_image(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """An array as an image to be searched.
-
-    Raises
-    ------
-    FrameError
-        If it is no grey image of 8 bits.
-    """
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise FrameError(
-            f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 of "
-            "shape (H, W); files of colours or 16 bits can be named by their path"
-        )
-    return np.ascontiguousarray(image)
-
-
 def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
     """A picture as HTML, its content in it."""
     content = base64.b64encode(png_of(picture)).decode()
@@ -329,7 +313,12 @@ def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
-        return RunFrame(still("image"), None, content=grey_image(image))
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise FrameError(
+                f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 "
+                "of shape (H, W); files of colours or 16 bits can be named by their path"
+            )
+        return RunFrame(still("image"), None, content=np.ascontiguousarray(image))
     path = Path(image)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")

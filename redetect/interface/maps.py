@@ -195,8 +195,8 @@ def localize(
     circles, lines : bool
         Which landmarks to use.
     **options
-        Further flags of `slam localize` (`redetect.slam.options.Localize`), such as `association`,
-        `start` or `map_errors`.
+        Further flags of `slam localize` (`redetect.slam.options.Localize`), such as `association`
+        or `start`.
 
     Returns
     -------

@@ -22,7 +22,7 @@ class CircleArrays:
     xy: FloatArray  #: (N, 2) centres in the robot frame (m)
     quality: FloatArray  #: (N,) confidence, 0 to 1
     covariance: FloatArray  #: (N, 2, 2) of `xy` (m^2)
-    ids: IntArray  #: (N,) each row's first identifier; -1 where it is unknown or missing
+    ids: IntArray  #: (N,) each row's first identifier that is known; -1 where none is
 
 
 def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
@@ -34,7 +34,7 @@ def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
         xy=numbers[:, :2].copy(),
         quality=numbers[:, 2].copy(),
         covariance=numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2),
-        ids=np.array([c.ids[0] if c.ids else -1 for c in circles], dtype=np.int64),
+        ids=np.array([next((i for i in c.ids if i >= 0), -1) for c in circles], dtype=np.int64),
     )
 
 

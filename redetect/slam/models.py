@@ -132,6 +132,21 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
     return np.concatenate([-by_disc, turned[..., None]], axis=-1), by_disc
 
 
+#: Of the camera above the floor (m).
+CAMERA_HEIGHT_M = 1.5
+
+
+def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
+    """How a small tilt of the robot moves the places on the floor that a camera seems to see.
+
+    Takes `disc_xy` (n, 2); returns (n, 2, 2).
+    """
+    x, y = disc_xy.T
+    rows = (x * y / height_m, -height_m - x**2 / height_m)
+    others = (height_m + y**2 / height_m, -x * y / height_m)
+    return np.stack([np.stack(rows, -1), np.stack(others, -1)], axis=1)
+
+
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
     """Measurement model of a vertical line: the bearing under which the camera sees it.
 

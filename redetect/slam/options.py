@@ -117,10 +117,6 @@ class Localize(FilterFlags):
     """
 
     map: Path  # The map (written by `slam map`).
-    # `considered`: the map's covariances are errors that stay the same each time a landmark is
-    # seen; `ignored`: the map is exact. By default (`auto`) considered with known association, else
-    # ignored.
-    map_errors: Literal["auto", "considered", "ignored"] = "auto"
     # Standard deviations of the pose at the start.
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Nothing is known of the pose at the start: it is found by the discs of the first frames,
@@ -137,10 +133,6 @@ class Ekf(FilterFlags):
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
     """
 
-    # Where the models are linearised: at the `first` estimate of each landmark, so that the filter
-    # gains no spurious information about its heading from landmarks that it has placed itself; or
-    # at the `latest`, as the textbook filter does, which is inconsistent at large heading errors.
-    jacobians: Literal["first", "latest"] = "first"
     reference_map: MaybePath = None  # A map.csv to measure the distance of the landmarks from.
     # Folder for map.csv, path.csv, ekf.json and pictures; by default `slam/ekf` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

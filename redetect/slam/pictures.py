@@ -20,7 +20,6 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -48,7 +47,7 @@ _CROPS_ABREAST, _CROP_PX = 8, 48.0
 _MOST_NUMBERED = 40
 # Largest number of landmarks whose ellipses are drawn.
 _MOST_ELLIPSES = 700
-# How far beyond path and discs a vertical may be and still be drawn.
+# How far beyond path and discs verticals are drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
 
@@ -158,14 +157,9 @@ def draw_map(
             ("after closing loops", landmark_map, path),
         ]
     low, high = _extent([(m, p) for _, m, p in panels], reference)
-    span = high - low
-    stacked = len(panels) > 1 and span[0] > 1.5 * span[1]
-    rows, columns = (len(panels), 1) if stacked else (1, len(panels))
-    largest = (9.0, 8.0) if len(panels) == 1 else (10.0, 6.0) if stacked else (7.0, 7.5)
-    scale = min(largest[0] / span[0], largest[1] / span[1])
-    size = (max(scale * span[0] * columns, 6.0) + 1.2, scale * span[1] * rows + 1.8)
-    ticks = MaxNLocator(12, steps=[1, 2, 5, 10]).tick_values(0.0, float(np.max(span)))
-    spacing = float(ticks[1] - ticks[0])
+    width, height = (8.0 * (high - low) / np.max(high - low)).tolist()
+    rows, columns = (len(panels), 1) if width > 1.5 * height else (1, len(panels))
+    size = max(columns * width, 6.0) + 1.2, rows * height + 1.8
     with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
@@ -173,9 +167,6 @@ def draw_map(
             axes.set_xlim(low[0], high[0])
             axes.set_ylim(low[1], high[1])
             axes.set_aspect("equal")
-            # Squares of one size: a scale for the eye.
-            axes.xaxis.set_major_locator(MultipleLocator(spacing))
-            axes.yaxis.set_major_locator(MultipleLocator(spacing))
             axes.set_title(name, fontsize=11)
             axes.set_xlabel("x / m")
             axes.set_ylabel("y / m")
@@ -255,23 +246,16 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
 def _extent(
     drawn: list[tuple[LandmarkMap, Path2D]], reference: Path2D | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners of the picture (m): all paths and discs, and the verticals not far from them."""
+    """Corners of the picture (m): all paths and discs, and a margin for verticals near them."""
     points = [xy for some, path in drawn for xy in (path.poses[:, :2], some.discs.xy)]
     if reference is not None:
         points.append(reference.poses[:, :2])
     inner = np.concatenate(points)
     low, high = inner.min(axis=0), inner.max(axis=0)
-    reach = np.minimum(_MARGIN_M, _MARGIN_SHARE * float(np.max(high - low)) + 1.0)
-    for some, _ in drawn:
-        near = _inside(some.lines.xy, low - reach, high + reach)
-        for landmarks, shown in ((some.discs, slice(None)), (some.lines, near)):
-            # With their ellipses, but an unknown place shall not shrink the known ones.
-            variance = np.diagonal(landmarks.covariance[shown], axis1=1, axis2=2)
-            around = np.minimum(3.0 * np.sqrt(np.clip(variance, 0.0, None)), 0.5 * reach)
-            places = landmarks.xy[shown]
-            inner = np.concatenate([inner, places - around, places + around])
-    low, high = inner.min(axis=0), inner.max(axis=0)
-    margin = max(0.03 * float(np.max(high - low)), 0.3)
+    span = float(np.max(high - low))
+    margin = max(0.05 * span, 0.3)
+    if any(len(some.lines) for some, _ in drawn):
+        margin = min(_MARGIN_M, _MARGIN_SHARE * span + 1.0)
     # A straight drive has next to no width, but shall have a picture.
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + margin
     half = np.maximum(half, 0.2 * float(half.max()))
@@ -333,8 +317,7 @@ def _draw_landmarks(
     shown = _inside(some.xy, low, high)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
-    # Many landmarks are close together: with small dots their ellipses remain visible, and where
-    # there are hundreds the dots alone show walls.
+    # Where there are hundreds of landmarks, small dots alone show walls.
     size = 4.0 if len(some) <= 100 else 2.0
     axes.plot(
         some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
@@ -342,17 +325,14 @@ def _draw_landmarks(
     )  # fmt: skip
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any() and ellipses:
-        outlines = ellipse_outlines(some.xy[known], some.covariance[known])
-        # The fillings of hundreds of overlapping ellipses would hide everything else.
-        filling, edge, width = (0.15, 1.0, 0.7) if len(some) <= 100 else (0.05, 0.55, 0.5)
         patches = PolyCollection(
-            list(outlines),
-            facecolors=[(*to_rgb(colour), filling)],
-            edgecolors=[(*to_rgb(colour), edge)],
-            linewidths=width,
+            list(ellipse_outlines(some.xy[known], some.covariance[known])),
+            facecolors=(*to_rgb(colour), 0.1),
+            edgecolors=colour,
+            linewidths=0.7,
             zorder=2,
+            label=f"3 {_SIGMA} of {name}",
         )
-        patches.set_label(f"3 {_SIGMA} of {name}")
         axes.add_collection(patches, autolim=False)
 
 

@@ -14,10 +14,12 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import (
     Frame,
     Step,
+    circle_arrays,
     circle_landmarks,
     is_positive_definite,
     read_frames,
 )
+from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
 
@@ -34,12 +36,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
-_STEP_COLUMNS = (
-    *("dx", "dy", "dphi"),
-    *("cxx", "cxy", "cxphi"),
-    *("cxy", "cyy", "cyphi"),
-    *("cxphi", "cyphi", "cphiphi"),
-)
+# Where in a STEP row the numbers of its covariance are.
+_STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +270,8 @@ def recording_of_frames(
     if not frames:
         raise SlamError(f"{name}: no STEP row: expected a run")
     steps = [frame.step for frame in frames]
-    numbers = np.array([[getattr(step, name) for name in _STEP_COLUMNS] for step in steps])
-    covariance = numbers[:, 3:].reshape(-1, 3, 3)
+    numbers = np.array([numbers_of_step(step) for step in steps])
+    covariance = numbers[:, _STEP_COVARIANCE]
     if not np.any(numbers):
         raise SlamError(
             f"{name}: no odometry: all {len(steps)} steps and their covariances are 0; expected "
@@ -317,20 +315,15 @@ def frames_of_discs(recording: Recording) -> list[Frame]:
 
 def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
     seen = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
-    rows = CircleRows.of(
-        (
-            *(k, (r.px, r.py), ((r.cxx, r.cxy), (r.cxy, r.cyy))),
-            next((i for i in r.ids if i >= 0), UNKNOWN_ID),
-        )
-        for k, r in seen
-    )
+    rows = circle_arrays([row for _, row in seen])
     for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
         k, row = seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
             "has a covariance that is not positive definite"
         )
-    return rows
+    frame = np.array([k for k, _ in seen], dtype=np.int64)
+    return CircleRows(frame, rows.xy, rows.covariance, rows.ids)
 
 
 def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:

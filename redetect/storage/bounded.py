@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from redetect.storage.messages import one_line
 
+_LARGEST_TEXT_BYTES = 1 << 28
+
 
 def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
     """The content of a regular file of at most `largest_bytes`, or of what a link leads to.
@@ -81,6 +83,30 @@ def read_text(
         return read_content(path, largest_bytes, kind, error).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise error(f"{path}: cannot be read as a {kind}: it is no text") from None
+
+
+def rows_of_numbers(
+    path: str | os.PathLike[str], kind: str, columns: str, error: type[Exception]
+) -> Iterator[tuple[str, list[float]]]:
+    """The place and the finite numbers of each row of a text file of some columns.
+
+    Between them are blanks or commas; ``#`` begins a comment. What is no such file is an `error`.
+    """
+    count = len(columns.split())
+    lines = read_text(path, _LARGEST_TEXT_BYTES, kind, error).split("\n")
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise error(
+                f"{path}:{number}: {' '.join(words)[:60]!r}: expected {count} numbers: {columns}"
+            )
+        yield f"{path}:{number}", values
 
 
 def writable_by_others(state: os.stat_result) -> str | None:

@@ -32,14 +32,11 @@ class Ros:
     """Messages of ROS 1 or 2, without ROS."""
 
     def __init__(self, kind: BagKind = "mcap") -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags.typesys import Stores, get_typestore
 
         self.kind = kind
         self.is1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is1 else Stores.ROS2_HUMBLE)
-        if self.is1:  # not among those that come with the package
-            definition = "geometry_msgs/TransformStamped[] transforms\n"
-            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
 
     def make(self, name: str, **fields: Any) -> Any:
         return self.store.types[name](**fields)
@@ -126,32 +123,6 @@ class Ros:
             INFO, header=header, height=height, width=width, distortion_model=model,
             roi=region, **numbers, **fields,
         )  # fmt: skip
-
-    def static_transforms(self, *placed: tuple[str, str, NDArray[Any]]) -> Any:
-        """Parents, children and (3, 4) parent_from_child."""
-        from scipy.spatial.transform import Rotation
-
-        made = []
-        for parent, child, pose in placed:
-            qx, qy, qz, qw = Rotation.from_matrix(pose[:, :3]).as_quat()
-            x, y, z = pose[:, 3]
-            header = self.header(0.0)
-            header.frame_id = parent
-            name = "geometry_msgs/msg/"
-            transform = self.make(
-                f"{name}Transform",
-                translation=self.make(f"{name}Vector3", x=x, y=y, z=z),
-                rotation=self.make(f"{name}Quaternion", x=qx, y=qy, z=qz, w=qw),
-            )
-            made.append(
-                self.make(
-                    f"{name}TransformStamped",
-                    header=header,
-                    child_frame_id=child,
-                    transform=transform,
-                )
-            )
-        return self.make("tf2_msgs/msg/TFMessage", transforms=made)
 
     def write(self, path: Path, said: Sequence[Said]) -> Path:
         """Record messages; gives the path by which the bag is read."""

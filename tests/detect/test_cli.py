@@ -201,13 +201,11 @@ def test_existing_drawings_stay(small_run: Path, tmp_path: Path, capsys: Capture
     drawings = tmp_path / "drawings"
     drawings.mkdir()
     (drawings / "s.0001.png").write_text("precious")
-    before = files_in(small_run)
     assert main(["circles", str(small_run), "--draw", str(drawings)]) == 1
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("error: ")
     assert "s.0001.png" in last
     assert (drawings / "s.0001.png").read_text() == "precious"
-    assert files_in(small_run) == before
 
 
 @pytest.mark.parametrize("flag", ["-o", "--json"])
@@ -364,7 +362,7 @@ def test_demands_decide_the_exit_code(
     shown = capsys.readouterr()
     lines = shown.err.splitlines()
     assert len(lines) == unmet
-    assert all("recall" in line for line in lines)
+    assert all(line.startswith("recall is 0.7500: at least 0.") for line in lines)
     assert "0.75" in shown.out or "75" in shown.out
 
 

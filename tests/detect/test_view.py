@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from camera import read_camera
 from detect.cli import main
 from detect.seen import summed_steps
 from redetect.landmarks import Step, read_frames
@@ -77,19 +76,13 @@ def test_recording_holds_frames_rows_and_path(
     detected = list(read_frames(small_run / "detected.circles"))
     wanted = [len(frame.circles) for frame in detected]
     assert sum(wanted) == 3
-    counts = {row["frame"]: row["Scalars:scalars"] for row in found["/count/discs"]}
-    assert counts == {k: [float(count)] for k, count in enumerate(wanted)}
-    for entity in ("/camera/image", "/world/robot", "/count/verticals"):
+    for entity in ("/camera/image", "/world/robot", "/world/robot/discs"):
         assert [row["frame"] for row in found[entity]] == [0, 1, 2]
         assert all("time" not in row for row in found[entity])
-    outlines = {r["frame"]: r["LineStrips2D:strips"] for r in found["/camera/image/discs"]}
-    assert [len(outlines[k]) for k in range(3)] == wanted
-    # The outline's middle is where the disc is in the image; Rerun counts from the corner.
-    camera = read_camera(small_run / "s.cam")
+    discs = {r["frame"]: r["LineStrips3D:strips"] for r in found["/world/robot/discs"]}
+    assert [len(discs[k]) for k in range(3)] == wanted
     first = detected[0].circles[0]
-    seen = camera.project_floor(np.array([[first.px, first.py]]))[0] + 0.5
-    middle = np.mean(outlines[0][0][:-1], axis=0)
-    assert np.linalg.norm(middle - seen) < 2.0
+    np.testing.assert_allclose(np.mean(discs[0][0], axis=0), [first.px, first.py, 0.0], atol=1e-3)
     robot = {r["frame"]: r["Transform3D:translation"][0] for r in found["/world/robot"]}
     poses = summed_steps([frame.step for frame in detected])
     np.testing.assert_allclose([robot[k][:2] for k in range(3)], poses[1:, :2], atol=1e-6)
@@ -113,5 +106,5 @@ def test_times_of_a_video_are_in_its_recording(small_run: Path, tmp_path: Path) 
     assert main(["circles", str(video), *camera]) == 0
     output = tmp_path / "v.rrd"
     assert main(["view", str(video), *camera, "-o", str(output)]) == 0
-    times = [row["time"].total_seconds() for row in read_back(output)["/count/discs"]]
+    times = [row["time"].total_seconds() for row in read_back(output)["/world/robot"]]
     assert times == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)

@@ -33,11 +33,11 @@ def as_bag(folder: Path, images: Images) -> Path:
 def rows(small_run_template: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Flags that name what was found in the small run, and a reference that differs from it."""
     folder = tmp_path_factory.mktemp("rows")
-    found, reference = folder / "found.circles", folder / "map.circles"
+    found, reference = folder / "detected.circles", folder / "map.circles"
     run = str(small_run_template)
     assert main(["circles", run, "-o", str(found)]) == 0
     assert main(["circles", run, "--preset", "published", "-o", str(reference)]) == 0
-    return ["--circles", str(found), "--reference", str(reference)]
+    return ["--rows", str(folder), "--reference", str(reference)]
 
 
 def looked_at(source: Path, rows: list[str], output: Path) -> dict[str, bytes]:
@@ -46,7 +46,7 @@ def looked_at(source: Path, rows: list[str], output: Path) -> dict[str, bytes]:
     output.mkdir()
     assert main(["draw", str(source), *rows, "-o", str(drawn)]) == 0
     assert main(["report", str(source), *rows, "-o", str(page)]) == 0
-    grid = ["--threshold", "0.3,0.6,0.9", "--jobs", "1"]
+    grid = ["--vary", "threshold=0.3,0.6,0.9", "--jobs", "1"]
     assert main(["tune", str(source), *grid, *rows[2:], "-o", str(tuned)]) == 0
     return {path.name: path.read_bytes() for path in [page, *drawn.iterdir(), tuned / "table.json"]}
 
@@ -92,5 +92,5 @@ def test_a_live_camera_shows_something_else_by_now(
     if command == "view":
         pytest.importorskip("rerun")
     arguments = [command, "camera:0", "-o", str(small_run / "output")]
-    arguments += ["--threshold", "0.5"] if command == "tune" else []
+    arguments += ["--vary", "threshold=0.5"] if command == "tune" else []
     assert_refused(arguments, small_run, "camera:0: shows other images now", capsys)

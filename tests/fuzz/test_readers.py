@@ -162,7 +162,7 @@ NASTY = [
     ("settings", b"# settings threshold=1-2\n", "expected a number"),
     ("settings", b"# settings polarity=" + b"x" * 60_000, "expected one of"),
     # The time of a message in SQLite's own column is bytes.
-    ("sqlite cells", b"/tf_static", "message 1 of /cam/image_raw cannot be read"),
+    ("sqlite cells", b"\x07\x28\0\5bytes", "message 1 of /cam/image_raw cannot be read"),
     # The images' type is of 255 characters that must not reach a terminal.
     ("sqlite cells", b"\x04\x07\0\xff" + b"\x1b" * 255, "no images in it, but \\x1b"),
     ("trajectory", b"0 0 0 0 0 0 0 1\n1 1e300 0 0 0 0 0 1\n", "at most 1e+12 m"),

@@ -121,7 +121,10 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         (odd / f"Robot1_{name}.dat").write_text(text + ("1.0 2.0\n" if name == "Odometry" else ""))
     target = str(odd / "run.circles")
     assert main(["import", str(odd / "Robot1_Odometry.dat"), "-o", target]) == 1
-    assert "Robot1_Odometry.dat:2404: 2 numbers: expected time, v, omega" in capsys.readouterr().err
+    assert (
+        "Robot1_Odometry.dat:2404: '1.0 2.0': expected 3 numbers: time v omega"
+        in capsys.readouterr().err
+    )
     assert main(["import", str(odd / "Robot1_Measurement.dat"), "-o", target]) == 1
     assert "expected a RobotN_Odometry.dat" in capsys.readouterr().err
     (odd / "aa3_dr.mat").write_text("no matrix")

@@ -57,11 +57,11 @@ def test_a_robot_that_turned_left_ahead_of_the_start(tmp_path: Path) -> None:
     [
         ("", "no poses"),
         ("# only a comment\n", "no poses"),
-        ("0 1 2 0 0 0 0\n", ":1: 7 values: expected 8"),
-        ("0 1 2 0 0 0 0 1\n\n1 nan 2 0 0 0 0 1\n", ":3: x is 'nan'"),
-        ("0 1,0 2 0 0 0 0 1\n", ":1: x is '1,0'"),
-        ("0 1 1e999 0 0 0 0 1\n", ":1: y is '1e999'"),
-        ("1 1 2 0 0 0 0 1\n1 1 2 0 0 0 0 1\n", ":2: t is 1: expected more"),
+        ("0 1 2 0 0 0 0\n", ":1: .*expected 8 numbers: t x y z"),
+        ("0 1 2 0 0 0 0 1\n\n1 nan 2 0 0 0 0 1\n", ":3: .*expected 8 numbers"),
+        ("0 1,0 2 0 0 0 0 1\n", ":1: .*expected 8 numbers"),
+        ("0 1 1e999 0 0 0 0 1\n", ":1: .*expected 8 numbers"),
+        ("1 1 2 0 0 0 0 1\n1 1 2 0 0 0 0 1\n", ":2: t is 1.0: expected more"),
         ("0 1 2 0 0 0 0 0.9\n", ":1: qx qy qz qw are no unit quaternion"),
         ("0 1 2 0.5 0 0 0 1\n", ":1: expected a pose on the floor"),
         ("0 1 2 0 0.6 0 0 0.8\n", ":1: expected a pose on the floor"),
@@ -86,5 +86,5 @@ def test_damaged_files_are_read_or_refused(
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(SlamError, match="no such file"):
+    with pytest.raises(SlamError, match="no such TUM trajectory"):
         read_tum(tmp_path / "p.tum")

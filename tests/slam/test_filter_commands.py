@@ -54,7 +54,6 @@ def test_map_then_localise(run: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert len(landmark_map.discs) == 31
     assert len(landmark_map.lines) > 30
     content = json.loads((first / "ekf.json").read_text())
-    assert content["settings"]["jacobians"] == "first"
     assert content["landmarks"]["discs"] == 31
     assert content["figures"]["rows_left_out"]["disc without ID"] == 10
 
@@ -68,7 +67,6 @@ def test_map_then_localise(run: Path, capsys: pytest.CaptureFixture[str]) -> Non
         "errors.png",
     }
     content = json.loads((second / "localize.json").read_text())
-    assert content["map_errors"] == "considered, jointly"
     distance = content["figures"]["distance_from_reference"]
     assert distance["position_rms_m"] < 0.1
     path = read_path(second / "path.csv")
@@ -103,7 +101,6 @@ def test_identities_are_found_in_the_demo_run(run: Path, known: Path, method: st
     some_map = ["--map", str(known / "map.csv")]
     assert main(["localize", str(run), "--association", method, *some_map, *reference]) == 0
     content = json.loads((run / "slam/localize/localize.json").read_text())
-    assert content["map_errors"] == "ignored"
     assert content["figures"]["disc_rows_used"] > 290
     assert content["figures"]["distance_from_reference"]["position_max_m"] < 0.15
     assert main(["ekf", str(run), "--association", method, "-o", str(run / "found")]) == 0

@@ -13,7 +13,7 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import Associator, frames_of, run_filter
-from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.filters.localizer import Localizer
 from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
@@ -73,7 +73,6 @@ def drive(seed: int, *, noise: float = 1.0) -> tuple[Recording, LandmarkMap, Flo
 def dense(
     recording: Recording,
     some: LandmarkMap,
-    map_errors: MapErrors,
     joint: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Poses and covariances by full matrices of pose and map, the map's gain set to zero."""
@@ -83,10 +82,9 @@ def dense(
     blocks = np.zeros((size, size))
     for i, block in enumerate(np.concatenate([some.discs.covariance, some.lines.covariance])):
         blocks[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = block
-    if map_errors == "considered":
-        P += blocks
-        if joint is not None:
-            P[3:, 3:] = joint
+    P += blocks
+    if joint is not None:
+        P[3:, 3:] = joint
     predicted = pose
     poses, covariances = [pose], [P[:3, :3]]
     for k, rows in enumerate(frames_of(recording)):
@@ -94,7 +92,7 @@ def dense(
         pose = move(pose, recording.steps[k])
         F = np.eye(size)
         F[:3, :3] = by_pose
-        if map_errors == "considered":
+        if np.any(P[3:, 3:]):
             F[0, 2], F[1, 2] = predicted[1] - pose[1], pose[0] - predicted[0]
             predicted = pose
         P = F @ P @ F.T
@@ -135,11 +133,11 @@ def dense(
     return np.array(poses), np.array(covariances)
 
 
-@pytest.mark.parametrize("map_errors", ["considered", "ignored"])
-def test_the_localizer_is_the_plain_dense_filter(map_errors: MapErrors) -> None:
+@pytest.mark.parametrize("exact", [False, True])
+def test_the_localizer_is_the_plain_dense_filter(exact: bool) -> None:
     recording, some, _ = drive(1)
-    run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY, map_errors=map_errors))
-    poses, covariances = dense(recording, some, map_errors)
+    run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY, exact=exact))
+    poses, covariances = dense(recording, some, np.zeros((40, 40)) if exact else None)
     np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
     assert run.path.covariance is not None
     np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)
@@ -152,7 +150,7 @@ def test_errors_that_landmarks_have_in_common_are_considered() -> None:
     joint = spd(np.random.default_rng(8), 40, 0.1)
     localizer = Localizer(replace(some, joint_covariance=joint), camera_xy=CAMERA_XY)
     run = run_filter(recording, localizer)
-    poses, covariances = dense(recording, some, "considered", joint)
+    poses, covariances = dense(recording, some, joint)
     np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
     assert run.path.covariance is not None
     np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)
@@ -201,7 +199,7 @@ def test_a_wrong_start_is_forgotten_when_it_is_said_to_be_uncertain() -> None:
         np.array([0.3, -0.2, 0.1]),
         np.diag([0.25, 0.25, 0.04]),
         CAMERA_XY,
-        map_errors="ignored",
+        exact=True,
     )
     run = run_filter(recording, localizer)
     assert np.hypot(*(run.path.poses[-1] - truth[-1])[:2]) < 0.01

@@ -105,7 +105,7 @@ def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
 def test_marginals_with_mounting_are_those_of_the_dense_inverse(published_camera: Camera) -> None:
     weighting = Weighting(calibrate=True)
     graph, estimate = _problem(published_camera)
-    estimate = solve(graph, estimate, weighting).estimate
+    estimate = solve(graph, estimate, weighting).at
     found = marginals(graph, estimate, weighting)
     problem = linearise(graph, estimate, weighting)
     jacobian = np.hstack([problem.jacobian.toarray(), problem.border])

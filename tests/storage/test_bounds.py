@@ -17,7 +17,7 @@ ROOMS = ("camera", "detect", "lut", "redetect")
 #: commands hand on to settings.
 NO_SETTINGS = frozenset(
     {
-        "FileHead", "FrameRows", "Known", "PickedFrames",
+        "FileHead", "FrameRows", "Known",
         "RowCount", "RowFiles", "RunSummary", "SeenRows", "_Rows",
     }
 )  # fmt: skip

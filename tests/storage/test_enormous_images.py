@@ -55,7 +55,7 @@ def test_chunks_of_a_png_that_claim_gigabytes(tmp_path: Path, chunk: bytes, deep
     with pytest.raises(CameraError, match="not an image that can be read"):
         read_grey(path)
     with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
-        decode_gray(bytes(content), path, 16, (8, 8))
+        decode_gray(bytes(content), path, (8, 8))
 
 
 def test_pictures_of_other_kinds_of_numbers(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def measure_run(run: Path, folder: Path) -> Iterator[tuple[str, ...]]:
     """Detect a run in each of the ways, compare and map it; files go into `folder`.
 
     Each row: what made the rows, their number, the share of shipped identifiers found again, the
-    median difference on the floor after the common lean, and chi-squared over its expectation of
+    median difference on the floor levelled alike, and chi-squared over its expectation of
     the least-squares map, as calibrated and with the camera's mounting as unknown.
     """
     shipped, camera = run / "map.circles", next(run.glob("*.cam"))
@@ -65,8 +65,7 @@ def measure_run(run: Path, folder: Path) -> Iterator[tuple[str, ...]]:
                 "redetect", "slam", "map", rows, "--camera", camera, "-o", mapped, *calibrate
             )
             factors.append(json.loads((mapped / "table.json").read_text())["table"]["factor"])
-        left = (result["lean"] or {}).get("left", {})
-        median_m = left.get("median_m", result["error_median_m"])
+        median_m = result["error_median_m"]
         yield (
             way, f"{result['detected'] + result['set_aside']:,}",
             f"{result['matched'] / result['reference']:.4f}",

@@ -12,8 +12,7 @@ import numpy as np
 
 from camera import CameraError
 from detect.errors import DetectError
-from detect.sources import bag as ros_bag
-from detect.sources.bag import Bag, pose_in_dataset, static_transforms
+from detect.sources.bag import Bag
 from detect.sources.poses import step_between
 from tests.detect.recordings import BagKind, Ros, Said
 from tools.fuzz.bag_cells import bag_with_edits
@@ -22,7 +21,7 @@ from tools.fuzz.reader import Reader
 _WORDS = (
     b"sensor_msgs/msg/Image", b"sensor_msgs/msg/CompressedImage", b"nav_msgs/msg/Odometry",
     b"sensor_msgs/msg/CameraInfo", b"tf2_msgs/msg/TFMessage", b"std_msgs/msg/Header", b"mono8",
-    b"/tf_static", b"/cam/camera_info", b"MCAP0\r\n", b"lz4", b"zstd", b"uint8[] data", b"cdr",
+    b"/cam/camera_info", b"MCAP0\r\n", b"lz4", b"zstd", b"uint8[] data", b"cdr",
     b"Header header", b"float64[9] k", b"string encoding", b"#ROSBAG V2.0\n", b"op=\x02", b"conn=",
     b"ros2msg",
 )  # fmt: skip
@@ -32,7 +31,7 @@ def _bag(path: Path) -> object:
     """All that `detect` asks of a bag.
 
     The calibration that it begins with is none, so that no camera is fitted to it, which takes
-    seconds; the transforms are read all the same.
+    seconds.
     """
     bag = Bag(path)
     images = list(bag)
@@ -42,23 +41,19 @@ def _bag(path: Path) -> object:
     odometry = bag.poses(None)
     poses = [] if odometry is None else list(odometry.read())
     steps = [step_between("e", *pair) for pair in pairwise(poses)]
-    with ros_bag.opened_bag(path) as reader:
-        transforms = static_transforms(reader, path)
-    return images, steps, pose_in_dataset(transforms, "b", "o")
+    return images, steps
 
 
 @cache
 def _recorded(kind: BagKind) -> bytes:
-    """A bag of an image, its calibration and pose, and odometry."""
+    """A bag of an image, its calibration, and odometry."""
     ros = Ros(kind)
     pixels = np.arange(64, dtype=np.uint8).reshape(8, 8)
-    placed = np.column_stack([np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.5]])
     said = [
         Said("/cam/image_raw", 5e-9, ros.image(pixels, "mono8", 1.0)),
         Said("/cam/camera_info", 5e-9,
              ros.camera_info(8, 8, "plumb_bob", [0.0] * 5, [0.0] * 9, "frame")),
         Said("/odom", 5e-9, ros.odometry(1.0, 2.0, 0.0, 1.0, np.zeros((3, 3)))),
-        Said("/tf_static", 5e-9, ros.static_transforms(("b", "o", placed))),
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         bag = ros.write(Path(folder) / "b", said)

@@ -16,14 +16,12 @@ from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
-from detect.runs.outputs import is_log
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import (
     bounded_content,
     decode_gray,
     gray_of_pixels,
-    significant_bits_of_file,
 )
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
@@ -55,21 +53,17 @@ def _header(path: Path) -> object:
 
 
 def _image(path: Path) -> object:
-    """As frames are decoded, whatever their significant bits."""
+    """As frames are decoded."""
     content = bounded_content(path, path, _SIZE)
-    image = decode_gray(content, path, 16, _SIZE)
+    image = decode_gray(content, path, _SIZE)
     assert image.dtype == np.uint8
     assert image.ndim == 2
-    return decode_gray(content, path, 12, _SIZE)
+    return image
 
 
 def _small(path: Path) -> bool:
     size = claimed_size(path.read_bytes()) if path.is_file() else None
     return size is None or size[0] * size[1] <= _MOST_PIXELS
-
-
-def _deep_image(path: Path) -> object:
-    return significant_bits_of_file(path) if _small(path) else None
 
 
 def _calibration_image(path: Path) -> object:
@@ -114,7 +108,7 @@ class _Message:
 
 
 def _image_message(path: Path) -> object:
-    image = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path, 12)
+    image = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image
@@ -214,7 +208,6 @@ _DETECT, _FRAME = (DetectError,), (FrameError,)
 DETECT_READERS: tuple[Reader, ...] = (
     Reader("image header", "image", _header, (), _HEADERS, _IMAGE_WORDS),
     Reader("image", "e.0000.jpg", _image, _FRAME, (), _IMAGE_WORDS, made_seeds=_encoded),
-    Reader("deep image", "e.png", _deep_image, (), (), _IMAGE_WORDS, made_seeds=_encoded),
     Reader("calibration image", "e.png", _calibration_image, (CameraError,), (), _IMAGE_WORDS,
            made_seeds=_encoded),
     Reader("image message", "message", _image_message, _FRAME, _MESSAGES, _ENCODINGS, needed=False),
@@ -224,9 +217,6 @@ DETECT_READERS: tuple[Reader, ...] = (
            NUMBERS),
     Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
-    Reader("log", "detected.log.json", is_log, (),
-           (b'{\n "program": "redetect",\n "version": "0.1.0"\n}\n',),
-           (b"{", b"}", b"\xef\xbb\xbf"), needed=False),
     Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,
            made_seeds=_table_content),
 )  # fmt: skip

@@ -103,7 +103,7 @@ def solve_path(
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
     start = Estimate(poses, disc_xy, places[known])
-    found = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance).estimate
+    found = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance).at
     places[known] = found.line_xy
     return LabelledMap(found.poses, found.disc_xy, places)
 

@@ -27,11 +27,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import compose, rotation
-from redetect.slam.association.frame_to_frame import (
-    LocalAssociation,
-    associate_locally,
-    tilt_jacobian,
-)
+from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
     closed_path,
@@ -54,7 +50,7 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.association.placing import ANYWHERE, lay_together
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 
@@ -108,7 +104,7 @@ def associate_run(
     setting = settings or AssociateSettings()
     report = progress or (lambda _: None)
     local = _associated_locally(recording, setting, camera_xy, report)
-    circle_labels, line_labels = local.circle_labels, local.line_labels
+    circle_labels, line_labels = local
     matches: tuple[Match, ...] = ()
     path = None
     if setting.map_level:
@@ -142,8 +138,8 @@ def associate_run(
     return RunAssociation(
         in_order(circle_labels),
         in_order(line_labels),
-        in_order(local.circle_labels),
-        in_order(local.line_labels),
+        in_order(local[0]),
+        in_order(local[1]),
         matches,
         path,
     )
@@ -151,21 +147,20 @@ def associate_run(
 
 def _associated_locally(
     recording: Recording, setting: AssociateSettings, camera_xy: ArrayLike, report: Progress
-) -> LocalAssociation:
+) -> tuple[IntArray, IntArray]:
     """Labels from frame to frame; of a run with discs and lines, discs are associated alone."""
     both = len(recording.circles) > 0 and len(recording.lines) > 0
-    local = associate_locally(
+    circle_labels, line_labels = associate_locally(
         recording,
         # Bearings say more of a frame's heading than discs, whose sway would only blur it.
         replace(setting, tilt_sigma_deg=0.0) if both else setting,
         camera_xy=camera_xy,
         progress=lambda done: report(f"frame {done} of {len(recording)}"),
     )
-    if not both:
-        return local
-    # Discs help to associate lines; lines are often confused and would only harm the discs.
-    discs_alone = associate_locally(_without_lines(recording), setting)
-    return replace(local, circle_labels=discs_alone.circle_labels)
+    if both:
+        # Discs help to associate lines; lines are often confused and would only harm the discs.
+        circle_labels, _ = associate_locally(_without_lines(recording), setting)
+    return circle_labels, line_labels
 
 
 class _Closed(NamedTuple):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
 
 from redetect.array_types import IntArray
 
@@ -35,52 +35,37 @@ class AssociationScore:
 
 
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:
-    """Score labels.
+    """Score labels (n,).
 
-    Two rows show one landmark where they have an ID in common. For `wrong_merges` and `splits`, and
-    for the one-to-one matching, a row with several IDs counts as the one among them that most rows
-    of its label have.
-
-    Takes `labels` (n,).
+    A row with several IDs counts as the one among them that most rows of its label have.
     """
     known = np.array([len(listed) > 0 for listed in ids], dtype=np.bool_)
     given = np.asarray(labels, dtype=np.int64)[known]
     unlabelled = given < 0
     given = np.where(unlabelled, given.max(initial=0) + 1 + np.arange(len(given)), given)
     found, label = np.unique(given, return_inverse=True)
-    # Rows with the same IDs are counted together: pairs of rows are too many in long runs.
-    sets = [frozenset(listed) for listed in ids if listed]
-    kinds = {some: k for k, some in enumerate(dict.fromkeys(sets))}
-    kind = np.array([kinds[some] for some in sets], dtype=np.int64)
-    names = sorted(frozenset().union(*kinds))
-    shows = np.array([[name in some for name in names] for some in kinds], dtype=np.int64)
-    shows = shows.reshape(len(kinds), len(names))
-    one = np.ones(len(sets), dtype=np.int64)
-    cells = csr_array((one, (kind, label)), shape=(len(kinds), len(found)))
+    listed = [numbers for numbers in ids if numbers]
+    votes = Counter((k, i) for k, numbers in zip(label.tolist(), listed) for i in set(numbers))
+    chosen = [max(n, key=lambda i: (votes[k, i], -i)) for k, n in zip(label.tolist(), listed)]
+    landmarks, landmark = np.unique(np.array(chosen, dtype=np.int64), return_inverse=True)
+    table = np.zeros((len(found), len(landmarks)), dtype=np.int64)
+    np.add.at(table, (label, landmark), 1)
 
-    alike = (csr_array(shows) @ csr_array(shows.T) > 0).astype(np.int64)
-    rows, of_label = np.bincount(kind), np.bincount(label)
-    totals = rows @ (alike @ rows), of_label @ of_label, (alike @ cells).multiply(cells).sum()
-    # Each pair was counted twice, and each row with itself.
-    same_landmark, same_label, both = ((int(total) - len(sets)) // 2 for total in totals)
+    def pairs(counts: IntArray) -> int:
+        return int(np.sum(counts * (counts - 1))) // 2
 
-    # A row counts as the one of its IDs that most rows of its label have.
-    votes = cells.T @ shows
-    counted = cells.tocoo()
-    of_kind, of_found = counted.row, counted.col
-    chosen = np.where(shows[of_kind] > 0, votes[of_found], -1).argmax(axis=1) if names else of_kind
-    table = np.zeros((len(found), len(names)), dtype=np.int64)
-    np.add.at(table, (of_found, chosen), counted.data)
+    same_label, same_landmark, both = map(pairs, (table.sum(axis=1), table.sum(axis=0), table))
     table[label[unlabelled]] = 0
     matched = linear_sum_assignment(table, maximize=True)
+    rows = len(listed)
     return AssociationScore(
-        rows=len(sets),
+        rows=rows,
         unlabelled_rows=int(np.count_nonzero(unlabelled)),
-        true_landmarks=len(np.unique(chosen)),
+        true_landmarks=len(landmarks),
         found_landmarks=len(found) - int(np.count_nonzero(unlabelled)),
         pair_precision=both / same_label if same_label else 1.0,
         pair_recall=both / same_landmark if same_landmark else 1.0,
-        right_rows=float(table[matched].sum() / len(sets)) if len(sets) else 1.0,
+        right_rows=float(table[matched].sum() / rows) if rows else 1.0,
         wrong_merges=int(np.sum(np.maximum(np.count_nonzero(table, axis=1) - 1, 0))),
         splits=int(np.sum(np.maximum(np.count_nonzero(table, axis=0) - 1, 0))),
     )

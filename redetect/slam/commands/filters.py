@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +37,7 @@ from redetect.slam.commands.files import (
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.frames import Associator, FilterRun, run_filter
-from redetect.slam.filters.localizer import Localizer, MapErrors
+from redetect.slam.filters.localizer import Localizer
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
@@ -47,15 +47,8 @@ from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 ERROR_PICTURE = "errors.png"
 
 
-class _Result(NamedTuple):
-    """What a filter found."""
-
-    run: FilterRun
-    landmark_map: LandmarkMap
-    source: str  # of the path, for its head
-    title: str  # of the pictures
-    figures: dict[str, Any]  # of its own, for the JSON file
-    said: list[str]  # of its own, for the terminal
+#: What a filter found: the run, the map, and what else is said of it.
+_Result = tuple[FilterRun, LandmarkMap, list[str]]
 
 
 def perform(command: Localize | Ekf) -> int:
@@ -69,11 +62,15 @@ def perform(command: Localize | Ekf) -> int:
         names += [MAP_NAME, covariance_file(Path(MAP_NAME)).name]
     demand_free([output / name for name in names], overwrite=command.force)
     recording = recording_of(command)
+    began = time.perf_counter()
     if isinstance(command, Localize):
-        result = _localized(command, recording)
+        run, landmark_map, said = _localized(command, recording)
+        source, title = f"{command.run} in {command.map}", "localised"
     else:
-        result = _mapped(command, recording)
-    run = result.run
+        run, landmark_map, said = _mapped(command, recording)
+        source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
+    seconds = time.perf_counter() - began
+    said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference, distance = None, None
     if command.reference:
         reference = read_path(command.reference)
@@ -85,49 +82,47 @@ def perform(command: Localize | Ekf) -> int:
         distance = path_distance(run.path, reference.poses)
 
     output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam {name} {slam.__version__}: {result.source}"]
+    head = [f"slam {name} {slam.__version__}: {source}"]
     write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
-    content = {
+    content: dict[str, Any] = {
         "version": slam.__version__,
         "settings": flags_of(command),
         "figures": _figures(run, distance),
-        **result.figures,
     }
+    if isinstance(command, Ekf):
+        counts = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
+        content["landmarks"] = counts
+        if command.reference_map:
+            off = map_distance(landmark_map, read_map(command.reference_map))
+            content["distance_from_reference_map"] = off
+            said.append(
+                "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
+                "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
+            )
     write_json(output / f"{name}.json", content, overwrite=command.force)
-    print("\n".join([*_table(run, distance), *result.said]))
+    print("\n".join([*_table(run, distance), *said]))
     drawing: dict[str, Any] = {
-        "title": result.title,
+        "title": f"{command.run.name}: {title}",
         "overwrite": command.force,
         "interactive": command.interactive,
     }
-    draw_map(output / MAP_PICTURE, result.landmark_map, run.path, reference=reference, **drawing)
+    draw_map(output / MAP_PICTURE, landmark_map, run.path, reference=reference, **drawing)
     if reference is not None:
         draw_errors(output / ERROR_PICTURE, run.path, reference.poses, **drawing)
     if isinstance(command, Ekf):
-        write_map(output / MAP_NAME, result.landmark_map, head, overwrite=command.force)
+        write_map(output / MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
     landmark_map = read_map(command.map)
-    map_errors = _map_errors(command)
-    said = []
-    if map_errors == "considered":
+    said: list[str] = []
+    if command.association == "known":
         landmark_map = with_joint_covariance(landmark_map, command.map)
         if landmark_map.joint_covariance is None:
             name = covariance_file(command.map).name
             said.append(f"errors of the map taken as independent: no {name}")
-    jointly = ", jointly" if landmark_map.joint_covariance is not None else ""
-    began = time.perf_counter()
-    run = localized_run_of(command, recording, landmark_map)
-    return _Result(
-        run,
-        landmark_map,
-        f"{command.run} in {command.map}",
-        f"{command.run.name}: localised",
-        {"map_errors": map_errors + jointly},
-        [*said, _time_line(began, len(recording))],
-    )
+    return localized_run_of(command, recording, landmark_map), landmark_map, said
 
 
 def localized_run_of(
@@ -146,7 +141,9 @@ def localized_run_of(
         start,
         covariance,
         camera_xy_of(recording, command.run, command.camera),
-        map_errors=_map_errors(command),
+        # Considering the map's errors makes the filter slow to pull itself back onto it, which
+        # costs little as long as the pairs are right, and the track if they are to be found.
+        exact=command.association != "known",
     )
     associator = Associator(command.association, command.gate_probability)
     run = run_filter(recording, localizer, associator)
@@ -178,22 +175,11 @@ def _woken_up(
     return woken.pose, woken.covariance
 
 
-def _map_errors(command: Localize) -> MapErrors:
-    """How the map's errors are treated, where that is not said."""
-    if command.map_errors != "auto":
-        return command.map_errors
-    # Considering them makes the filter slow to pull itself back onto the map, which costs little
-    # as long as the pairs are right, and the track if they are to be found.
-    return "considered" if command.association == "known" else "ignored"
-
-
 def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = camera_xy_of(recording, command.run, command.camera)
-    ekf = EkfSlam(command.start, camera_xy=camera_xy, jacobians=command.jacobians)
+    ekf = EkfSlam(command.start, camera_xy=camera_xy)
     associator = Associator(command.association, command.gate_probability)
-    began = time.perf_counter()
     run = run_ekf(recording, ekf, associator)
-    time_line = _time_line(began, len(recording))
     landmark_map = ekf.landmark_map()
     discs, lines = len(landmark_map.discs), len(landmark_map.lines)
     if not discs and not lines:
@@ -201,28 +187,11 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
             f"{command.run}: no landmark in the map: expected rows with identifiers, or "
             "--association joint"
         )
-    figures: dict[str, Any] = {"landmarks": {"discs": discs, "lines": lines}}
     said = [f"landmarks         {discs} discs, {lines} lines"]
-    if command.reference_map:
-        off = map_distance(landmark_map, read_map(command.reference_map))
-        figures["distance_from_reference_map"] = off
-        said.append(
-            "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
-            "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
-        )
-    return _Result(
-        run,
-        landmark_map,
-        str(command.run),
-        f"{command.run.name}: EKF-SLAM, poses as they were at the time, map at the end",
-        figures,
-        [*said, time_line],
-    )
-
-
-def _time_line(began: float, steps: int) -> str:
-    seconds = time.perf_counter() - began
-    return f"time              {seconds:.2f} s, {steps / seconds:.0f} steps/s"
+    waiting = len(ekf.line_slots) - lines
+    if waiting:
+        said.append(f"                  {waiting} lines more, seen under too little parallax")
+    return run, landmark_map, said
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:

@@ -5,28 +5,29 @@ they were seen from (Smith, Self, Cheeseman: Estimating uncertain spatial relati
 1990). All rows of a frame are one measurement, so that all of them are linearised at the pose the
 odometry leads to.
 
-A vertical line is seen by its bearing only. As long as its bearings have too little parallax,
-copies of the poses they were seen from are kept in the state (stochastic cloning); then the line
-joins the state by all of them at once (`redetect.slam.filters.delayed_lines`). Each row is used
-once.
+A vertical line is seen by its bearing only. It is kept as the ray of its first sight, which begins
+at the camera's place then, and the inverse of its distance along the ray. In these four numbers
+bearings are nearly linear from the first sight on, however far the line may be (J. Civera, A. J.
+Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on
+Robotics 24(5), 2008).
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 from scipy.linalg.blas import dgemm
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
-from redetect.plane import rotation
+from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.delayed_lines import View, WaitingLines, relative_range_sigma, start_line
 from redetect.slam.filters.frames import (
     NO_CAMERA,
     POSE_SIZE,
@@ -34,17 +35,21 @@ from redetect.slam.filters.frames import (
     Filter,
     FilterRun,
     FrameRows,
-    Innovation,
-    innovation_of,
     run_filter,
 )
-from redetect.slam.recording import UNKNOWN_ID, Recording
+from redetect.slam.models import tilt_jacobian
+from redetect.slam.recording import Recording
 
-JacobiansAt = Literal["first", "latest"]
-
-#: A line joins the state when its distance is known to this share, so that bearings are nearly
-#: linear in its place.
+#: A line is in the map if its distance is known to this share: what uses its place as x and y
+#: takes bearings to be linear in these.
 LARGEST_RANGE_SIGMA = 0.05
+# Inverse distance of a line at first sight, and its standard deviation: half a metre to infinity
+# within two of these (1/m).
+_INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
+
+# Most iterations of an update with bearings, below which change it ends, and the largest change of
+# an inverse distance in one of them (1/m).
+_MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
 _POSE = np.arange(POSE_SIZE)
 # By as many numbers the state grows; some too many cost less than moving its covariance often.
@@ -62,13 +67,12 @@ class EkfSlam(Filter):
         Its covariance; none by default, as the start defines the map.
     camera_xy : (2,) array_like
         The camera's centre in the robot frame (m); only lines need it.
-    jacobians : str
-        `first`: evaluate them at the first estimate of each landmark and at the poses as predicted
-        (Huang, Mourikis, Roumeliotis: Observability-based rules for designing consistent EKF SLAM
-        estimators, 2010), so that landmarks that the filter has initialised itself give it no
-        spurious information about its heading. `latest`: at the latest estimates, as the textbook
-        filter does.
+    tilt_sigma_rad : float
+        Standard deviation of the robot's sway about both axes of the floor, beyond what the rows'
+        covariances say.
     """
+
+    line_size = 4
 
     def __init__(
         self,
@@ -76,197 +80,165 @@ class EkfSlam(Filter):
         start_covariance: ArrayLike | None = None,
         camera_xy: ArrayLike = NO_CAMERA,
         *,
-        jacobians: JacobiansAt = "first",
+        tilt_sigma_rad: float = 0.0,
     ) -> None:
-        super().__init__(start, start_covariance, camera_xy, first_estimates=jacobians == "first")
+        super().__init__(start, start_covariance, camera_xy)
+        self.tilt_sigma_rad = tilt_sigma_rad
         self.disc_rows: Counter[int] = Counter()
         self.line_rows: Counter[int] = Counter()
-        self.frame = -1
-        self._waiting = WaitingLines()
 
-    def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
-        super().predict(step, noise)
-        self.frame += 1
+    def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        """See `Filter.line_points`; the scale is the inverse distance along the first ray."""
+        x, y, direction, inverse = self._state[numbers].T
+        sin, cos = np.sin(direction), np.cos(direction)
+        points = np.stack([inverse * x + sin, inverse * y - cos, inverse], axis=1)
+        by_numbers = np.zeros((len(numbers), 3, 4))
+        by_numbers[:, 0, 0] = by_numbers[:, 1, 1] = inverse
+        by_numbers[:, 0, 2], by_numbers[:, 1, 2] = cos, sin
+        by_numbers[:, :, 3] = np.stack([x, y, np.ones(len(x))], axis=1)
+        return points, by_numbers
 
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of the frame: known landmarks first, then new ones.
 
-        Rows without ID are left out, and so are rows of several lines of which not all are in the
-        map yet. A row of several lines measures the mean of their bearings.
+        Rows of several lines of which not all are in the state then are left out.
         """
-        discs, lines = [], []
-        new_discs: dict[int, int] = {}
-        again: list[int] = []
-        single: list[int] = []
-        for k, number in enumerate(rows.circles.ids.tolist()):
-            if number == UNKNOWN_ID:
-                self.count.left_out["disc without ID"] += 1
-            elif number in self.disc_slots:
-                discs.append(k)
-            elif number in new_discs:
-                again.append(k)
-            else:
-                new_discs[number] = k
-        for k, numbers in enumerate(rows.lines.ids):
-            if not numbers:
-                self.count.left_out["line without ID"] += 1
-            elif all(number in self.line_slots for number in numbers):
-                lines.append(k)
-            elif len(numbers) > 1:
-                self.count.left_out["row of lines not in the map yet"] += 1
-            else:
-                single.append(k)
-        if discs or lines:
-            self._update(rows.only(discs, lines))
-        for number, k in new_discs.items():
-            self._add_disc(number, rows.circles.xy[k], rows.circles.covariance[k])
-        if again:
-            self._update(rows.only(again, []))
-        if single or self._waiting.slots:
-            self._view_lines(rows, single)
-
-    def finish(self) -> None:
-        """The run is over: lines that were not initialised are dropped."""
-        self._give_up(self._waiting.forget())
+        known, others = self._known(rows)
+        self._update(known)
+        discs, lines = others
+        new_discs = _first_rows([(i,) for i in discs.ids.tolist()])
+        for k in np.flatnonzero(new_discs):
+            self._add_disc(int(discs.ids[k]), discs.xy[k], discs.covariance[k])
+        new_lines = _first_rows(lines.ids)
+        for k in np.flatnonzero(new_lines):
+            self._add_line(lines.ids[k][0], float(lines.bearing_rad[k]), float(lines.sigma_rad[k]))
+        again, unknown = self._known(others.only(~new_discs, ~new_lines))
+        self._update(again)
+        self.count.leave_out("row of lines not in the map yet", len(unknown.lines))
 
     def landmark_map(self) -> LandmarkMap:
-        """The landmarks that are in the state, with their covariances."""
-        slots = np.array([*self.disc_slots.values(), *self.line_slots.values()], dtype=np.int64)
-        return LandmarkMap(
-            discs=self._landmarks(self.disc_slots, self.disc_rows),
-            lines=self._landmarks(self.line_slots, self.line_rows),
-            joint_covariance=self.block((slots[:, None] + np.arange(2)).ravel()),
+        """The landmarks whose place is known, with their covariances."""
+        of_discs = _numbers_of(self.disc_slots, 2)
+        of_lines = _numbers_of(self.line_slots, self.line_size)
+        inverse = self._state[of_lines[:, 3]]
+        variance = self._covariance[of_lines[:, 3], of_lines[:, 3]]
+        placed = np.sqrt(variance) < LARGEST_RANGE_SIGMA * inverse
+        of_lines = of_lines[placed]
+        points, by_numbers = self.line_points(of_lines)
+        line_xy = points[:, :2] / points[:, 2:]
+        by_points = np.concatenate(
+            [np.tile(np.eye(2), (len(points), 1, 1)), -line_xy[..., None]], 2
         )
+        by_lines = by_points @ by_numbers / points[:, 2, None, None]
+        jacobian = block_diag(np.eye(of_discs.size), *by_lines)
+        joint = jacobian @ self.block(np.append(of_discs.ravel(), of_lines.ravel())) @ jacobian.T
+        every = np.arange(len(of_discs) + len(of_lines))
+        xy = np.concatenate([self._state[of_discs], line_xy])
+        own = joint.reshape(len(every), 2, len(every), 2)[every, :, every]
+
+        def landmarks(ids: list[int], some: slice, rows: Counter[int]) -> Landmarks:
+            counts = np.array([rows[i] for i in ids], dtype=np.int64)
+            return Landmarks(np.array(ids, dtype=np.int64), xy[some], own[some], counts)
+
+        line_ids = [number for number, good in zip(self.line_slots, placed) if good]
+        return LandmarkMap(
+            discs=landmarks(list(self.disc_slots), slice(len(of_discs)), self.disc_rows),
+            lines=landmarks(line_ids, slice(len(of_discs), None), self.line_rows),
+            joint_covariance=joint,
+        )
+
+    def forget(self, discs: set[int], lines: set[int]) -> None:
+        """Take landmarks out of the state."""
+        if not discs and not lines:
+            return
+        sizes = ((self.disc_slots, 2, discs), (self.line_slots, self.line_size, lines))
+        kept = [np.arange(POSE_SIZE)]
+        for slots, size, dropped in sizes:
+            for number in dropped:
+                del slots[number]
+            kept.append(_numbers_of(slots, size).ravel())
+        index = np.concatenate(kept)
+        at = POSE_SIZE
+        for slots, size, _ in sizes:
+            for number in slots:
+                slots[number], at = at, at + size
+        self.size = len(index)
+        self._state, self._linearised = self._state[index], self._linearised[index]
+        self._covariance = np.asfortranarray(self.block(index))
 
     def _update(self, rows: FrameRows) -> None:
         """Use rows whose landmarks are in the state."""
-        self._apply(innovation_of(rows, self, self._linearised))
-        self.count.discs += len(rows.circles)
-        self.count.lines += len(rows.lines)
-        self.disc_rows.update(rows.circles.ids.tolist())
-        self.line_rows.update(number for numbers in rows.lines.ids for number in numbers)
-
-    def _apply(self, innovation: Innovation) -> None:
-        """Update the state."""
-        factor, last = self._whitened(innovation)
+        if not len(rows.circles) and not len(rows.lines):
+            return
+        before = self._state.copy()
+        for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
+            factor, last = self._whitened(rows, before)
+            change = before + factor @ last - self._state
+            nearer = np.abs(change[_numbers_of(self.line_slots, self.line_size)[:, 3]])
+            self._state += change * min(1.0, _LONGEST_STEP / max(nearer.max(initial=0.0), 1e-9))
+            if np.max(np.abs(change)) < _CONVERGED:
+                break
+        self.count.use(rows, last)
         # P - K S K^T, in place.
         self._covariance = dgemm(
             -1.0, factor, factor, 1.0, self._covariance, trans_b=1, overwrite_c=1
         )
-        self._state += factor @ last
+        self.disc_rows.update(rows.circles.ids.tolist())
+        self.line_rows.update(number for numbers in rows.lines.ids for number in numbers)
 
     def _add_disc(self, number: int, seen_xy: FloatArray, noise: FloatArray) -> None:
-        pose, at = self._state, self._linearised
-        by_seen = rotation(pose[2])
-        xy = pose[:2] + by_seen @ seen_xy
-        by_pose = np.array([[1.0, 0.0, at[1] - xy[1]], [0.0, 1.0, xy[0] - at[0]]])
-        self.disc_slots[number] = self._append(_POSE, by_pose, by_seen @ noise @ by_seen.T, xy, xy)
+        by_seen = rotation(self._state[2])
+        sway = self.tilt_sigma_rad * tilt_jacobian(seen_xy[None])[0]
+        noise = by_seen @ (noise + sway @ sway.T) @ by_seen.T
+        xy = self._state[:2] + by_seen @ seen_xy
+        self.disc_slots[number] = self._append(self._turned_about(xy), noise, xy)
         self.disc_rows[number] = 1
         self.count.discs += 1
 
-    def _view_lines(self, rows: FrameRows, single: list[int]) -> None:
-        """Lines that are not in the state yet: they join it, or wait."""
-        waiting, reasons = self._waiting, self.count.left_out
-        given_up = waiting.forget(self.frame)
-        kept = False
-        for k in single:
-            number = rows.lines.ids[k][0]
-            view = View(
-                self.frame, float(rows.lines.bearing_rad[k]), float(rows.lines.sigma_rad[k])
-            )
-            if number in self.line_slots or any(
-                other.frame == self.frame for other in waiting.views(number)
-            ):
-                reasons["further row of a new line"] += 1
-            elif not self._start_line(number, [*waiting.views(number), view]):
-                waiting.keep(number, view)
-                kept = True
-        if kept:
-            waiting.slots[self.frame] = self._keep_pose()
-            given_up += waiting.thin()
-        self._give_up(given_up)
+    def _add_line(self, number: int, bearing_rad: float, sigma_rad: float) -> None:
+        xy = apply(self._state[:3], self.camera_xy)
+        value = np.array([*xy, self._state[2] + bearing_rad, _INVERSE_DISTANCE])
+        by_pose = np.concatenate([self._turned_about(xy), [[0.0, 0.0, 1.0], np.zeros(3)]])
+        noise = np.diag([0.0, 0.0, sigma_rad**2, _INVERSE_DISTANCE_SIGMA**2])
+        self.line_slots[number] = self._append(by_pose, noise, value)
+        self.line_rows[number] = 1
+        self.count.lines += 1
 
-    def _give_up(self, views: int) -> None:
-        """Count views that are not used, and let go of the poses that none needs any more."""
-        if views:
-            self.count.left_out["line without parallax"] += views
-        self._waiting.release()
+    def _turned_about(self, xy: FloatArray) -> FloatArray:
+        """(2, 3) derivative of a place that the robot carries along, by its pose."""
+        x, y = xy - self._linearised[:2]
+        return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
-    def _start_line(self, number: int, views: list[View]) -> bool:
-        """Add a line by all its views, the last from the present pose, if that places it well."""
-        if len(views) < 2:
-            return False
-        slots = [*(self._waiting.slots[view.frame] for view in views[:-1]), 0]
-        index = (np.array(slots)[:, None] + _POSE).ravel()
-        bearing = np.array([view.bearing_rad for view in views])
-        sigma = np.array([view.sigma_rad for view in views])
-        poses = self._state[index].reshape(-1, POSE_SIZE)
-        if not self._waiting.worth_trying(number, float(np.ptp(np.unwrap(bearing + poses[:, 2])))):
-            return False
-        known = self.block(index)
-        poses_at = self._linearised[index].reshape(-1, POSE_SIZE)
-        start = start_line(poses, poses_at, bearing, sigma, self.camera_xy, known)
-        if start is None:
-            return False
-        both = np.zeros((5, 5))
-        both[:3, :3] = known[-3:, -3:]
-        both[:3, 3:] = known[-3:] @ start.by_poses.T
-        both[3:, :3] = both[:3, 3:].T
-        both[3:, 3:] = start.by_poses @ known @ start.by_poses.T + start.noise
-        if relative_range_sigma(poses[-1], start.xy, both) > LARGEST_RANGE_SIGMA:
-            return False
-        self.line_slots[number] = self._append(
-            index, start.by_poses, start.noise, start.xy + start.correction, start.xy
-        )
-        if len(views) > 2:
-            noise = np.eye(len(start.residual))
-            self._apply(Innovation(start.residual, start.residual_by_poses, index, noise))
-        self._waiting.take(number)
-        self.line_rows[number] = len(views)
-        self.count.lines += len(views)
-        return True
-
-    def _keep_pose(self) -> int:
-        """Put a copy of the pose into the state; returns where."""
-        copy, none = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-        pose, at = self._state[_POSE], self._linearised[_POSE]
-        if not self._waiting.free_slots:
-            return self._append(_POSE, copy, none, pose, at)
-        slot = self._waiting.free_slots.pop()
-        self._put(slot, _POSE, copy, none, pose, at)
-        return slot
-
-    def _append(
-        self,
-        index: IntArray,
-        jacobian: FloatArray,
-        noise: FloatArray,
-        value: FloatArray,
-        linearised: FloatArray,
-    ) -> int:
-        """`_put` numbers at the end of the state; returns where they begin."""
+    def _append(self, by_pose: FloatArray, noise: FloatArray, value: FloatArray) -> int:
+        """`_put` numbers that follow from the pose at the end of the state; returns where."""
         slot, self.size = self.size, self.size + len(value)
         if self.size > len(self._state):
             self._grow(_CHUNK)
-        self._put(slot, index, jacobian, noise, value, linearised)
+        self._put(slot, _POSE, by_pose, noise, value)
         return slot
 
-    def _landmarks(self, slots: dict[int, int], rows: Counter[int]) -> Landmarks:
-        places = np.array(list(slots.values()), dtype=np.int64)[:, None] + np.arange(2)
-        return Landmarks(
-            ids=np.array(list(slots), dtype=np.int64),
-            xy=self._state[places],
-            covariance=self._covariance[places[:, :, None], places[:, None, :]],
-            rows=np.array([rows[number] for number in slots], dtype=np.int64),
-        )
+
+def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
+    """Which rows show one landmark alone that none before them shows alone."""
+    first: dict[int, int] = {}
+    for k, numbers in enumerate(ids):
+        if len(numbers) == 1:
+            first.setdefault(numbers[0], k)
+    chosen = np.zeros(len(ids), dtype=np.bool_)
+    chosen[list(first.values())] = True
+    return chosen
+
+
+def _numbers_of(slots: dict[int, int], size: int) -> IntArray:
+    """(n, size) where the numbers of landmarks are in the state."""
+    return np.array(list(slots.values()), dtype=np.int64)[:, None] + np.arange(size)
 
 
 def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
     """`run_filter` with EKF-SLAM, which holds the map afterwards.
 
     If identities are found out, discs that are far from all others are new ones, numbered from 1 in
-    the order of their first sight; lines have no place before there is parallax, so that they can't
+    the order of their first sight; lines may be anywhere on a ray at first, so that they can't
     be found again by it: their rows must be known, else `SlamError` is raised.
     """
     pairing = associator or Associator()
@@ -275,6 +247,4 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
             f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
             "only; expected known association, or a run without lines"
         )
-    filtered = run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
-    ekf.finish()
-    return filtered
+    return run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dtrtrs
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.plane import apply, rotation
@@ -27,13 +27,7 @@ from redetect.slam.association.compatibility import (
     individual_distances,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.models import (
-    bearing_jacobians,
-    bearing_of_vertical,
-    disc_in_robot,
-    move,
-    move_jacobians,
-)
+from redetect.slam.models import disc_in_robot, move, move_jacobians, tilt_jacobian
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 NO_CAMERA = np.zeros(2)
@@ -45,7 +39,7 @@ class FrameRows(NamedTuple):
     circles: CircleRows
     lines: LineRows
 
-    def only(self, discs: Sequence[int], lines: Sequence[int]) -> FrameRows:
+    def only(self, discs: BoolArray, lines: BoolArray) -> FrameRows:
         """Some of the rows."""
         return FrameRows(self.circles.only(discs), self.lines.only(lines))
 
@@ -54,8 +48,9 @@ class Prediction(NamedTuple):
     """How d discs and e lines of a filter's state are seen."""
 
     seen: FloatArray  # (2 d + e,): discs' places in the robot frame (m), lines' bearings (rad)
-    jacobian: FloatArray  # (2 d + e, 3 + 2 d + 2 e): by these numbers of the state:
-    numbers: IntArray  # (3 + 2 d + 2 e,)
+    jacobian: FloatArray  # (2 d + e, k): by these numbers of the state:
+    numbers: IntArray  # (k,)
+    sway: FloatArray  # (2 d + e, 2): how tilts of the robot by their standard deviation move them
 
 
 class Innovation(NamedTuple):
@@ -65,60 +60,6 @@ class Innovation(NamedTuple):
     jacobian: FloatArray  # (m, k): of the prediction, by these numbers of the state:
     numbers: IntArray  # (k,)
     noise: FloatArray  # (m, m): covariance of the measurements
-
-
-def predicted(
-    estimate: Filter, discs: ArrayLike, lines: ArrayLike, linearised_at: FloatArray
-) -> Prediction:
-    """How discs and lines of a filter's state are seen.
-
-    Takes where in the state they begin, `discs` (d,) and `lines` (e,), and the state (n,) at which
-    derivatives by the heading are evaluated.
-    """
-    state, camera_xy = estimate.state, estimate.camera_xy
-    d = np.size(discs)
-    slots = np.concatenate([discs, lines]).astype(np.int64)
-    places = slots[:, None] + np.arange(2)
-    pose, disc_xy, line_xy = state[:3], state[places[:d]], state[places[d:]]
-    seen = disc_in_robot(pose, disc_xy).ravel()
-    by_place = np.zeros((d + len(slots), len(slots), 2))
-    every = np.arange(d)
-    by_place[: 2 * d].reshape(d, 2, len(slots), 2)[every, :, every] = rotation(pose[2]).T
-    if d < len(slots):
-        seen = np.append(seen, bearing_of_vertical(pose, line_xy, camera_xy))
-        every = np.arange(d, len(slots))
-        by_place[d + every, every] = bearing_jacobians(pose, line_xy, camera_xy)[1]
-    # Turning the robot is turning the landmarks about it the other way.
-    offset = linearised_at[places] - linearised_at[:2]
-    by_heading = by_place[:, :, 0] @ offset[:, 1] - by_place[:, :, 1] @ offset[:, 0]
-    by_landmarks = by_place.reshape(len(seen), 2 * len(slots))
-    jacobian = np.concatenate([-by_place.sum(axis=1), by_heading[:, None], by_landmarks], axis=1)
-    return Prediction(seen, jacobian, np.concatenate([np.arange(3), places.ravel()]))
-
-
-def innovation_of(rows: FrameRows, estimate: Filter, linearised_at: FloatArray) -> Innovation:
-    """Innovation of rows whose landmarks are in a filter's state; see `predicted`.
-
-    A row of several lines measures the mean of their bearings.
-    """
-    seen, jacobian, index = predicted(
-        estimate,
-        [estimate.disc_slots[number] for number in rows.circles.ids.tolist()],
-        [estimate.line_slots[number] for numbers in rows.lines.ids for number in numbers],
-        linearised_at,
-    )
-    d = 2 * len(rows.circles)
-    error = rows.circles.xy.ravel() - seen[:d]
-    if rows.lines.ids:
-        members = np.array([len(numbers) for numbers in rows.lines.ids])
-        mean = np.repeat(np.diag(1.0 / members), members, axis=1)
-        off = wrap_angle(np.repeat(rows.lines.bearing_rad, members) - seen[d:])
-        error = np.append(error, mean @ off)
-        jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
-    noise = np.diag(np.append(np.zeros(d), rows.lines.sigma_rad**2))
-    at = np.arange(d).reshape(-1, 2)
-    noise[at[:, :, None], at[:, None, :]] = rows.circles.covariance
-    return Innovation(error, jacobian, index, noise)
 
 
 @dataclass
@@ -133,6 +74,18 @@ class RowCount:
     innovation_squared: float = 0.0
     # Their degrees of freedom: if the covariances are right, what the sum is expected to be.
     innovation_numbers: int = 0
+
+    def use(self, rows: FrameRows, whitened: FloatArray) -> None:
+        """Count rows that are used, with their whitened innovation (m,)."""
+        self.discs += len(rows.circles)
+        self.lines += len(rows.lines)
+        self.innovation_squared += float(whitened @ whitened)
+        self.innovation_numbers += len(whitened)
+
+    def leave_out(self, reason: str, rows: int) -> None:
+        """Count rows that are not used."""
+        if rows:
+            self.left_out[reason] += rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,11 +114,16 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
 
 
 POSE_SIZE = 3
-_POSE = np.arange(POSE_SIZE)
+_POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
 
 
 class Filter(ABC):
     """The pose and landmarks of a robot with their joint covariance, to be taken through a run.
+
+    What the heading turns is evaluated at the poses as predicted and at the first estimates of
+    landmarks (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
+    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010):
+    at the latest ones, corrections would look like knowledge of how the map as a whole is turned.
 
     Parameters
     ----------
@@ -175,9 +133,6 @@ class Filter(ABC):
         Its covariance; none if the start defines the map.
     camera_xy : (2,) array_like
         The camera's centre in the robot frame (m); only lines need it.
-    first_estimates : bool
-        Whether derivatives are evaluated at the poses as predicted and at the first estimates of
-        landmarks, or at the latest ones.
 
     Attributes
     ----------
@@ -188,13 +143,13 @@ class Filter(ABC):
         How many numbers the state has.
     """
 
+    #: How many numbers of the state a line has.
+    line_size = 2
+    #: Standard deviation of a tilt that moves all discs of a frame together (rad).
+    tilt_sigma_rad = 0.0
+
     def __init__(
-        self,
-        start: ArrayLike,
-        start_covariance: ArrayLike | None,
-        camera_xy: ArrayLike,
-        *,
-        first_estimates: bool,
+        self, start: ArrayLike, start_covariance: ArrayLike | None, camera_xy: ArrayLike
     ) -> None:
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
         self.disc_slots: dict[int, int] = {}
@@ -202,8 +157,7 @@ class Filter(ABC):
         self.count = RowCount()
         self.size = POSE_SIZE
         self._state = np.array(start, dtype=np.float64)
-        # The same array unless derivatives are evaluated elsewhere.
-        self._linearised = self._state.copy() if first_estimates else self._state
+        self._linearised = self._state.copy()
         self._covariance = np.zeros((POSE_SIZE, POSE_SIZE))
         if start_covariance is not None:
             self._covariance += np.asarray(start_covariance, dtype=np.float64)
@@ -228,18 +182,117 @@ class Filter(ABC):
         pose = move(self._state[_POSE], step)
         by_pose, by_step = move_jacobians(self._state[_POSE], step)
         by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
-        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose, pose)
+        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose)
 
     @abstractmethod
     def measure(self, rows: FrameRows) -> None:
-        """Update with the rows of a frame."""
+        """Update with the rows of a frame that have an identifier.
 
-    def _whitened(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+        A row of several lines measures the mean of their bearings.
+        """
+
+    def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Lines as homogeneous points (e, 3): the place is x / w, y / w.
+
+        Takes their numbers of the state (e, k), and returns the derivatives (e, 3, k) by these,
+        too.
+        """
+        points = np.insert(self._state[numbers], 2, 1.0, axis=1)
+        return points, np.tile(np.eye(3, 2), (len(numbers), 1, 1))
+
+    def predicted(self, discs: ArrayLike, lines: ArrayLike) -> Prediction:
+        """How discs and lines are seen; takes where in the state they begin, (d,) and (e,)."""
+        of_discs = _numbers(discs, 2)
+        of_lines = _numbers(lines, self.line_size)
+        pose, turn, d, e = self._state[:3], rotation(self._state[2]), len(of_discs), len(of_lines)
+        numbers = np.concatenate([_POSE, of_discs.ravel(), of_lines.ravel()])
+        jacobian = np.zeros((2 * d + e, len(numbers)))
+        seen = disc_in_robot(pose, self._state[of_discs])
+        by_disc = np.zeros((d, 2, d, 2))
+        by_disc[np.arange(d), :, np.arange(d)] = turn.T
+        jacobian[: 2 * d, 3 : 3 + 2 * d] = by_disc.reshape(2 * d, 2 * d)
+        jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
+        sway = np.zeros((len(jacobian), 2))
+        if self.tilt_sigma_rad:
+            sway[: 2 * d] = self.tilt_sigma_rad * tilt_jacobian(seen).reshape(-1, 2)
+        bearing = np.zeros(0)
+        if e:
+            points, by_numbers = self.line_points(of_lines)
+            off = (points[:, :2] - points[:, 2:] * pose[:2]) @ turn - points[:, 2:] * self.camera_xy
+            bearing = np.arctan2(off[:, 0], -off[:, 1])
+            by_off = np.stack([-off[:, 1], off[:, 0]], axis=1) / np.sum(off**2, axis=1)[:, None]
+            by_xy = by_off @ turn.T
+            by_scale = -by_xy @ pose[:2] - by_off @ self.camera_xy
+            by_line = np.einsum("ei,eij->ej", np.column_stack([by_xy, by_scale]), by_numbers)
+            every = np.arange(e)[:, None]
+            jacobian[2 * d + every, 3 + 2 * d + np.arange(of_lines.size).reshape(e, -1)] = by_line
+            jacobian[2 * d :, :2] = -points[:, 2:] * by_xy
+        # Turning the robot is turning the landmarks about it the other way.
+        turned = [np.zeros(of_discs.shape), np.zeros(of_lines.shape)]
+        for own, places in zip(turned, (of_discs, of_lines[:, :2])):
+            x, y = (self._linearised[places] - self._linearised[:2]).T
+            own[:, 0], own[:, 1] = -y, x
+        turned[1][:, 2:3] = 1.0  # the direction of a ray
+        jacobian[:, 2] = -jacobian[:, 3:] @ np.concatenate([own.ravel() for own in turned])
+        return Prediction(np.append(seen.ravel(), bearing), jacobian, numbers, sway)
+
+    def innovation_of(self, rows: FrameRows) -> Innovation:
+        """Innovation of rows whose landmarks are in the state."""
+        members = np.array([len(numbers) for numbers in rows.lines.ids], dtype=np.int64)
+        seen, jacobian, index, sway = self.predicted(
+            [self.disc_slots[number] for number in rows.circles.ids.tolist()],
+            [self.line_slots[number] for numbers in rows.lines.ids for number in numbers],
+        )
+        d = 2 * len(rows.circles)
+        mean = np.repeat(np.diag(1.0 / members), members, axis=1)
+        off = wrap_angle(np.repeat(rows.lines.bearing_rad, members) - seen[d:])
+        error = np.append(rows.circles.xy.ravel() - seen[:d], mean @ off)
+        jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
+        noise = np.diag(np.append(np.zeros(d), rows.lines.sigma_rad**2))
+        at = np.arange(d).reshape(-1, 2)
+        noise[at[:, :, None], at[:, None, :]] = rows.circles.covariance
+        noise[:d, :d] += sway[:d] @ sway[:d].T
+        return Innovation(error, jacobian, index, noise)
+
+    def compared(
+        self, rows: CircleRows | LineRows, names: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rows of one kind against m landmarks of it, as `compatible` takes them.
+
+        Returns innovations (n, m, d) and the covariances of what is expected (m d, m d) and of the
+        rows (n, d, d).
+        """
+        if isinstance(rows, LineRows):
+            prediction = self.predicted([], [self.line_slots[i] for i in names.tolist()])
+            innovation = wrap_angle(rows.bearing_rad[:, None] - prediction.seen)[:, :, None]
+            noise = rows.sigma_rad[:, None, None] ** 2
+        else:
+            prediction = self.predicted([self.disc_slots[i] for i in names.tolist()], [])
+            innovation = rows.xy[:, None] - prediction.seen.reshape(-1, 2)
+            noise = rows.covariance
+        _, jacobian, index, sway = prediction
+        spread = jacobian @ self.block(index) @ jacobian.T + sway @ sway.T
+        return innovation, spread, noise
+
+    def _known(self, rows: FrameRows) -> tuple[FrameRows, FrameRows]:
+        """The rows whose landmarks are all in the state, and the others that have identifiers."""
+        of_discs, of_lines = rows.circles.identified, rows.lines.identified
+        discs = np.array([i in self.disc_slots for i in rows.circles.ids.tolist()], dtype=bool)
+        lines = np.array([self.line_slots.keys() >= set(ids) for ids in rows.lines.ids], dtype=bool)
+        others = rows.only(of_discs & ~discs, of_lines & ~lines)
+        return rows.only(of_discs & discs, of_lines & lines), others
+
+    def _whitened(
+        self, rows: FrameRows, before: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """The state's covariance with an innovation (n, m), and the innovation (m,), both whitened.
 
-        That is, over a root of the innovation's covariance; `SlamError` where there is none.
+        That is, over a root of the innovation's covariance; `SlamError` where there is none. The
+        innovation is that of the state `before`, if the present one is where it is linearised.
         """
-        error, jacobian, index, noise = innovation
+        error, jacobian, index, noise = self.innovation_of(rows)
+        if before is not None:
+            error += jacobian @ (self._state - before)[index]
         projected = self._covariance[:, index] @ jacobian.T
         try:
             root = np.linalg.cholesky(jacobian @ projected[index] + noise)
@@ -249,15 +302,13 @@ class Filter(ABC):
                 "covariances that contradict each other"
             ) from None
         both = dtrtrs(root, np.vstack([projected, error]).T, lower=1)[0].T
-        self.count.innovation_squared += float(both[-1] @ both[-1])
-        self.count.innovation_numbers += len(error)
         return both[:-1], both[-1]
 
     def _grow(self, count: int) -> None:
         """Lengthen the arrays by some numbers, 0 so far. BLAS has matrices by columns."""
-        separate, before = self._linearised is not self._state, len(self._state)
+        before = len(self._state)
         self._state = np.pad(self._state, (0, count))
-        self._linearised = np.pad(self._linearised, (0, count)) if separate else self._state
+        self._linearised = np.pad(self._linearised, (0, count))
         covariance = np.zeros((before + count, before + count), order="F")
         covariance[:before, :before] = self._covariance
         self._covariance = covariance
@@ -269,7 +320,6 @@ class Filter(ABC):
         jacobian: FloatArray,
         noise: FloatArray,
         value: FloatArray,
-        linearised: FloatArray,
     ) -> None:
         """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
 
@@ -282,8 +332,12 @@ class Filter(ABC):
         columns[own] = 0.5 * (spread + spread.T)
         self._covariance[:, own] = columns
         self._covariance[own] = columns.T
-        self._linearised[own] = linearised
-        self._state[own] = value
+        self._linearised[own] = self._state[own] = value
+
+
+def _numbers(slots: ArrayLike, size: int) -> IntArray:
+    """(n, size) numbers of the state from (n,) slots on."""
+    return np.asarray(slots, dtype=np.int64)[:, None] + np.arange(size)
 
 
 Association = Literal["known", "nearest", "joint"]
@@ -318,19 +372,14 @@ class Associator:
         return FrameRows(replace(rows.circles, ids=discs), replace(rows.lines, ids=lines))
 
     def _discs(self, rows: CircleRows, estimate: Filter) -> IntArray:
-        names, slots = _near_discs(rows.xy, estimate)
+        names = _near_discs(rows.xy, estimate)
         found = np.full(len(rows), UNKNOWN_ID, dtype=np.int64)
         closest = np.full(len(found), np.inf)
-        if len(slots):
-            seen, jacobian, index = predicted(estimate, slots, [], estimate.state)
-            spread = jacobian @ estimate.block(index) @ jacobian.T
-            innovation = rows.xy[:, None] - seen.reshape(-1, 2)
-            landmark = compatible(
-                self.method, innovation, spread, rows.covariance, self.gate_probability
-            )
+        if len(names):
+            compared = estimate.compared(rows, names)
+            landmark = compatible(self.method, *compared, self.gate_probability)
             found[landmark >= 0] = names[landmark[landmark >= 0]]
-            distances = individual_distances(innovation, spread, rows.covariance)
-            closest = np.min(distances, axis=1)
+            closest = np.min(individual_distances(*compared), axis=1)
         if self.new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
@@ -338,20 +387,13 @@ class Associator:
         return found
 
     def _lines(self, rows: LineRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
-        slots = np.array(list(estimate.line_slots.values()), dtype=np.int64)
-        names = np.array(list(estimate.line_slots), dtype=np.int64)
-        state = estimate.state
-        away = np.hypot(state[slots] - state[0], state[slots + 1] - state[1])
-        slots, names = slots[away < FARTHEST_LINE_M], names[away < FARTHEST_LINE_M]
-        if not len(slots) or not len(rows):
+        names, slots = _names_and_slots(estimate.line_slots)
+        away = np.linalg.norm(estimate.state[slots[:, None] + _XY] - estimate.state[:2], axis=1)
+        names = names[away < FARTHEST_LINE_M]
+        if not len(names) or not len(rows):
             return ((),) * len(rows)
-        seen, jacobian, index = predicted(estimate, [], slots, state)
-        innovation = wrap_angle(rows.bearing_rad[:, None] - seen)
-        spread = jacobian @ estimate.block(index) @ jacobian.T
-        noise = rows.sigma_rad[:, None, None] ** 2
-        landmark = compatible(
-            self.method, innovation[:, :, None], spread, noise, self.gate_probability
-        )
+        compared = estimate.compared(rows, names)
+        landmark = compatible(self.method, *compared, self.gate_probability)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
 
@@ -362,8 +404,8 @@ def run_filter(
 ) -> FilterRun:
     """Take a filter, which is at the start, through a run.
 
-    Rows are paired with landmarks by their identifiers, unless an associator says otherwise. Raises
-    `SlamError`, which names the step, if an update is not possible.
+    Rows are paired with landmarks by their identifiers, unless an associator says otherwise; those
+    without are left out. Raises `SlamError`, which names the step, if an update is not possible.
     """
     pairing = associator or Associator()
     disc_ids: list[int] = []
@@ -381,24 +423,25 @@ def run_filter(
         disc_ids.extend(identified.circles.ids.tolist())
         line_ids.extend(identified.lines.ids)
         poses[k + 1], covariance[k + 1] = estimate.state[:3], estimate.pose_covariance
+    count = estimate.count
+    count.leave_out("disc without ID", disc_ids.count(UNKNOWN_ID))
+    count.leave_out("line without ID", line_ids.count(()))
     return FilterRun(
         path=Path2D(("start", *recording.prefixes), poses, covariance),
-        count=estimate.count,
+        count=count,
         disc_ids=np.array(disc_ids, dtype=np.int64),
         line_ids=tuple(line_ids),
     )
 
 
-def _near_discs(seen_xy: FloatArray, estimate: Filter) -> tuple[IntArray, IntArray]:
-    """Names and slots of the discs that any of the rows may show."""
-    slots = np.array(list(estimate.disc_slots.values()), dtype=np.int64)
-    names = np.array(list(estimate.disc_slots), dtype=np.int64)
-    if not len(slots):
-        return names, slots
+def _names_and_slots(of: dict[int, int]) -> tuple[IntArray, IntArray]:
+    return np.array(list(of), dtype=np.int64), np.array(list(of.values()), dtype=np.int64)
+
+
+def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:
+    """The discs that any of the rows may show."""
+    names, slots = _names_and_slots(estimate.disc_slots)
     state, spread = estimate.state, estimate.pose_covariance
-    away = np.linalg.norm(
-        state[slots[:, None, None] + np.arange(2)] - apply(state[:3], seen_xy), axis=2
-    )
+    away = np.linalg.norm(state[slots[:, None, None] + _XY] - apply(state[:3], seen_xy), axis=2)
     reach = np.sqrt(spread[0, 0] + spread[1, 1]) + np.sqrt(spread[2, 2]) * np.hypot(*seen_xy.T)
-    near = np.any(away < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)
-    return names[near], slots[near]
+    return names[np.any(away < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)]

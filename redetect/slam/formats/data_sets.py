@@ -27,9 +27,10 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import finite, rows_of_words, to_dataset
+from redetect.slam.formats.text import to_dataset
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
+from redetect.storage.bounded import rows_of_numbers
 
 #: How the names of a robot's odometry and of the files beside it end.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -98,8 +99,8 @@ class _Seen(NamedTuple):
 
 def _seen_by_robot(odometry: Path) -> _Seen:
     """The measurements beside a robot's odometry; other robots that it saw are left out."""
-    seen = _table(_beside(odometry, MEASUREMENTS), ("time", "barcode", "range", "bearing"))
-    barcodes = _table(odometry.with_name(BARCODES), ("subject", "barcode"))
+    seen = _table(_beside(odometry, MEASUREMENTS), "time barcode range bearing")
+    barcodes = _table(odometry.with_name(BARCODES), "subject barcode")
     subject = {int(barcode): int(number) for number, barcode in barcodes}
     ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
@@ -113,7 +114,7 @@ def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
 
     Takes the standard deviations of ranges and bearings.
     """
-    velocity, seen = _table(odometry, ("time", "v", "omega")), _seen_by_robot(odometry)
+    velocity, seen = _table(odometry, "time v omega"), _seen_by_robot(odometry)
     if len(seen.times) == 0 or len(velocity) == 0:
         raise SlamError(f"{odometry}: no odometry, or no landmark seen: expected both")
     steps = _velocity_steps(velocity, seen.times)
@@ -129,8 +130,8 @@ def _run(times: FloatArray, steps: FloatArray, rows: CircleRows) -> Recording:
 
 def read_truth(odometry: Path) -> Path2D:
     """True poses of a robot at the times of its frames, and first that at the start."""
-    times, logged = _seen_by_robot(odometry).times, _table(odometry, ("time", "v", "omega"))
-    truth = _table(_beside(odometry, TRUTH), ("time", "x", "y", "theta"))
+    times, logged = _seen_by_robot(odometry).times, _table(odometry, "time v omega")
+    truth = _table(_beside(odometry, TRUTH), "time x y theta")
     if min(len(truth), len(times), len(logged)) == 0:
         raise SlamError(f"{odometry}: no odometry, landmark seen or true pose: expected some")
     at = np.concatenate([[min(logged[0, 0], times[0])], times])
@@ -141,7 +142,7 @@ def read_truth(odometry: Path) -> Path2D:
 
 def read_landmarks(path: Path) -> LandmarkMap:
     """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map."""
-    table = _table(path, ("subject", "x", "y", "x sigma", "y sigma"))
+    table = _table(path, "subject x y x_sigma y_sigma")
     table = table[np.argsort(table[:, 0])]
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
@@ -169,14 +170,10 @@ def _beside(odometry: Path, ending: str) -> Path:
     return odometry.with_name(odometry.name.removesuffix(ODOMETRY) + ending)
 
 
-def _table(path: Path, names: tuple[str, ...]) -> FloatArray:
-    """The numbers of a file, sorted by the first column as they come."""
-    rows = []
-    for line, words in rows_of_words(path):
-        if len(words) != len(names):
-            raise SlamError(f"{path}:{line}: {len(words)} numbers: expected {', '.join(names)}")
-        rows.append([finite(path, line, name, word) for name, word in zip(names, words)])
-    return np.array(rows, dtype=np.float64).reshape(-1, len(names))
+def _table(path: Path, names: str) -> FloatArray:
+    """The numbers of a file."""
+    rows = [row for _, row in rows_of_numbers(path, "file of the data set", names, SlamError)]
+    return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
 
 
 def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:

@@ -15,6 +15,7 @@ know.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -29,17 +30,17 @@ from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.text import (
     covariance_from_dataset,
-    finite,
     from_dataset,
-    rows_of_words,
     to_dataset,
     write_text,
 )
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.storage.bounded import read_text
 
 #: The largest number of a vertex: other tools keep it in 31 bits.
 LARGEST_NUMBER = 2**31 - 1
+_LARGEST_BYTES = 1 << 28
 # Less has no inverse that is finite (m^-2, rad^-2).
 _LEAST_INFORMATION = 1e-100
 
@@ -205,7 +206,9 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
     """The rows of each kind; `FIX` is left out, as is what is behind ``#``."""
     rows: dict[str, list[_Row]] = {kind: [] for kind in _KINDS}
     known: set[tuple[int, ...]] = set()  # vertices, and those between which there is a step
-    for line, (kind, *words) in rows_of_words(path):
+    text = read_text(path, _LARGEST_BYTES, "g2o graph", SlamError)
+    for line, row in enumerate(text.split("\n"), 1):
+        kind, *words = row.partition("#")[0].split() or [_FIX]
         if kind == _FIX:
             continue
         if kind not in _KINDS:
@@ -213,29 +216,26 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
                 f"{path}:{line}: row starts with {kind[:30]!a}: expected {', '.join(_KINDS)} or FIX"
             )
         count, names = _KINDS[kind]
-        if len(words) != count + len(names):
+        try:
+            vertices = tuple(map(int, words[:count]))
+            numbers = tuple(map(float, words[count:]))
+        except ValueError:
+            vertices, numbers = (), ()
+        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(
+            map(math.isfinite, numbers)
+        )
+        if not usable or len(numbers) != len(names):
             raise SlamError(
-                f"{path}:{line}: {kind} with {len(words)} values: expected {count + len(names)}: "
-                f"{count} vertex number{'s' if count > 1 else ''} and {' '.join(names)}"
+                f"{path}:{line}: {kind} {' '.join(words)[:60]!a}: expected "
+                f"{'a vertex' if count == 1 else 'two vertices'}, whole numbers of 0 to "
+                f"{LARGEST_NUMBER}, and finite numbers {' '.join(names)}"
             )
-        vertices = tuple(_vertex(path, line, word) for word in words[:count])
-        numbers = [finite(path, line, name, word) for name, word in zip(names, words[count:])]
         if kind != _SIGHT:
             if vertices in known:
                 raise SlamError(f"{path}:{line}: {kind} {' '.join(words[:count])} is there already")
             known.add(vertices)
-        rows[kind].append(_Row(line, vertices, tuple(numbers)))
+        rows[kind].append(_Row(line, vertices, numbers))
     return rows
-
-
-def _vertex(path: str | os.PathLike[str], line: int, word: str) -> int:
-    number = int(word) if word.isdecimal() and len(word) <= 10 else LARGEST_NUMBER + 1
-    if number > LARGEST_NUMBER:
-        raise SlamError(
-            f"{path}:{line}: vertex is {word[:30]!a}: expected a whole number of 0 to "
-            f"{LARGEST_NUMBER}"
-        )
-    return number
 
 
 def _chain(path: str | os.PathLike[str], order: list[int], steps: list[_Row]) -> list[_Row]:

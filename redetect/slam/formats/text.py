@@ -1,4 +1,4 @@
-"""Common parts of other tools' text formats: axes, rows and numbers.
+"""Common parts of other tools' formats: axes, and text that is written.
 
 The data set's robot has X left and Y backward; other tools expect X forward and Y left. One
 rotation about Z by a quarter turn, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, leads
@@ -13,18 +13,15 @@ bits.
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.slam.errors import SlamError
 from redetect.storage import write_bytes
-from redetect.storage.bounded import read_content
 
 Axes = Literal["robotics", "dataset"]
 
@@ -73,30 +70,7 @@ def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
     return order, (_SIGNS[order] if back else _SIGNS[:size])
 
 
-_LARGEST_FILE_BYTES = 1 << 28
-
-
 def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
     """Write rows of text, whole or not at all."""
     content = "".join(f"{row}\n" for row in rows).encode("utf-8", "surrogateescape")
     write_bytes(path, content, overwrite=overwrite)
-
-
-def rows_of_words(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
-    """The words of a text file's rows with their line numbers, without comments and blank rows."""
-    content = read_content(path, _LARGEST_FILE_BYTES, "file", SlamError)
-    for number, source in enumerate(content.split(b"\n"), 1):
-        words = source.decode("utf-8", "surrogateescape").split()
-        if words and not words[0].startswith("#"):
-            yield number, words
-
-
-def finite(path: str | os.PathLike[str], line: int, name: str, word: str) -> float:
-    """A word as a finite number; `SlamError` where it is none."""
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise SlamError(f"{path}:{line}: {name} is {word[:30]!a}: expected a finite number")
-    return value

@@ -14,9 +14,10 @@ import numpy as np
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import finite, from_dataset, rows_of_words, to_dataset, write_text
+from redetect.slam.formats.text import from_dataset, to_dataset, write_text
+from redetect.storage.bounded import rows_of_numbers
 
-_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_COLUMNS = "t x y z qx qy qz qw"
 # How far a pose may lie off the floor (m; quaternion) and still be a pose on it.
 _FLAT = 1e-6
 _UNIT = 1e-3
@@ -31,7 +32,7 @@ def write_tum(
     overwrite: bool = False,
 ) -> None:
     """Write a path as a TUM trajectory."""
-    rows = [f"# {comment}" for comment in (*comments, " ".join(_COLUMNS))]
+    rows = [f"# {comment}" for comment in (*comments, _COLUMNS)]
     numbers = (from_dataset(poses.poses) + 0.0).tolist()
     for number, (name, (x, y, theta)) in enumerate(zip(poses.prefixes, numbers)):
         half, t = 0.5 * theta, str(number)
@@ -46,30 +47,25 @@ def write_tum(
 def read_tum(path: str | os.PathLike[str]) -> Path2D:
     """Read a TUM trajectory of a path on the floor; the result is in the data set's axes.
 
-    Angles are in [-pi, pi). The first pose is called ``start``, the others by their time as it is
-    written. Raises `SlamError` if the file cannot be read, is not a path on the floor, or its times
-    do not ascend; the message names file and line.
+    Angles are in [-pi, pi). The first pose is called ``start``, the others by their time.
+
+    Raises `SlamError` if the file cannot be read, is not a path on the floor, or its times do not
+    ascend; the message names file and line.
     """
     prefixes: list[str] = []
     numbers: list[list[float]] = []
-    for line, words in rows_of_words(path):
-        if len(words) != len(_COLUMNS):
-            raise SlamError(
-                f"{path}:{line}: {len(words)} values: expected {len(_COLUMNS)}: "
-                f"{' '.join(_COLUMNS)}"
-            )
-        row = [finite(path, line, name, word) for name, word in zip(_COLUMNS, words)]
-        time, _, _, z, qx, qy, qz, qw = row
+    for place, row in rows_of_numbers(path, "TUM trajectory", _COLUMNS, SlamError):
+        time, _, _, z, *quaternion = row
         if numbers and time <= numbers[-1][0]:
-            raise SlamError(f"{path}:{line}: t is {words[0]}: expected more than the row before")
-        if abs(float(np.hypot(np.hypot(qx, qy), np.hypot(qz, qw))) - 1.0) > _UNIT:
-            raise SlamError(f"{path}:{line}: qx qy qz qw are no unit quaternion")
-        if max(abs(z), abs(qx), abs(qy)) > _FLAT:
-            raise SlamError(f"{path}:{line}: expected a pose on the floor: z, qx and qy 0")
-        prefixes.append(words[0] if numbers else "start")
+            raise SlamError(f"{place}: t is {time}: expected more than the row before")
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT:
+            raise SlamError(f"{place}: qx qy qz qw are no unit quaternion")
+        if max(map(abs, (z, *quaternion[:2]))) > _FLAT:
+            raise SlamError(f"{place}: expected a pose on the floor: z, qx and qy 0")
+        prefixes.append(f"{time:.15g}" if numbers else "start")
         numbers.append(row)
     if not numbers:
-        raise SlamError(f"{path}: no poses: expected rows of {' '.join(_COLUMNS)}")
+        raise SlamError(f"{path}: no poses: expected rows of {_COLUMNS}")
     table = np.array(numbers, dtype=np.float64)
     theta = wrap_angle(2.0 * np.arctan2(table[:, 6], table[:, 7]))
     poses = to_dataset(np.column_stack([table[:, 1:3], theta])) + 0.0  # no -0.0

@@ -139,7 +139,7 @@ def _fit(
     order = np.argsort(graph.disc_index, kind="stable")
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
-    estimate = solve(graph, first, weighting, tolerance=1e-7).estimate
+    estimate = solve(graph, first, weighting, tolerance=1e-7).at
     equations = equations_at(graph, estimate, weighting)
     table = chi_squared(graph, estimate, weighting)
     return _Fit(graph, estimate, weighting, factor(equations.matrix), table)

@@ -1,12 +1,8 @@
-"""All measurements of a run as one least-squares problem, and a value for each of its unknowns.
-
-One map can represent a run only if all its parts are connected, which is checked here, too.
-"""
+"""All measurements of a run as one least-squares problem, and a value for each of its unknowns."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +11,6 @@ from camera import Camera
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import whitening
 from redetect.plane import apply
-from redetect.slam.errors import SlamError
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import LineRows, Recording
 
@@ -129,43 +124,4 @@ def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
         poses=poses,
         disc_xy=apply(poses[graph.disc_pose[first]], graph.disc_xy[first]),
         line_xy=np.full((len(graph.line_ids), 2), np.nan),
-    )
-
-
-#: Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
-FEWEST_SHARED = 2
-
-
-def check_connected(recording: Recording, name: str) -> None:
-    """See that landmarks join the parts between which odometry is lost."""
-    lost = recording.lost
-    if len(lost) == 0:
-        return
-    seen: list[set[tuple[str, int]]] = [set() for _ in range(len(lost) + 1)]
-    circles, lines = recording.circles, recording.lines
-    for part, number in zip(np.searchsorted(lost, circles.frame, side="right"), circles.ids):
-        if number >= 0:
-            seen[part].add(("disc", int(number)))
-    for part, ids in zip(np.searchsorted(lost, lines.frame, side="right"), lines.ids):
-        seen[part].update(("line", i) for i in ids)
-    # Parts grow together as long as any two share enough.
-    joined = [({k}, landmarks) for k, landmarks in enumerate(seen)]
-    while pair := next(
-        (p for p in combinations(joined, 2) if len(p[0][1] & p[1][1]) >= FEWEST_SHARED), None
-    ):
-        (one, own), (other, others) = pair
-        joined = [some for some in joined if some not in pair] + [(one | other, own | others)]
-    if len(joined) == 1:
-        return
-    # Name the first step with parts on both sides that nothing joins.
-    around = {part: landmarks for parts, landmarks in joined for part in parts}
-    broken = next(k for k in range(len(lost)) if around[k] is not around[k + 1])
-    step = int(lost[broken])
-    covariance = recording.step_covariance[step]
-    shared = len(around[broken] & around[broken + 1])
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    raise SlamError(
-        f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its odometry is "
-        f"lost (standard deviations {sigma:.3g} m, {np.sqrt(covariance[2, 2]):.3g} rad), and the "
-        f"parts before and after share {shared} landmarks: expected at least {FEWEST_SHARED}"
     )

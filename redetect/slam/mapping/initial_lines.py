@@ -13,16 +13,12 @@ from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.models import bearing_jacobians, disc_in_robot
 from redetect.slam.recording import LineRows
 
-#: Rays to a line have to cross under at least this angle somewhere.
-LEAST_PARALLAX_RAD = float(np.radians(5.0))
-#: Largest median distance of rays from their intersection, in standard deviations.
-MOST_MEDIAN_MISS = 10.0
+#: Farther from their intersection rays do not agree with it, in standard deviations.
+MOST_MISS = 10.0
 #: Lines whose place is less certain, the poses being known, are left out.
 MOST_SIGMA_M = 0.5
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
-# Information below which rays are as good as parallel (m^-2).
-_PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +30,12 @@ class InitialLines:
     unplaced: IntArray  # (U,): lines never seen, alone in a row, under enough parallax
 
 
-def place_lines(
-    poses: FloatArray,
-    rows: LineRows,
-    camera_xy: FloatArray,
-    *,
-    least_parallax_rad: float = LEAST_PARALLAX_RAD,
-) -> InitialLines:
+def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> InitialLines:
     """Triangulate lines from poses that are known well enough.
 
     Only rows of a single line are used: two lines that were always joined cannot be separated. A
-    line is triangulated from its views along some metres of path from its first sight on; if they
-    have too little parallax, from all of its views.
+    line is triangulated from its views along some metres of path from its first sight on; if these
+    leave it uncertain, from all of its views. Half of them have to agree with its place.
 
     Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
@@ -59,19 +49,15 @@ def place_lines(
     xy = np.full((len(every), 2), np.nan)
     for some in (near, np.ones(len(seen), dtype=bool)):
         use = some & np.isnan(xy[label, 0])
+        own, bearing, sigma = seen[use], rows.bearing_rad, rows.sigma_rad
         found, ahead, miss = meeting_points(
-            *(poses[pose[use]], rows.bearing_rad[seen[use]], rows.sigma_rad[seen[use]]),
-            *(label[use], len(every), camera_xy),
+            *(poses[pose[use]], bearing[own], sigma[own], label[use], len(every)),
+            camera_xy,
+            MOST_SIGMA_M**-2,
         )
-        course = (poses[pose, 2] + rows.bearing_rad[seen])[use]
-        for k in np.unique(label[use]):
-            own = label[use] == k
-            if (
-                _widest_crossing(course[own]) >= least_parallax_rad
-                and np.mean(ahead[own] > 0.0) > 0.5
-                and np.median(miss[own]) <= MOST_MEDIAN_MISS
-            ):
-                xy[k] = found[k]
+        agrees = (ahead > 0.0) & (miss <= MOST_MISS)
+        count, right = (np.bincount(label[use], w, len(every)) for w in (None, agrees))
+        xy = np.where((right > 0.5 * count)[:, None], found, xy)
     placed = np.isfinite(xy[:, 0])
     return InitialLines(every[placed], xy[placed], every[~placed])
 
@@ -102,7 +88,7 @@ def meeting_points(
     labels: IntArray,
     count: int,
     camera_xy: ArrayLike,
-    least_information: float = _PARALLEL,
+    least_information: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The places nearest to the rays of each line, a ray's miss counted as an angle.
 
@@ -131,15 +117,3 @@ def meeting_points(
         distance = np.where(np.isfinite(ahead), np.abs(ahead), distance)
     miss = np.abs(np.sum((places[labels] - centre) * normal, axis=1)) * np.sqrt(weight)
     return places, ahead, miss
-
-
-def _widest_crossing(course_rad: FloatArray) -> float:
-    """The largest angle under which two of (n,) directions cross as lines, 0 to a right angle."""
-    ordered = np.sort(course_rad % np.pi)
-    # Of each line, the one nearest to its perpendicular: the next or the last one around it.
-    after = np.searchsorted(ordered, (ordered + 0.5 * np.pi) % np.pi)
-    widest = 0.0
-    for place in (after, after - 1):
-        apart = np.abs(ordered[place % len(ordered)] - ordered)
-        widest = max(widest, float(np.max(np.minimum(apart, np.pi - apart))))
-    return widest

@@ -16,21 +16,19 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from redetect.least_squares.solver import LossKind
+from redetect.least_squares.solver import LossKind, Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import (
-    FEWEST_SHARED,
     Estimate,
     Graph,
-    check_connected,
     first_sight,
     graph_of_recording,
     with_lines,
 )
 from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.solve import Marginals, Solution, joint_covariance, marginals, solve
+from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
@@ -112,6 +110,8 @@ def as_json(table: ChiSquared) -> dict[str, float | int | None]:
 
 Solver = Literal["separable", "gtsam"]
 
+# Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
+_FEWEST_SHARED = 2
 # Near enough to the minimum for the final optimisation.
 _COARSE = 1e-3
 # Multiples of the scale of a loss that is not convex, from nearly least squares down.
@@ -224,13 +224,13 @@ def map_run(
     begin = first_sight(graph, start)
     plain = Weighting()
     if len(recording.lost):
-        begin = _with_parts_in_place(recording, graph, begin)
+        begin = _with_parts_in_place(recording, graph, begin, name)
     descend = _descent(solver, wanted.loss)
-    trail: list[Solution] = []
+    trail: list[Minimum[Estimate]] = []
 
-    def keep(solution: Solution) -> Estimate:
+    def keep(solution: Minimum[Estimate]) -> Estimate:
         trail.append(solution)
-        return solution.estimate
+        return solution.at
 
     more = len(recording.lines) > 0
     only_start = more or wanted != plain or solver != "separable"
@@ -249,7 +249,7 @@ def map_run(
         for weighting in _on_the_way(fixed):
             estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
         estimate = keep(descend(graph, estimate, fixed))
-    as_calibrated = trail[-1].cost
+    as_calibrated = trail[-1].costs[-1]
     if wanted.calibrate:
         estimate = keep(descend(graph, estimate, wanted))
     covariance = marginals(graph, estimate, wanted)
@@ -262,39 +262,55 @@ def map_run(
         covariance=covariance,
         table=chi_squared(graph, estimate, wanted, len(recording.lost)),
         left_out=_left_out(recording, graph, placed),
-        cost=trail[-1].cost,
+        cost=trail[-1].costs[-1],
         steps=sum(len(solution.costs) - 1 for solution in trail),
-        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].cost),
+        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].costs[-1]),
     )
 
 
-def _with_parts_in_place(recording: Recording, graph: Graph, begin: Estimate) -> Estimate:
+def _with_parts_in_place(
+    recording: Recording, graph: Graph, begin: Estimate, name: str
+) -> Estimate:
     """A start at which parts between which odometry is lost lie on each other, by their discs.
 
     Each part is mapped by itself. The first stays; next is always the part that has most discs in
-    common with those that lie.
+    common with those that lie. Verticals may join a part, too, which then begins where odometry has
+    it. `SlamError` where a part shares fewer than two landmarks with the others.
     """
     lost, discs = recording.lost, len(graph.disc_ids)
     part = np.searchsorted(lost, graph.disc_pose - 1, side="right")
     own, index = np.unique(part * discs + graph.disc_index, return_inverse=True)
     alone = replace(graph, disc_ids=own, disc_index=index)
     begun = first_sight(alone, begin.poses[0])
-    found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).estimate
+    found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).at
     places = np.full((len(lost) + 1, discs, 2), np.nan)
     places[own // discs, own % discs] = found.disc_xy
-    poses, xy = found.poses, places[0]
+    lines: list[set[int]] = [set() for _ in places]
+    of_rows = np.searchsorted(lost, recording.lines.frame, side="right")
+    for k, ids in zip(of_rows, recording.lines.ids):
+        lines[k].update(ids)
+    poses, xy, known = found.poses, places[0], lines[0]
     waiting = set(range(1, len(places)))
     while waiting:
         shared = {k: np.isfinite(xy + places[k])[:, 0] for k in waiting}
-        k = max(waiting, key=lambda k: np.count_nonzero(shared[k]))
-        if np.count_nonzero(shared[k]) < FEWEST_SHARED:  # it is verticals that join it
-            break
+        counts = {k: np.array([shared[k].sum(), len(known & lines[k])]) for k in waiting}
+        k = max(waiting, key=lambda k: (counts[k][0] >= _FEWEST_SHARED, *counts[k]))
+        if counts[k].sum() < _FEWEST_SHARED:
+            first = min(waiting)
+            step = int(lost[first - 1])
+            raise SlamError(
+                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its "
+                f"odometry is lost, and the parts before and after share {counts[first].sum()} "
+                f"landmarks: expected at least {_FEWEST_SHARED}"
+            )
         waiting.remove(k)
-        motion = fitted(places[k, shared[k]], xy[shared[k]])
-        here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
-        poses[here, :2] = apply(motion, poses[here, :2])
-        poses[here, 2] += motion[2]
-        xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
+        known = known | lines[k]
+        if counts[k][0] >= _FEWEST_SHARED:
+            motion = fitted(places[k, shared[k]], xy[shared[k]])
+            here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
+            poses[here, :2] = apply(motion, poses[here, :2])
+            poses[here, 2] += motion[2]
+            xy = np.where(np.isfinite(xy), xy, apply(motion, places[k]))
     return replace(begin, poses=poses, disc_xy=np.where(np.isfinite(xy), xy, begin.disc_xy))
 
 
@@ -303,7 +319,7 @@ def _with_lines(
     recording: Recording,
     estimate: Estimate,
     placed: InitialLines,
-    keep: Callable[[Solution], Estimate],
+    keep: Callable[[Minimum[Estimate]], Estimate],
 ) -> tuple[Graph, Estimate]:
     """The problem with the lines that stay well placed while all is fitted together."""
     ids, xy = placed.ids, placed.xy
@@ -333,7 +349,9 @@ def _on_the_way(wanted: Weighting) -> list[Weighting]:
     return [Weighting(), *wider]
 
 
-def _descent(solver: Solver, loss: LossKind) -> Callable[[Graph, Estimate, Weighting], Solution]:
+def _descent(
+    solver: Solver, loss: LossKind
+) -> Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]:
     if solver == "gtsam":
         return solve_gtsam
     # A robust loss converges slowly at last: reweighting is no Newton's method.
@@ -364,7 +382,6 @@ def _check_usable(
                 f"{name}: bearings do not say how the camera is mounted: expected discs alone"
             )
         check_rows_fit_camera(camera, recording.circles.xy)
-    check_connected(recording, name)
 
 
 def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:

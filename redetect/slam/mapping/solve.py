@@ -19,6 +19,7 @@ from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import chosen_covariance, diagonal_blocks
 from redetect.least_squares.solver import (
     Linear,
+    Minimum,
     NormalEquations,
     StartError,
     factor,
@@ -30,15 +31,6 @@ from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
 
 _MOST_STEPS = 200
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Where a descent ended."""
-
-    estimate: Estimate
-    cost: float  # what was minimised: chi-squared, or less under a robust loss
-    costs: tuple[float, ...]  # at the start and after each step
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +83,7 @@ def solve(
     weighting: Weighting,
     *,
     tolerance: float = 1e-10,
-) -> Solution:
+) -> Minimum[Estimate]:
     """Minimise the sum of squared (or robust) whitened errors.
 
     As a start, odometry and first sight do for thousands of poses. The descent ends at a step that
@@ -118,7 +110,7 @@ def solve(
             f"least squares: no minimum within {_MOST_STEPS} steps: chi-squared is "
             f"{found.costs[-1]:.6g} and falling"
         )
-    return Solution(found.at, found.costs[-1], found.costs)
+    return found
 
 
 @contextmanager

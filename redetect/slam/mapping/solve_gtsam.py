@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from redetect.landmarks import wrap_angle
+from redetect.least_squares.solver import Minimum
 from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
-from redetect.slam.mapping.solve import Solution
 
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
@@ -28,7 +28,7 @@ _TOLERANCE, _MOST_STEPS = 1e-10, 200
 _MISSING = "--solver gtsam needs GTSAM, which is not installed: pip install 'redetect[slam]'"
 
 
-def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Solution:
+def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[Estimate]:
     """Minimise the sum of `redetect.slam.mapping.solve.solve` by GTSAM's Levenberg-Marquardt."""
     gtsam = load_gtsam()
     if weighting.calibrate or weighting.loss != "none" or len(graph.line_ids):
@@ -52,7 +52,7 @@ def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Solution
     estimate = estimate_of_values(graph, found, start)
     lowest = cost(graph, estimate, weighting)
     begun = cost(graph, start, weighting)
-    return Solution(estimate, lowest, (begun, *[lowest] * int(optimizer.iterations())))
+    return Minimum(estimate, (begun, *[lowest] * int(optimizer.iterations())), True)
 
 
 def load_gtsam() -> Any:

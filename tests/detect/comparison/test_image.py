@@ -119,47 +119,31 @@ def test_a_lean_is_a_difference_on_the_floor_not_missed_rows(published_camera: C
     assert found.in_image
     assert found.recall == found.precision == 1.0
     assert found.image_median_px == pytest.approx(0.35, abs=0.1)
+    assert np.median(np.linalg.norm(found.pairs.as_written, axis=1)) > 0.1
     assert found.error_median_m is not None
-    assert found.error_median_m > 0.1
-    lean = found.lean
-    assert lean is not None
-    for value, sigma, true in (
-        (lean.pitch_deg, lean.pitch_sigma_deg, -2.3),
-        (lean.roll_deg, lean.roll_sigma_deg, 0.7),
-        (lean.raised_m, lean.raised_sigma_m, 0.0),
-    ):
-        assert abs(value - true) < 4.0 * sigma
-    assert lean.pitch_sigma_deg < 0.05
-    assert lean.roll_sigma_deg < 0.05
-    assert lean.left.median_m is not None
-    assert lean.left.median_m < 0.02
+    assert found.error_median_m < 0.02
     far = next(part for part in found.bins if part.from_m == 3.0)
-    assert far.before.along_m is not None
-    assert far.before.along_m > 0.2
-    assert far.after is not None
-    assert abs(far.after.along_m or 0.0) < 0.02
-    text = format_text(found)
-    assert "levelled reference rows of 0 frames, detected rows of 60: compared at the pixels" in (
-        " ".join(text.split())
-    )
-    told = json.loads(found.to_json())
-    assert told["lean"]["pitch_deg"] == lean.pitch_deg
-    assert told["pairs"] == found.matched
+    assert far.as_written.along_m is not None
+    assert far.as_written.along_m > 0.2
+    assert far.alike is not None
+    assert abs(far.alike.along_m or 0.0) < 0.02
+    text = " ".join(format_text(found).split())
+    assert "reference levelled 0 detected levelled 60" in text
+    assert "the same levelled alike" in text
+    assert json.loads(found.to_json())["pairs"] == found.matched
 
 
-def test_height_is_found_beside_the_tilt(published_camera: Camera) -> None:
-    rng = np.random.default_rng(6)
-    raw, level = [], []
-    for k in range(40):
-        xy = places(rng)
-        raw.append(frame(k, xy))
-        level.append(frame(k, level_seen(published_camera, xy, (PITCH, ROLL), -0.045), None))
-    found = compare_frames(
-        raw, level, CompareOptions(gate_m=2.0), sight=Sight(published_camera)
-    ).lean
-    assert found is not None
-    assert found.raised_m == pytest.approx(-0.045, abs=1e-4)
-    assert found.pitch_deg == pytest.approx(-2.3, abs=1e-3)
+def test_rows_levelled_by_other_tilts_are_levelled_alike(published_camera: Camera) -> None:
+    xy = places(np.random.default_rng(6))
+    by_one, by_other = (PITCH, ROLL), (0.01, 0.02)
+    sides = [
+        [frame(0, level_seen(published_camera, xy, tilt), tilt)] for tilt in (by_one, by_other)
+    ]
+    found = compare(published_camera, *sides)
+    assert found.matched == len(xy)
+    assert found.error_95_m == pytest.approx(0.0, abs=1e-6)
+    backwards = compare(published_camera, sides[0], [frame(0, xy)])
+    assert backwards.error_95_m == pytest.approx(0.0, abs=1e-6)
 
 
 def test_frames_without_a_tilt_and_with_other_rows(published_camera: Camera) -> None:
@@ -199,11 +183,12 @@ def test_a_far_disc_is_the_same_within_three_pixels(published_camera: Camera) ->
     assert [matched(2.9), matched(3.1), matched(0.0, 6.0), matched(0.0, 12.0)] == [1, 0, 1, 0]
 
 
-def test_few_rows_tell_no_lean(published_camera: Camera) -> None:
+def test_rows_that_are_levelled_alike_have_no_second_figures(published_camera: Camera) -> None:
     xy = np.array([[0.1, -2.0], [0.1, -3.0]])
-    assert compare(published_camera, [frame(0, xy)], [frame(0, xy)]).lean is None
+    same = compare(published_camera, [frame(0, xy)], [frame(0, xy)])
+    assert {part.alike for part in same.bins} == {None}
     nothing = compare(published_camera, [frame(0, xy)], [frame(0, xy[:0])])
-    assert (nothing.matched, nothing.lean) == (0, None)
+    assert nothing.matched == 0
     json.loads(nothing.to_json())
 
 
@@ -216,7 +201,7 @@ def test_without_a_calibration_the_floor_is_compared(
     assert main(["compare", str(tmp_path)]) == 0
     told = capsys.readouterr().out
     assert "no calibration: positions are compared on the floor" in told
-    assert "within 0.1 m" in told
+    assert "options gate m" in told
     assert main(["compare", str(tmp_path), "--gate-m", "0.2"]) == 0
     assert "no calibration" not in capsys.readouterr().out
 

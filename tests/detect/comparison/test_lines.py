@@ -197,7 +197,7 @@ def test_sigmas_that_say_nothing_are_left_out_and_counted(sigma_deg: float) -> N
     assert (error.dof, error.left_out) == (1, 1)
     assert error.per_dof == pytest.approx(4)
     text = " ".join(format_text(found).split())  # without line breaks
-    assert "1 without a positive sigma left out" in text
+    assert "normalised error left out 1" in text
 
 
 def test_discs_in_the_file_do_not_count() -> None:
@@ -218,7 +218,7 @@ def test_no_matches_give_clear_results(reference: list[Frame], detected: list[Fr
     figures = json.loads(found.to_json())
     for name in ("bearing_median_deg", "bearing_95_deg", "ends_median", "beta_median_deg"):
         assert figures[name] is None
-    assert "median - deg, 95 % - deg" in format_text(found)
+    assert "bearing median deg -" in " ".join(format_text(found).split())
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
@@ -236,15 +236,9 @@ def test_json_has_the_figures_in_a_fixed_order() -> None:
 def test_text_shows_the_figures_plainly() -> None:
     text = format_text(compare(REFERENCE, DETECTED))
     lines = [" ".join(row.split()) for row in text.splitlines()]
-    assert lines[:4] == [
-        "found 4 of 5 reference rows",
-        "missed 1 of 5 reference rows",
-        "extra 1 of 5 detected rows: on no reference row",
-        "recall 0.8000",
-    ]
-    assert "same line within 0.5 deg or 2 sigma" in lines
-    assert "bearing error median 0.0500 deg, 95 % 0.2700 deg" in lines
-    assert "e.0000 2 0 1 1 0.300" in lines
+    assert lines[0] == "4 of 5 verticals of the reference are found, 1 missed, in 2 frames."
+    figures = {"recall 0.8", "bearing median deg 0.05", "bearing 95 deg 0.27"}
+    assert figures | {"e.0000 2 0 1 1 0.300"} <= {*lines}
     assert "\x1b" not in text
     assert max(map(len, text.splitlines())) <= 100
 
@@ -307,7 +301,7 @@ def test_rows_on_unlisted_lines_are_neither_right_nor_wrong(tmp_path: Path) -> N
 
     assert (result.found, result.extra, result.set_aside) == (1, 1, 1)
     assert result.precision == 0.5
-    assert "on lines in view that are not listed" in format_text(result)
+    assert "set aside 1" in " ".join(format_text(result).split())
     # So does the file beside the reference.
     for name, frames in (("map", reference), ("unlisted", unlisted), ("detected", detected)):
         write_frames(tmp_path / f"{name}.lines", frames)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, read_head, select_frames
-from detect.errors import DetectError
+from detect.drawing.inputs import SeenRows, every_nth, read_head
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
@@ -153,37 +152,11 @@ def _circle(points: int) -> FloatArray:
 # -- which frames -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("wanted", "every", "expected"),
-    [
-        ([], 1, [0, 1, 2]),
-        ([], 2, [0, 2]),
-        (["s.0002", "s.0000"], 1, [0, 2]),
-        (["images/s.0002.png"], 1, [2]),
-        (["s.0000", "s.0001", "s.0002"], 2, [0, 2]),
-    ],
-)
-def test_frames_are_selected(
-    small_run: Path, wanted: list[str], every: int, expected: list[int]
-) -> None:
-    frames = open_source(small_run).frames
-    count, selection = select_frames(frames, wanted, every)
+@pytest.mark.parametrize(("every", "expected"), [(1, [0, 1, 2]), (2, [0, 2])])
+def test_frames_are_selected(small_run: Path, every: int, expected: list[int]) -> None:
+    count, selection = every_nth(open_source(small_run).frames, every)
     assert [position for position, _ in selection] == expected
     assert count == len(expected)
-
-
-@pytest.mark.parametrize(
-    ("wanted", "every", "says"),
-    [
-        (["s.0009"], 1, "expected the name of an image"),
-        ([], 0, "every is 0"),
-    ],
-)
-def test_frames_that_are_none_are_refused(
-    small_run: Path, wanted: list[str], every: int, says: str
-) -> None:
-    with pytest.raises(DetectError, match=says):
-        select_frames(open_source(small_run).frames, wanted, every)
 
 
 # -- the command ------------------------------------------------------------------------------
@@ -239,7 +212,7 @@ def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path
     (small_run / "detected.markers").write_text(
         f"STEP s.0000 0 0 0 0 0 0 0 0 0\nLANDMARK_M rawseeds 5 0.9 {corners}\n"
     )
-    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--images", "s.0000"]) == 0
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "1"]) == 0
     picture = cv2.imread(str(tmp_path / "d" / "s.0000.png"))
     assert picture is not None
     green = np.abs(picture[50, 110:150].astype(int) - (60, 220, 60)).sum(axis=1)
@@ -251,9 +224,11 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run, "-o", out], small_run, "detect all", capsys)
     (small_run / "detected.circles").write_text("STEP s.0000 0 0 0 0 0 0 0 0 0\n")
     assert_refused(["draw", run], small_run, "--video", capsys)
-    assert_refused(["draw", run, "-o", out, "--lines", "no.lines"], small_run, "no.lines", capsys)
+    assert_refused(["draw", run, "-o", out, "--rows", "no"], small_run, "no/detected", capsys)
     assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
-    assert_refused(["draw", run, "-o", out, "--images", "x"], small_run, "'x'", capsys)
+    with pytest.raises(SystemExit):
+        main(["draw", run, "-o", out, "--every", "0"])
+    assert "every is 0: expected a whole number" in " ".join(capsys.readouterr().err.split())
     video = tmp_path / "v.mp4"
     video.write_bytes(b"mine")
     assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)

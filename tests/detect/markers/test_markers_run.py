@@ -44,7 +44,8 @@ def folder(tmp_path: Path) -> Path:
 def test_rows_of_a_folder_without_a_calibration(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["markers", str(folder), "--draw", str(folder / "drawn")]) == 0
+    drawn = str(folder / "drawn")
+    assert main(["markers", str(folder), "--draw", drawn, "--rejected"]) == 0
     assert "3 markers in 3 frames" in capsys.readouterr().out
     frames = list(read_frames(folder / "detected.markers"))
     assert [[row.id for row in frame.markers] for frame in frames] == [[5], [], [5, 9]]

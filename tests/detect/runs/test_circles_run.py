@@ -25,9 +25,7 @@ def detected(
     run: Run, settings: CircleSettings, output: Path, *, overwrite: bool = False, **others: Any
 ) -> RunSummary:
     """The discs of a run, and those as JSON if there is a place for them."""
-    plan = FramePlan(
-        run.camera, circles=settings, drawing="discs" if "pictures" in others else None
-    )
+    plan = FramePlan(run.camera, circles=settings)
     places = {"circles": output}
     if "json_output" in others:
         places["json"] = others.pop("json_output")
@@ -100,8 +98,7 @@ def test_head_tells_how_rows_were_made(small_run: Path) -> None:
 def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> None:
     (small_run / "images" / "s.0001.png").write_bytes(b"no image")
     (small_run / "images" / "s.0002.png").unlink()
-    output, as_json, pictures = small_run / "out.circles", tmp_path / "out.json", tmp_path / "drawn"
-    pictures.mkdir()
+    output, as_json = small_run / "out.circles", tmp_path / "out.json"
     ticks = [0]
 
     def tick() -> None:
@@ -112,7 +109,6 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
         CircleSettings(),
         output,
         json_output=as_json,
-        pictures=pictures,
         on_progress=tick,
     )
     assert summary.frames == ticks[0] == 3
@@ -121,7 +117,6 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
     broken, missing = summary.failures
     assert broken.startswith(str(small_run / "images" / "s.0001.png"))
     assert missing.startswith("s.0002: no image")
-    assert [path.name for path in pictures.iterdir()] == ["s.0000.png"]
     frames = list(read_frames(output))
     assert [len(frame.circles) for frame in frames] == [2, 0, 0]
     assert [frame.step for frame in frames] == list(read_steps(small_run / "s.txt"))

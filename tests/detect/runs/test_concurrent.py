@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,17 +10,14 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from detect.sources.opening import open_run
 from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import ForkedRuns, StopAfter, forked_runs, started
 from tests.detect.test_cli import files_in
-from tools.benchmark.material import repeated_run
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
 DETECT = ("-m", "detect")
 FRAMES = 16
-LONG_FRAMES = 40
 
 pytestmark = [
     pytest.mark.long,
@@ -42,13 +37,6 @@ def runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         yield started_runs
 
 
-@pytest.fixture(scope="module")
-def long_run(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Long enough for others to be at work meanwhile."""
-    folder = tmp_path_factory.mktemp("long") / "s"
-    return repeated_run(open_run(project_root / "images" / "e"), folder, LONG_FRAMES, 0)
-
-
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
     _, said = process.communicate(timeout=PATIENCE_S)
     return process.returncode, said
@@ -57,15 +45,6 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
 def folder_of(path: Path) -> Path:
     path.mkdir()
     return path
-
-
-def assert_one_run_wrote_all(folder: Path) -> None:
-    """Every file is the one that the log names by its hash."""
-    log = json.loads((folder / "detected.log.json").read_text())
-    assert len(log["outputs"]) == 4
-    for file in log["outputs"]:
-        content = (folder / file["name"]).read_bytes()
-        assert hashlib.sha256(content).hexdigest() == file["sha256"]
 
 
 def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> None:
@@ -95,35 +74,14 @@ def test_the_same_command_twice_is_refused(
     arguments = ["all", str(run_folder), "-o", str(output)]
     with runs.started(arguments, StopAfter(FRAMES // 2)) as first:
         first.wait_until_stopped()
-        for flags in ([], ["--resume"]):
+        for flags in ([], ["--resume"], ["--force"]):
             assert main([*arguments, *flags]) == 1
             *_, line = capsys.readouterr().err.splitlines()
             journal = output / ".detected.journal"
             assert line.startswith(f"error: {journal}: another run is writing")
         first.go_on()
         assert first.wait() == 0, first.said()
-    assert_one_run_wrote_all(output)
     assert len(files_in(output)) == 5
-
-
-def test_of_two_runs_that_may_overwrite_one_is_the_last(
-    runs: ForkedRuns, long_run: Path, tmp_path: Path
-) -> None:
-    """With other settings each, so that a mixture would be seen."""
-    output = folder_of(tmp_path / "output")
-    arguments = ["all", str(long_run), "-o", str(output), "--force"]
-    with runs.started(arguments, StopAfter(LONG_FRAMES // 10)) as first:
-        first.wait_until_stopped()
-        flags = ["--circles.threshold", "0.5", "--lines.alpha", "published"]
-        other = started([*DETECT, *arguments, *flags])
-        assert other.stderr is not None
-        assert "another run is writing" in other.stderr.readline()  # at work, and does not resume
-        first.go_on()
-        assert first.wait() == 0, first.said()
-        code, said = ended(other)
-        assert code == 0, said
-    assert_one_run_wrote_all(output)
-    assert len(files_in(output)) == 5  # and nothing that is hidden
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="looks for shared memory in /dev/shm")

@@ -69,7 +69,7 @@ def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -
     tasks, _ = tasks_and_plan
     tilt = FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7)
     tasks[1] = FrameTask(tasks[1].frame, KnownOfFrame(tilt))
-    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, 12, "why")
+    shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, "why")
     assert pickle.loads(pickle.dumps(tasks)) == tasks
     arrived = pickle.loads(pickle.dumps(shipped))
     assert arrived == shipped
@@ -96,18 +96,6 @@ def test_a_journal_gives_back_what_was_noted(
         assert list(journal.frames()) == list(zip(map(task_digest, tasks), ROWS_OF_JOURNAL))
         assert journal.complete() is None
     assert not list(tmp_path.glob(".*"))
-
-
-def test_pictures_are_not_noted(
-    tasks_and_plan: tuple[list[FrameTask], FramePlan], tmp_path: Path
-) -> None:
-    drawn = ROWS_OF_JOURNAL[0]._replace(picture=b"PNG")
-    with new_part(tmp_path / "a", "journal") as file:
-        journal = Journal(file)
-        journal.write(["program"])
-        journal.write_frames([(tasks_and_plan[0][0], drawn)])
-        ((_, rows),) = journal.frames()
-    assert rows == ROWS_OF_JOURNAL[0]
 
 
 def test_a_journal_goes_on_behind_what_is_taken_over(

@@ -163,7 +163,8 @@ def test_links_in_the_place_of_a_journal_or_part_are_not_followed(
     (output / name).symlink_to(precious)
     main(command(run_folder, output))
     assert precious.read_bytes() == PREVIOUS
-    assert results(output) == undisturbed
+    refused = name == ".detected.journal"  # as if another run had it
+    assert results(output) == ({} if refused else undisturbed)
 
 
 def test_resuming_what_was_never_begun(
@@ -195,30 +196,3 @@ def test_results_that_cannot_be_written_are_written_by_the_next_run(
     assert resumed(run_folder, output, capsys) == FRAMES
     assert results(output) == undisturbed
     assert hidden(output) == set()
-
-
-def test_pictures_of_the_frame_under_way(run_folder: Path, tmp_path: Path) -> None:
-    """A killed run may have drawn a frame that it had not noted yet."""
-    drawings = tmp_path / "drawn"
-    arguments = ["circles", str(run_folder), "-o", str(tmp_path / "rows"), "--draw", str(drawings)]
-    assert main(arguments) == 3
-    whole = results(drawings)
-    rows = (tmp_path / "rows").read_bytes()
-    shutil.rmtree(drawings)
-    (tmp_path / "rows").unlink()
-
-    add, count = RunFiles.add, [0]
-
-    def fail(self: RunFiles, found: object) -> None:
-        count[0] += 1
-        if count[0] == 7:
-            raise KeyboardInterrupt
-        add(self, found)  # type: ignore[arg-type]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RunFiles, "add", fail)
-        assert main(arguments) == 130
-    assert len(results(drawings)) == 7
-    assert main([*arguments, "--resume"]) == 3
-    assert results(drawings) == whole
-    assert (tmp_path / "rows").read_bytes() == rows

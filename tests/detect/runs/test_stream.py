@@ -42,9 +42,7 @@ def detect(
     """Detect in one pass, with a plan of discs or lines or both."""
     opened = open_run(run)
     wanted = FramePlan(opened.camera, **plan)
-    pictures = places.pop("pictures", None)
-    workers = local_workers(jobs, large=pictures is not None)
-    return detect_run(Job(opened, wanted, places, known or Known(), pictures), workers)
+    return detect_run(Job(opened, wanted, places, known or Known()), local_workers(jobs))
 
 
 def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
@@ -91,8 +89,7 @@ def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None
 
 
 def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
-    """Every kind of file: rows, tilts, IDs carried over, JSON, drawings."""
-    pictures = {kind: folder_of(output / kind) for kind in ("discs", "tracks")}
+    """Every kind of file: rows, tilts, IDs carried over, JSON."""
     plain = {"lines": output / "plain.lines", "tilt": output / "plain.tilt"}
     detect(run, plain, lines=LineSettings())
     reference = output / "reference.lines"
@@ -101,30 +98,20 @@ def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
         for number, row in enumerate((output / "plain.lines").read_text().splitlines())
     )
     reference.write_text("\n".join(numbered) + "\n")
-    places = {
-        "lines": output / "known.lines",
-        "tilt": output / "known.tilt",
-        "pictures": pictures["tracks"],
-    }
+    places = {"lines": output / "known.lines", "tilt": output / "known.tilt"}
     known = Known(lines=FramesByImage(reference))
-    detect(run, places, jobs, known, lines=LineSettings(), drawing="tracks")
-    places = {
-        "circles": output / "level.circles",
-        "json": output / "level.json",
-        "pictures": pictures["discs"],
-    }
+    detect(run, places, jobs, known, lines=LineSettings())
+    places = {"circles": output / "level.circles", "json": output / "level.json"}
     known = Known(tilts=read_tilts(plain["tilt"]))
-    detect(run, places, jobs, known, circles=LIGHT, drawing="discs")
+    detect(run, places, jobs, known, circles=LIGHT)
     return files_in(output)
 
 
 @pytest.mark.long
-def test_drawings_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_path: Path) -> None:
+def test_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_path: Path) -> None:
     one = all_there_is(run_folder, folder_of(tmp_path / "one"), 1)
     two = all_there_is(run_folder, folder_of(tmp_path / "two"), 2)
     assert one == two
-    drawn = [name for name in one if name.endswith(".png")]
-    assert len(drawn) == 2 * (FRAMES - 2)
     known = [line for f in read_frames(tmp_path / "one" / "known.lines") for line in f.lines]
     assert sum(line.ids != (-1,) for line in known) > 0.5 * len(known) > 20
 

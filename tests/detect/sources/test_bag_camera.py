@@ -1,4 +1,4 @@
-"""Calibrations that bags hold themselves: camera_info, and the camera's place by tf_static."""
+"""Calibrations of lenses that bags hold themselves: camera_info."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
 
@@ -16,13 +15,9 @@ from camera import Camera
 from camera.formats.conversion import convert_to_foreign
 from camera.formats.models import ForeignCamera
 from camera.formats.yaml_files import ROS_NAMES
-from detect.cli import main
 from detect.errors import DetectError
-from detect.options import SourceOptions
-from detect.sources.bag import pose_in_dataset, rotation_of
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
-from redetect.landmarks import read_frames
 from tests.detect.recordings import BagKind, Ros, Said
 
 OPTICAL = "front_optical"
@@ -52,12 +47,6 @@ def info(ros: Ros, camera: ForeignCamera, **changed: Any) -> Any:
     )
 
 
-def in_ros_axes(camera: Camera) -> NDArray[np.float64]:
-    """(3, 4) base_from_optical, X forward and Y left, of a camera in the data set's axes."""
-    left_backward_up = np.array(camera.robot_from_camera)
-    return np.stack([-left_backward_up[1], left_backward_up[0], left_backward_up[2]])
-
-
 def recorded(run: Path, ros: Ros, said: list[Said]) -> list[Said]:
     images = []
     for k in range(3):
@@ -68,62 +57,25 @@ def recorded(run: Path, ros: Ros, said: list[Said]) -> list[Said]:
 
 
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])
-def test_a_bag_that_needs_nothing_else(
-    small_run: Path, tmp_path: Path, published_camera: Camera, foreign: ForeignCamera, kind: BagKind
+def test_a_bags_own_calibration_is_for_markers(
+    small_run: Path, tmp_path: Path, foreign: ForeignCamera, published_camera: Camera, kind: BagKind
 ) -> None:
-    """Calibration and pose as ROS has them: the same discs at the same places."""
     ros = Ros(kind)
     (tmp_path / "bag").mkdir()
-    lifted = np.eye(4)[:3]
-    lifted[2, 3] = 0.2
-    optical = in_ros_axes(published_camera)
-    optical[2, 3] -= 0.2
-    transforms = ros.static_transforms(
-        ("base_link", OPTICAL, optical),
-        ("base_footprint", "base_link", lifted),
-        ("base_link", "lidar", lifted),
-    )
     said = [
-        Said("/tf_static", 1.0, transforms),
         Said("/front/camera_info", 1.0, info(ros, foreign)),
         Said("/rear/camera_info", 1.0, info(ros, foreign, roi_width=5)),
     ]
     path = ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
-    camera = open_run(path).camera
-    np.testing.assert_allclose(
-        camera.robot_from_camera, published_camera.robot_from_camera, atol=1e-4
-    )
-    if kind == "ros1":
-        return  # images of all kinds of bags: test_bag.py
-    expected, found = tmp_path / "expected.circles", tmp_path / "found.circles"
-    assert main(["circles", str(small_run), "-o", str(expected)]) == 0
-    assert main(["circles", str(path), "-o", str(found)]) == 0
-    for first, second in zip(read_frames(expected), read_frames(found), strict=True):
-        assert len(first.circles) == len(second.circles)
-        for a, b in zip(first.circles, second.circles):
-            assert (a.px, a.py) == pytest.approx((b.px, b.py), abs=1e-3)
-
-
-def test_without_a_pose_only_markers(
-    small_run: Path, tmp_path: Path, published_camera: Camera, plumb_bob: ForeignCamera
-) -> None:
-    ros = Ros()
-    (tmp_path / "bag").mkdir()
-    transforms = ros.static_transforms(("map", OPTICAL, in_ros_axes(published_camera)))
-    said = [
-        Said("/tf_static", 1.0, transforms),
-        Said("/front/camera_info", 1.0, info(ros, plumb_bob)),
-    ]
-    path = ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))
-    told = r"no static transforms lead from 'base_footprint' to 'front_optical': name a \.cam file"
-    with pytest.raises(DetectError, match=told):
+    with pytest.raises(DetectError, match=r"no calibration: expected a \.cam file beside"):
         open_run(path)
-    assert isinstance(open_source(path), Run)
-    assert isinstance(open_run(path, small_run / "s.cam"), Run)
-    named = open_run(path, None, SourceOptions(base_frame="map"))
+    run = open_source(path)
+    assert isinstance(run, Run)
+    pixels = np.random.default_rng(1).uniform([0, 0], [767, 287], size=(200, 2))
     np.testing.assert_allclose(
-        named.camera.robot_from_camera, published_camera.robot_from_camera, atol=1e-4
+        run.camera.undistort(pixels), published_camera.undistort(pixels), atol=1e-4
     )
+    assert isinstance(open_run(path, small_run / "s.cam"), Run)
 
 
 def test_camera_infos_that_say_nothing_or_too_little(
@@ -150,10 +102,11 @@ def test_a_decentred_lens_is_taken_over(small_run: Path, tmp_path: Path) -> None
     k = [460.0, 0, 384, 0, 230, 144, 0, 0, 1]
     d = [-0.05, 0.01, 4e-3, -5e-3, 0.0]
     said = [
-        Said("/tf_static", 1.0, ros.static_transforms(("base_footprint", OPTICAL, np.eye(4)[:3]))),
         Said("/front/camera_info", 1.0, ros.camera_info(768, 288, "plumb_bob", d, k, OPTICAL)),
     ]
-    camera = open_run(ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said))).camera
+    run = open_source(ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said)))
+    assert isinstance(run, Run)
+    camera = run.camera
     assert camera.tangential == pytest.approx((4e-3, -5e-3), abs=1e-4)
     pixels = np.random.default_rng(1).uniform([0, 0], [767, 287], size=(200, 2))
     rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
@@ -172,22 +125,3 @@ def test_a_lens_that_the_model_cannot_follow(small_run: Path, tmp_path: Path) ->
     path = ros.write(tmp_path / "bent", recorded(small_run, ros, said))
     with pytest.raises(DetectError, match=r"differs from it by up to [0-9.]+ px, more than 0\.05"):
         open_source(path)
-
-
-def test_chains_of_transforms() -> None:
-    turned = np.eye(4)
-    turned[:3, :3] = rotation_of(0.0, 0.0, np.sin(0.5), np.cos(0.5))
-    turned[:3, 3] = (1.0, 2.0, 3.0)
-    tree = {"a": ("base", turned), "b": ("a", turned), "x": ("y", turned), "y": ("x", turned)}
-    found = pose_in_dataset(tree, "base", "/b")
-    assert found is not None
-    forward, left, up = (turned @ turned)[:3]
-    np.testing.assert_allclose(found, [left, -forward, up])
-    assert pose_in_dataset(tree, "base", "x") is None  # they lead in a circle
-    assert pose_in_dataset(tree, "base", "unheard of") is None
-    for none in (0.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="a rotation of"):
-            rotation_of(none, 0.0, 0.0, 0.0)
-    np.testing.assert_allclose(
-        rotation_of(0.0, 0.0, 1e-200, 1e-200), rotation_of(0.0, 0.0, 1.0, 1.0)
-    )

@@ -29,27 +29,20 @@ def test_images_are_in_natural_order(names: set[str]) -> None:
             (Path(folder) / name).touch()
         (Path(folder) / "notes.txt").touch()
         images = ImageNames(Path(folder))
-        found = [images.path(place).name for place in range(len(images))]
-        assert found == sorted(names, key=by_value)
+        assert images.names == sorted(names, key=by_value)
         for name in names:
-            place = images.find(name)
-            assert place is not None
-            assert images.path(place).name == name
-            of_stem = images.find(Path(name).stem)
-            assert of_stem == next(
-                k for k, n in enumerate(found) if Path(n).stem == Path(name).stem
-            )
-        assert images.find("c") is None
-        assert images.find("notes") is None
+            assert images.image_of(name) == Path(folder) / name
+            first = next(n for n in images.names if Path(n).stem == Path(name).stem)
+            assert images.image_of(Path(name).stem) == Path(folder) / first
+        assert images.image_of("c") is None
+        assert images.image_of("notes") is None
 
 
 def test_hidden_files_are_no_images(tmp_path: Path) -> None:
     for name in ("a.jpg", "._a.jpg", ".b.jpg"):
         (tmp_path / name).touch()
-    images = ImageNames(tmp_path)
-    assert [images.path(k).name for k in range(len(images))] == ["a.jpg"]
-    assert len(ImageNames(tmp_path, "*.jpg")) == 1
-    assert ImageNames(tmp_path, ".b.jpg").path(0).name == ".b.jpg"
+    for pattern, found in (("*", "a.jpg"), ("*.jpg", "a.jpg"), (".b.jpg", ".b.jpg")):
+        assert ImageNames(tmp_path, pattern).names == [found]
 
 
 def test_a_prefix_may_go_up_within_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,6 +51,6 @@ def test_a_prefix_may_go_up_within_the_run(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path / "other")
     images = ImageNames(Path("../run/images"))
-    assert images.place_of("../images/a") == images.place_of('"a.png"') == 0
+    assert images.image_of("../images/a") == images.image_of('"a.png"') is not None
     with pytest.raises(FrameError, match="the prefix leads out of the folder: expected an image"):
-        images.place_of("../../other/a")
+        images.image_of("../../other/a")

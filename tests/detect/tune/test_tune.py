@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
-from detect.report.figures import f1_score, knee, pareto_front
 from detect.settings import CircleSettings
 from detect.tune import (
-    Trial,
     combinations,
     curve_picture,
+    knee,
+    marked,
     parameter_values,
-    trial_records,
+    pareto_front,
 )
 from redetect.landmarks import read_frames
 from tests.detect.conftest import SMALL_RUN_DISCS
@@ -53,11 +53,6 @@ def test_without_a_bend_the_greatest_f1_stands_for_the_knee() -> None:
     assert knee([0.9, 0.3], [0.8, 0.9]) == 0
     assert knee([0.4], [0.5]) == 0
     assert knee([np.nan, 0.5], [0.5, np.nan]) is None
-
-
-def test_harmonic_mean() -> None:
-    np.testing.assert_allclose(f1_score([0.5, 0.0, 1.0], [1.0, 0.0, 1.0]), [2 / 3, 0.0, 1.0])
-    assert np.isnan(f1_score(np.nan, 0.5))
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
@@ -132,16 +127,12 @@ def test_all_combinations_are_tried() -> None:
 
 
 def test_records_mark_front_and_knee() -> None:
-    grid = [{"threshold": k / 10} for k in range(len(CURVE))]
-    trials = [
-        Trial({"recall": r, "precision": p, "error_median_m": 0.0123456789}) for r, p in CURVE
-    ]
-    records = trial_records(grid, trials)
+    trials = [{"threshold": k / 10, "recall": r, "precision": p} for k, (r, p) in enumerate(CURVE)]
+    records = marked(trials)
     assert [r["front"] for r in records] == [True] * 4 + [False] * 3
     assert [r["knee"] for r in records] == [False, True] + [False] * 5
-    assert records[0]["error_median_m"] == 0.0123457
-    picture = curve_picture(grid, trials, "by hand")
-    assert picture == curve_picture(grid, trials, "by hand")
+    picture = curve_picture(records, ["threshold"], "by hand")
+    assert picture == curve_picture(records, ["threshold"], "by hand")
     shown = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     # The ring round the knee (#a8321e).
@@ -165,7 +156,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
         small_run, {**SMALL_RUN_DISCS, "s.0001": [], "s.0002": [(0.0, -1.4), (0.5, -1.4)]}
     )
     folder = tmp_path / "t"
-    arguments = ["tune", str(small_run), "--threshold", "0.4,0.999", "--samples", "8,16"]
+    arguments = ["tune", str(small_run), "--vary", "samples=8,16", "threshold=0.4,0.999"]
     assert main([*arguments, "-o", str(folder)]) == 0
     document = json.loads((folder / "table.json").read_text())
     rows = document["trials"]
@@ -194,7 +185,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
 @pytest.mark.long
 def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
     write_reference(small_run, SMALL_RUN_DISCS)
-    arguments = ["tune", str(small_run), "--threshold", "0.4:0.9:0.25"]
+    arguments = ["tune", str(small_run), "--vary", "threshold=0.4:0.9:0.25"]
     for jobs in ("1", "2"):
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
     for name in ("table.json", "curve.png"):
@@ -205,15 +196,16 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     run = str(small_run)
     tune = ["tune", run, "-o", str(tmp_path / "t")]
     assert_refused(tune, small_run, "nothing is varied", capsys)
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "map.circles", capsys)
+    assert_refused([*tune, "--vary", "threshold"], small_run, "expected NAME=VALUES", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "map.circles", capsys)
     write_reference(small_run, {"other": [(0.0, -1.0)]})
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "none of the 3", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "none of the 3", capsys)
     write_reference(small_run, SMALL_RUN_DISCS)
-    assert_refused([*tune, "--threshold", "2"], small_run, "threshold is 2", capsys)
+    assert_refused([*tune, "--vary", "threshold=2"], small_run, "threshold is 2", capsys)
     assert not (tmp_path / "t").exists()
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "curve.png").write_bytes(b"mine")
-    assert_refused([*tune, "--threshold", "0.5"], small_run, "--force", capsys)
+    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "--force", capsys)
     with pytest.raises(SystemExit) as ended:
         main([*tune, "--treshold", "0.5"])
     assert ended.value.code == 2
