@@ -62,9 +62,9 @@ FloatArray = NDArray[np.float64]
 
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
 _WELL_EXPLAINED = 0.97
-#: From this share of the rim on, and if it explains this share of the variance, the fit of the
-#: whole disc gives the place.
-_WHOLE_RIM, _IN_PART = 0.8, 0.9
+#: From this share of the variance on that it explains, the fit of the whole disc gives the place:
+#: where this share of the rim is in view, and where less is.
+_WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.93
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND, _MOST_REFITS = 0.98, 2
 #: Standard deviation of the radius about that which discs of the image seem to have, relative: of a
@@ -564,7 +564,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> Any:
     clear = 0
     for k in range(count):
         rim = _rim_of(scene, discs, k, scene.radius)
-        whole[k] = rim.agreeing >= _WHOLE_RIM and _fit_whole(scene, rim, work, results[k])
+        whole[k] = _fit_whole(scene, rim, work, results[k])
         if whole[k] and results[k].explained >= _WELL_EXPLAINED:
             radii[clear] = results[k].radius
             clear += 1
@@ -596,7 +596,8 @@ def _fit_whole(scene: Scene, rim: Rim, work: Any, result: Any) -> bool:
             break
         # Too blurred for its patch: once more, in a wider one.
         start, blur = Start(result.x, result.y, result.radius, result.blur), result.blur_bound
-    return bool(result.explained >= _IN_PART and result.contrast * rim.step > 0.0)
+    least = _EXPLAINS_WHOLE if rim.agreeing >= _WHOLE_RIM else _EXPLAINS_PART
+    return bool(result.explained >= least and result.contrast * rim.step > 0.0)
 
 
 @kernel()
