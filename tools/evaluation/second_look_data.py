@@ -286,11 +286,12 @@ def render_board(
     part = photograph[int(top) : int(top + zoom[0]), int(left) : int(left + zoom[1])]
     behind = cv2.resize(part, (width * fine, height * fine), interpolation=cv2.INTER_CUBIC)
     behind = behind * rng.uniform(0.3, 1.0)
-    paper, ink = rng.uniform(110.0, 240.0), rng.uniform(10.0, 80.0)
+    paper = rng.uniform(90.0, 240.0)
+    ink = paper * rng.uniform(0.1, 0.8)
     grey = np.where(on_board, np.where(off < _RADIUS, ink, paper), behind)
     slope = rng.uniform(-0.3, 0.3, 2)
     light = 1.0 + slope[0] * u[None, :] / width + slope[1] * v[:, None] / height
-    sigma = fine * rng.uniform(0.4, 1.6)
+    sigma = fine * rng.uniform(0.4, 2.5)
     seen = cv2.GaussianBlur((grey * light).astype(np.float32), (0, 0), sigma)
     pixels = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
     noisy = pixels + rng.normal(0.0, rng.uniform(0.5, 5.0), pixels.shape)
