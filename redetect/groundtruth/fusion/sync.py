@@ -47,7 +47,7 @@ _SLOWEST_INTERPOLATED_S = 0.25
 # Deviation of a position that was not measured (m).
 _UNKNOWN_M = 1e4
 _LEAST_WAY_M = 1.0
-_SMOOTHED_SAMPLES = 5
+_SMOOTHED_SAMPLES, _SMOOTHED_S = 5, 0.5
 _ROUNDS = 2
 # Steps of the search (s, at the middle and at the ends) and of derivatives (standard deviations).
 _STEP_S = 0.005
@@ -366,14 +366,16 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
 
 
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
-    """Means of some samples: single ones are rough, and between two of them less so.
+    """Means of up to five samples: single ones are rough, and between two of them less so.
 
     Where samples meet the measured poses at the same phase throughout, that difference would pass
     for a better or worse fit of the clock.
     """
     x, y, theta = odometry.poses.T
     columns = np.column_stack([odometry.times_s, x, y, np.unwrap(theta)])
-    means = uniform_filter1d(columns, _SMOOTHED_SAMPLES, axis=0)
+    interval_s = float(np.median(np.diff(odometry.times_s)))
+    aside = min(_SMOOTHED_SAMPLES, int(_SMOOTHED_S / interval_s)) // 2
+    means = uniform_filter1d(columns, 1 + 2 * aside, axis=0)
     return PlanarPoses(means[:, 0], means[:, 1:])
 
 
