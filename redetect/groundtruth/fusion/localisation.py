@@ -122,9 +122,9 @@ def _stationary(
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
-        return surprise(logarithms) + (off / _LOG_CORRELATION_SIGMA) ** 2
+        return surprise(logarithms) + float((off / _LOG_CORRELATION_SIGMA) ** 2)
 
-    start = np.log([np.std(values) + 1e-6, _USUAL_CORRELATION_S])
+    start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
     found = minimize(
         with_prior, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02}
     )
