@@ -117,12 +117,12 @@ def _stationary(
     def surprise(logarithms: FloatArray) -> float:
         sigma, lasting = np.exp(logarithms)
         factor = cho_factor(sigma**2 * np.exp(-apart / lasting) + _LEVEL_SIGMA**2 + noise)
-        determinant = 2.0 * values.shape[1] * float(np.sum(np.log(np.diagonal(factor[0]))))
-        return determinant + float(np.sum(some * cho_solve(factor, some)))
+        determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(factor[0])))
+        return float(determinant + np.sum(some * cho_solve(factor, some)))
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
-        return surprise(logarithms) + float((off / _LOG_CORRELATION_SIGMA) ** 2)
+        return surprise(logarithms) + float(off / _LOG_CORRELATION_SIGMA) ** 2
 
     start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
     found = minimize(

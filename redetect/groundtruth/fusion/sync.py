@@ -372,11 +372,13 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     for a better or worse fit of the clock.
     """
     x, y, theta = odometry.poses.T
-    columns = np.column_stack([odometry.times_s, x, y, np.unwrap(theta)])
+    # From the first one on: sums of times since 1970 lose digits.
+    begin_s = odometry.times_s[0]
+    columns = np.column_stack([odometry.times_s - begin_s, x, y, np.unwrap(theta)])
     interval_s = float(np.median(np.diff(odometry.times_s)))
     aside = min(_SMOOTHED_SAMPLES, int(_SMOOTHED_S / interval_s)) // 2
     means = uniform_filter1d(columns, 1 + 2 * aside, axis=0)
-    return PlanarPoses(means[:, 0], means[:, 1:])
+    return PlanarPoses(begin_s + means[:, 0], means[:, 1:])
 
 
 def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
