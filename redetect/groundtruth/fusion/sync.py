@@ -69,6 +69,7 @@ _JUMP_SPACING_S = 0.005
 _JUMP_GAIN = 60.0
 _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
+_LEAST_PART_S = 5.0
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 
 
@@ -300,6 +301,7 @@ def _likeliest(
         problem = problem_at(clock)
         noise = likeliest_noise(problem)
         noise *= math.sqrt(looser_over_seconds(problem, noise))
+        clock, unit = np.clip(clock, -0.999 * largest, 0.999 * largest), np.minimum(unit, largest)
         inward = np.where(clock > 0.0, -unit, unit)
         found = minimize(
             lambda x, unit: surprise(x * unit),
@@ -401,11 +403,12 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
     before = np.cumsum(squared, axis=1)
     after = before[:, -1:] - before
-    inside = slice(_FEWEST_SAMPLES, -_FEWEST_SAMPLES)
-    parted = (before.min(axis=0) + after.min(axis=0))[inside]
-    if not len(parted) or np.sum(fit.squared(fit.clock)) - parted.min() < _JUMP_GAIN:
+    times_s = fit.problem_at(fit.clock).measured_s
+    parted = before.min(axis=0) + after.min(axis=0)
+    parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < _LEAST_PART_S] = np.inf
+    if np.sum(fit.squared(fit.clock)) - parted.min() < _JUMP_GAIN:
         return None
-    return float(fit.problem_at(fit.clock).measured_s[inside][np.argmin(parted)])
+    return float(times_s[np.argmin(parted)])
 
 
 def _differ(parts: list[ClockSegment]) -> bool:
