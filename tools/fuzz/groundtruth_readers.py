@@ -44,7 +44,7 @@ _SCANNER_JSON = (
 )
 _CLOCK_JSON = (
     '{"segments": [{"from_s": 0, "to_s": 10, "reference_s": 5, "offset_s": 0.1, "rate": 1.0,'
-    ' "angle_rad": 0.1, "sigma_offset_s": 0.001, "sigma_rate": 1e-5, "sigma_angle_rad": null,'
+    ' "angle_rad": 0.1, "sigma_offset_s": 0.001, "sigma_rate": 1e-5,'
     ' "turned_rad": 3, "status": "ok", "note": ""}]}'
 )
 _BOARDS_JSON = (

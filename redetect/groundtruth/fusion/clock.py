@@ -47,7 +47,6 @@ class ClockSegment:
     # Standard deviations; infinite where the segment does not determine the value
     sigma_offset_s: float = math.inf
     sigma_rate: float = math.inf
-    sigma_angle_rad: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
     # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
     # `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at the

@@ -242,25 +242,28 @@ def fuse(
     at = np.searchsorted(problem.times_s, inside)
     path = _path(inside, smoothed[at], spread[at])
     states, spreads = problem.filtered(noise)
-    squared, accepted, restarted = account.squared, account.accepted, account.restarted > 0
+    restarted = account.restarted > 0
     localisation = None
     if chosen.learn_noise:
-        found = as_localisation(last_of_each_time(odometry), problem, over_seconds, inside)
+        found = as_localisation(last_of_each_time(odometry), problem, over_seconds, path)
         if found is not None:
-            path, squared, localisation = found
-            accepted, restarted = squared <= problem.gate(), np.zeros_like(restarted)
+            path, localisation = found
+            restarted[:] = False
     # Odometry's errors are constants: their final estimate uses all measurements.
     last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
         rejected=tuple(
-            Rejected(str(problem.streams[i]), float(problem.measured_s[i]), float(squared[i]))
-            for i in np.flatnonzero(~accepted)
+            Rejected(
+                str(problem.streams[i]), float(problem.measured_s[i]), float(account.squared[i])
+            )
+            for i in np.flatnonzero(~account.accepted)
         ),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
-            name: int(np.count_nonzero(accepted & (problem.streams == name))) for name in streams
+            name: int(np.count_nonzero(account.accepted & (problem.streams == name)))
+            for name in streams
         },
         odometry=OdometryErrors(
             *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()

@@ -1,13 +1,11 @@
 """Odometry as control and measured poses: their likelihood together, and the smoothed path.
 
 Over a long path without measurements odometry's heading drifts so far that derivatives along the
-filter's own path do not hold for the true one. Such gaps, at whose ends the filter is lost, are
-treated separately. The paths before and after are known from their own measurements. Odometry is
-placed between them, bent evenly, and refined to the likeliest path by Gauss-Newton steps (a forward
-filter and a backward smoother, linearised along the current path). Headings are known up to whole
-turns: each possible number of turns is tried, and the gap is bridged only if one of them explains
-the other end much better than all others. Otherwise the two sides are not connected: the gap is cut
-in the middle.
+filter's own path do not hold for the true one. So filter and smoother are repeated, linearised
+along the smoothed path, until it settles (Gauss-Newton steps). Headings are known up to whole
+turns: where odometry could have drifted by so much, or does not explain the other end of a gap, the
+two sides are not connected. Such a gap is cut in the middle, and each half follows odometry from
+its own end.
 """
 
 from __future__ import annotations
@@ -43,108 +41,15 @@ from redetect.groundtruth.fusion.kernels import (
     smooth_backward,
 )
 from redetect.groundtruth.settings import FuseSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
-from redetect.landmarks import wrap_angle
+from redetect.groundtruth.trajectories.streams import (
+    PlanarPoses,
+    last_of_each_time,
+    pose_differences,
+)
 
 #: Least time without measurements that is a gap: rejections after it are attributed to it.
 UNMEASURED_S = 1.0
-_MOST_TURNS = 2
-_MOST_STEPS = 15
-_MOST_LOOSENINGS = 10
-_WHERE_NONE_SETTLES = 10.0
-_SETTLED_RAD = 1e-3
-# Of twice the logarithm of the likelihood: by how much the best number of turns must lead.
-_CLEAR_LEAD = 2.0 * math.log(100.0)
 _TURN_PER_METRE = 4
-
-
-def bridge(
-    odometry: Odometry,
-    forward: FloatArray,
-    spread: FloatArray,
-    end: FloatArray,
-    end_spread: FloatArray,
-    gate: float,
-) -> tuple[FloatArray | None, float]:
-    """Find the likeliest path between two known ends.
-
-    `odometry` leads to the N nodes of the gap. `forward` (N - 1, 6) is where it leads from the
-    first node, whose covariance is `spread` (6, 6). `end` (3,) is the pose at the last node, with
-    `end_spread` (3, 3). Beyond the `gate`, a squared normalised distance of the end, odometry is
-    taken to err more in this gap than elsewhere.
-
-    Returns states (N, 6) from the gap's begin to its end, whose headings have no jumps, or None if
-    more than one number of whole turns may be, or none explains the end; and by how much odometry's
-    variances had to be raised to explain it, 1 or more.
-    """
-    looser = 1.0
-    for _ in range(_MOST_LOOSENINGS):
-        tried = []
-        for turns in range(-_MOST_TURNS, _MOST_TURNS + 1):
-            start = _bent(odometry.controls, forward, end, turns)
-            loose = odometry._replace(variances=looser * odometry.variances)
-            found = _likeliest(loose, start, forward[0], spread, end_spread)
-            if found is not None:
-                tried.append(found)
-        if not tried:
-            looser *= _WHERE_NONE_SETTLES
-            continue
-        tried.sort(key=lambda one: one[0])
-        surprise, squared, path = tried[0]
-        if squared <= gate:
-            clear = len(tried) == 1 or tried[1][0] - surprise >= _CLEAR_LEAD
-            return (path if clear else None), looser
-        looser *= max(squared / POSE, 1.5)
-    return None, looser
-
-
-def _bent(controls: FloatArray, forward: FloatArray, end: FloatArray, turns: int) -> FloatArray:
-    """(N, 6) the path of odometry, bent and moved evenly along its way until it meets the end."""
-    way = np.hypot(controls[:, 0], controls[:, 1])
-    way[0] = 0.0
-    # On the spot: by the rows.
-    passed = np.cumsum(way) if np.any(way > 0.0) else np.arange(float(len(way)))
-    share = passed / passed[-1]
-    path = np.vstack([forward, forward[-1:]])
-    path[-1, 2] += controls[-1, 2]
-    missing = float(wrap_angle(end[2] - path[-1, 2])) + 2.0 * math.pi * turns
-    steps = np.diff(path[:, :2], axis=0)
-    steps = (steps[:, 0] + 1j * steps[:, 1]) * np.exp(1j * missing * share[1:])
-    xy = np.concatenate([[0.0], np.cumsum(steps)]) + complex(path[0, 0], path[0, 1])
-    xy += share * (complex(end[0], end[1]) - xy[-1])
-    path[:, 0], path[:, 1] = xy.real, xy.imag
-    path[:, 2] += missing * share
-    return path
-
-
-def _likeliest(
-    odometry: Odometry,
-    path: FloatArray,
-    begin: FloatArray,
-    spread: FloatArray,
-    end_spread: FloatArray,
-) -> tuple[float, float, FloatArray] | None:
-    """Surprise, squared distance of the end and states, by Gauss-Newton steps, if they settle."""
-    count = len(path)
-    measured = MeasuredPoses(
-        np.array([count - 1]), path[-1:, :POSE].copy(), end_spread[None].copy()
-    )
-    history = empty_history(count)
-    for _ in range(_MOST_STEPS):
-        account = filter_forward(odometry, begin, spread, measured, _no_gate(count), path, history)
-        better, _ = smooth_backward(history)
-        moved = float(np.max(np.abs(better[:, 2] - path[:, 2])))
-        path = better
-        if not moved < 10.0 * math.pi:
-            return None
-        if moved < _SETTLED_RAD:
-            return account.surprise, float(account.squared[0]), path
-    return None
-
-
-def _no_gate(nodes: int) -> Gating:
-    """Accept everything."""
-    return Gating(math.inf, 1, np.ones(POSE), math.inf, np.zeros(nodes, dtype=np.bool_))
 
 
 def back_from(
@@ -166,7 +71,7 @@ def back_from(
         mirror * end,
         end_spread * mirror * mirror[:, None],
         MeasuredPoses(np.empty(0, dtype=np.int64), np.empty((0, POSE)), np.empty((0, POSE, POSE))),
-        _no_gate(count),
+        Gating(math.inf, 1, np.ones(POSE), math.inf, np.zeros(count, dtype=np.bool_)),
         np.empty((1, STATE)),
         history,
     )
@@ -176,10 +81,10 @@ def back_from(
 
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
-# Of the heading (rad^2): beyond it, derivatives at the heading expected say nothing of others.
-_LOST_VARIANCE = 0.5**2
-_RELINEARISATIONS = 1
-_RELINEARISATIONS_WHERE_LOST = 3
+# Of the heading (rad^2): beyond it, another number of whole turns is possible.
+_LOST_VARIANCE = 1.0
+_MOST_STEPS = 5
+_SETTLED_RAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +180,6 @@ class MovementProblem:
         `states`, `covariances` (N, 6), (N, 6, 6).
         """
         variances = self._variances(noise)
-        as_sampled = variances.copy()
         nodes = self.measured.nodes
         after = np.flatnonzero(np.diff(self.measured_s) > UNMEASURED_S)
         for begin, end in zip(nodes[after], nodes[after + 1]):
@@ -290,25 +194,21 @@ class MovementProblem:
             cuts[unfit] = True
         states, covariances = smooth_backward(history)
         good = nodes[account.accepted]
-        # The nodes of the last measurement before, and the first one after, gaps that are too long.
+        # The nodes of the last measurement before, and the first one after, gaps that were cut.
         gaps = [
             (int(good[np.searchsorted(good, end) - 1]), int(end))
             for end in np.flatnonzero(account.restarted == WHERE_LOST)
         ]
-        points = states.copy()
-        cuts[:] = False
-        for begin, end in gaps:
-            cuts[end], looser = self._bridge(begin, end, as_sampled, points, covariances)
-            variances[begin + 1 : end + 1] *= max(1.0, looser / looser_in_gaps)
-        # Again, linearised along the smoothed path: where a gap was bridged, the filter alone was
-        # too far off on its way for its derivatives to hold.
-        for _ in range(_RELINEARISATIONS + (_RELINEARISATIONS_WHERE_LOST if gaps else 0)):
-            account = self._forward(variances, points, cuts, history)
+        carried = cuts.copy()
+        cuts[[end for _, end in gaps]] = True
+        for _ in range(_MOST_STEPS):
+            before = states
+            account = self._forward(variances, before, cuts, history)
             states, covariances = smooth_backward(history)
-            points = states.copy()
+            if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
+                break
         for begin, end in gaps:
-            if cuts[end]:
-                self._anchor(begin, end, variances, states, covariances)
+            self._anchor(begin, end, variances, states, covariances, carried=bool(carried[end]))
         return states, covariances, account
 
     def _ends_that_did_not_fit(self, account: MeasurementAccount) -> list[int]:
@@ -323,36 +223,6 @@ class MovementProblem:
                 found.append(int(nodes[first]))
         return found
 
-    def _bridge(
-        self,
-        begin: int,
-        end: int,
-        variances: FloatArray,
-        points: FloatArray,
-        covariances: FloatArray,
-    ) -> tuple[bool, float]:
-        """Bridge a gap that was cut with points, if possible; else it stays cut.
-
-        The number of whole turns by which headings differ is that with the least noise. Returns
-        whether it stays cut, and by how much odometry's variances are to be raised in it.
-        """
-        gap = slice(begin, end + 1)
-        path, looser = bridge(
-            Odometry(self.controls[gap], variances[gap]),
-            points[begin:end],
-            covariances[begin],
-            points[end, :POSE],
-            covariances[end, :POSE, :POSE],
-            self.gate(),
-        )
-        if path is None:
-            return True, looser
-        points[begin:end] = path[:-1]
-        # Whole turns, so that headings continue without a jump.
-        turns = np.round((path[-1, 2] - points[end, 2]) / (2.0 * math.pi))
-        points[end:, 2] += 2.0 * math.pi * turns
-        return False, looser
-
     def _anchor(
         self,
         begin: int,
@@ -360,16 +230,28 @@ class MovementProblem:
         variances: FloatArray,
         states: FloatArray,
         covariances: FloatArray,
+        *,
+        carried: bool,
     ) -> None:
-        """Determine the second half of a gap that was cut from the measurements after it."""
+        """Determine the second half of a gap that was cut from the measurements after it.
+
+        A robot that was `carried` in the gap may have been so anywhere along its way: covariances
+        then have the other end's path as a possibility.
+        """
         gap = slice(begin, end + 1)
         back, spreads = back_from(
             Odometry(self.controls[gap], variances[gap]), states[end], covariances[end]
         )
         way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
-        half = int(np.searchsorted(way, 0.5 * (way[0] + way[-1]))) + 1
+        way -= way[0]
+        half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
+        apart = pose_differences(back[1:-1, :POSE], states[begin + 1 : end, :POSE])
         states[begin + half : end] = back[half:-1]
         covariances[begin + half : end] = spreads[half:-1]
+        if carried:
+            share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
+            other = share[:, None, None] * apart[:, :, None] * apart[:, None]
+            covariances[begin + 1 : end, :POSE, :POSE] += other
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""

@@ -1,48 +1,37 @@
-"""The robot's clock from headings: time offset, drift and angle offset, segment by segment.
+"""The robot's clock: time offset, drift and angle offset, segment by segment.
 
 The headings of odometry and ground truth are those of one robot; the offset and the rate between
 their clocks minimise the squared difference, with the angle between their axes eliminated in closed
-form (RAWSEEDS D2.1 part 2). The search is global and derivative-free and depends on no initial
-value. Odometry's heading drifts, so that a plain sum of squares would explain drift by a time
-offset. A second search around the first result therefore whitens the residuals, from which the
-noise of the samples and the rate of the random walk are estimated.
+form (RAWSEEDS D2.1 part 2). That search is global and derivative-free and depends on no initial
+value. But odometry's heading drifts, which a sum of squares would in part explain by a time offset.
 
-Headings determine the time only through turns, and only as well as odometry's heading drift allows.
-Where the ground truth has positions and covariances, the clock is refined, near the estimate by
-headings, to maximise the likelihood of all measured poses given odometry's movements. Curves of the
-path and changes of speed then contribute as well.
+So from there the clock is moved to where the measured poses are likeliest, given odometry's
+movements and their errors: once for the headings of the ground truth alone, and once for its whole
+poses, if they have covariances; then curves of the path and changes of speed contribute as well.
+The more certain of the two counts.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, direct, minimize
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import Bounds, direct, minimize, minimize_scalar
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.clock import (
-    ClockModel,
     ClockSegment,
     Status,
     knots_of,
     on_one_line,
 )
-from redetect.groundtruth.fusion.fuse import likeliest_noise
-from redetect.groundtruth.fusion.headings import (
-    HeadingPair,
-    Wandering,
-    continuous_headings,
-    estimate_wandering,
-    find_jump,
-    pair_headings,
-    without_turns,
-)
-from redetect.groundtruth.fusion.inputs import noise_of
+from redetect.groundtruth.fusion.fuse import likeliest_noise, looser_over_seconds
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -52,20 +41,36 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.landmarks import wrap_angle
 
-_MOST_COARSE_SAMPLES = 400
-_OUTLIER_SIGMAS = 6.0
-_COARSE_SIGMA_RAD = 0.02
-# A segment determines the offset, or the drift, if its deviation is below this share of the search
-# bound.
+_FEWEST_SAMPLES = 20
+_MOST_SAMPLES = 400
+_SLOWEST_INTERPOLATED_S = 0.25
+# Deviation of a position that was not measured (m).
+_UNKNOWN_M = 1e4
+_LEAST_WAY_M = 1.0
+_SMOOTHED_SAMPLES, _SMOOTHED_S = 5, 0.5
+_ROUNDS = 2
+# Steps of the search (s, at the middle and at the ends) and of derivatives (standard deviations).
+_STEP_S = 0.005
+_DERIVATIVE_STEP = 0.7
+# Ratio of the errors in simulated sessions to the deviations by the likelihood's curvature: errors
+# of wheels do not follow the model exactly.
+_SIGMA_FACTOR = 2.0
+# Share of the bounds beyond which the search has not found a minimum within them.
+_AT_A_BOUND = 0.999
+# A segment determines the offset if its deviation is below this share of the search bound.
 _LEAST_DETERMINED = 0.1
+# The same of the drift, which is taken to be 0 where it is not determined.
+_DETERMINED_DRIFT = 0.025
+_NEAR_S = 0.1
 _MOST_JUMPS = 3
+_JUMP_OFFSETS = np.arange(-40, 41)
+_JUMP_SPACING_S = 0.005
+# By how much a jump must lower the squared normalised errors.
+_JUMP_GAIN = 60.0
 _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
+_LEAST_PART_S = 5.0
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
-_FEWEST_SAMPLES = 20
-_SIMPLEX_SIZE = 0.02
-# Of variances: movement's are stated with a margin, so it is left only where headings clearly win.
-_MUCH_LESS_CERTAIN = 4.0
 
 
 def synchronise(
@@ -76,9 +81,10 @@ def synchronise(
     Parameters
     ----------
     odometry : PlanarPoses
-        The robot's own poses on its own clock; only headings and times are used.
+        The robot's own poses on its own clock.
     groundtruth : PlanarPoses
-        Poses on the ground truth's clock. Of several of one time, in either, the last counts.
+        Poses on the ground truth's clock; without covariances only their headings are used. Of
+        several of one time, in either, the last counts.
 
     Returns
     -------
@@ -100,103 +106,309 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
-    by_headings: list[ClockSegment] = []
-    by_movement: list[ClockSegment] = []
+    odometry = _smoothed(odometry)
+    found: list[ClockSegment] = []
     for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
-        segment = groundtruth.only(part)
-        own = _segment(odometry, segment, bounds, _MOST_JUMPS)
-        refined = refine_by_movement(own, odometry, segment, bounds.largest)
-        if len(refined) > 1 and not _differ(refined):
-            # Headings suggested a jump of the clock that the whole movement does not confirm.
-            own = _segment(odometry, segment, bounds, 0)
-            refined = refine_by_movement(own, odometry, segment, bounds.largest)
-        by_headings.extend(own)
-        by_movement.extend(refined)
-    if all(segment.turned_rad == 0.0 and segment.note == "no odometry" for segment in by_headings):
+        found += _segment(odometry, groundtruth.only(part), bounds, _MOST_JUMPS)
+    if all(segment.note == _NO_ODOMETRY for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
             f"overlap within {bounds.largest_offset_s:g} s"
         )
-    best, alone = on_one_line(by_movement), on_one_line(by_headings)
-    if _uncertainty(best) > _MUCH_LESS_CERTAIN * _uncertainty(alone):
-        best = alone
-    return tuple(_interpolated(best))
+    return tuple(_interpolated(on_one_line(found)))
 
 
-def _uncertainty(segments: list[ClockSegment]) -> float:
-    """Variances of the offsets at the ends of the segments that are determined, summed up (s^2)."""
-    return sum(
-        segment.sigma_offset_s**2
-        + (0.5 * segment.sigma_rate * (segment.to_s - segment.from_s)) ** 2
-        for segment in segments
-        if segment.status != "no turns"
-    )
+_NO_ODOMETRY = "no odometry"
 
 
 def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, jumps_left: int
 ) -> list[ClockSegment]:
     """One segment's clock; several parts where the clock was set within it."""
-    pair = pair_headings(odometry, segment, bounds.largest, _FEWEST_SAMPLES)
-    turned = float(np.sum(np.abs(np.diff(_smoothed(continuous_headings(segment))))))
-    if pair is None:
-        return [_undetermined(segment, 0.0, "no odometry")]
-    offset, drift = _search(pair, bounds)
-    pair = pair.kept(_inliers(pair, offset, drift))
-    if len(pair.times_s) < _FEWEST_SAMPLES:
-        return [_undetermined(segment, turned, "the headings have nothing in common")]
-    for _ in range(2):
-        wandering = estimate_wandering(
-            pair.times_s, without_turns(pair.differences(offset, drift)), pair.systematic
-        )
-        offset, drift = _refine(pair, wandering, (offset, drift), bounds)
-    sigma_offset_s, sigma_rate = _sigmas(pair, wandering, offset, drift, bounds).tolist()
-    alone_s = float(_sigmas(pair, wandering, offset, drift, bounds, unknowns=1)[0])
-    if not alone_s < _LEAST_DETERMINED * bounds.largest_offset_s:
-        return [_undetermined(segment, turned, "turns too little to determine the offset")]
-    note = ""
-    if not sigma_rate < _LEAST_DETERMINED * bounds.largest_drift:
-        note = "too short to determine the drift: assumed to be 0"
-        offset, drift = _refine(pair, wandering, (offset, 0.0), bounds, unknowns=1)
-        # Only at the reference time is the offset independent of the unknown drift.
-        sigma_offset_s, sigma_rate = alone_s, bounds.largest_drift / math.sqrt(3.0)
-    elif jumps_left > 0:
-        place = find_jump(pair, offset, drift)
-        if place is not None:
-            parts = []
-            for which in (segment.times_s < place, segment.times_s >= place):
-                part = segment.only(which)
-                if len(part) >= _FEWEST_SAMPLES:
-                    parts += _segment(odometry, part, bounds, jumps_left - 1)
-            if _differ(parts):
-                return [
-                    replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
-                    if part.status == "ok"
-                    else part
-                    for part in parts
-                ]
-    found, largest = np.abs([offset, drift]), np.array(bounds.largest)
-    status: Status = "at a bound" if np.any(found > _AT_A_BOUND * largest) else "ok"
-    level, level_sigma = wandering.level(
-        without_turns(pair.differences(offset, drift), keep_mean=True)
+    headings = np.unwrap(segment.poses[:, 2])
+    # Without their noise, coarsely: means of ten.
+    means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
+    turned = float(np.sum(np.abs(np.diff(means))))
+    # What odometry covers, wherever within the bounds its clock is.
+    reach = bounds.largest_offset_s + bounds.largest_drift * float(np.ptp(segment.times_s))
+    measured = segment.only(
+        segment.during(odometry.times_s[0] + reach, odometry.times_s[-1] - reach)
     )
+    own = odometry.only(
+        odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
+    )
+    if min(len(measured), len(own)) < _FEWEST_SAMPLES:
+        return [_undetermined(segment, turned, _NO_ODOMETRY)]
+    pair = HeadingPair.of(own, measured, reach)
+    clock = _search(pair, bounds)
+    jittered = _with_jitter(measured, own)
+    best = _likeliest(own, _headings_alone(jittered), pair.reference_s, clock, bounds)
+    if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
+        return [_undetermined(segment, turned, "turns too little to determine the offset")]
+    driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
+    if measured.covariances is not None and driven >= _LEAST_WAY_M:
+        moving = _likeliest(own, jittered, pair.reference_s, best.clock, bounds)
+        if moving is not None and moving.uncertainty(measured) < best.uncertainty(measured):
+            best = moving
+    place = _jump(best, bounds) if jumps_left > 0 else None
+    if place is not None:
+        parts = []
+        for which in (segment.times_s < place, segment.times_s >= place):
+            parts += _segment(odometry, segment.only(which), bounds, jumps_left - 1)
+        if _differ(parts):
+            return [
+                replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
+                if part.status == "ok"
+                else part
+                for part in parts
+            ]
+    at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
+    status: Status = "at a bound" if at_bound else "ok"
     return [
         ClockSegment(
             from_s=float(segment.times_s[0]),
             to_s=float(segment.times_s[-1]),
             reference_s=pair.reference_s,
-            offset_s=offset,
-            rate=1.0 + drift,
-            angle_rad=float(wrap_angle(np.array(level))),
-            sigma_offset_s=sigma_offset_s,
-            sigma_rate=sigma_rate,
-            sigma_angle_rad=level_sigma,
+            offset_s=float(best.clock[0]),
+            rate=1.0 + float(best.clock[1]),
+            angle_rad=_mean_angle(pair.differences(best.clock)),
+            sigma_offset_s=float(best.sigmas[0]),
+            sigma_rate=float(best.sigmas[1]),
             turned_rad=turned,
             status=status,
-            note=note,
         )
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingPair:
+    """The headings of two streams: those of one, and the other one, which is interpolated."""
+
+    times_s: FloatArray  # (N,)
+    headings: FloatArray  # (N,)
+    other_s: FloatArray  # (M,)
+    other: FloatArray  # (M,): continuous
+    reference_s: float
+    sign: int  # 1 where the ground truth's headings are the N
+
+    @classmethod
+    def of(cls, odometry: PlanarPoses, groundtruth: PlanarPoses, reach_s: float) -> HeadingPair:
+        """Interpolate the smoother, faster stream; of the other one, some samples are enough.
+
+        Within `reach_s` of its ends the ground truth may not have been measured by the other clock.
+        """
+        inside = odometry.during(
+            groundtruth.times_s[0] + reach_s, groundtruth.times_s[-1] - reach_s
+        )
+        streams = [(one.times_s, np.unwrap(one.poses[:, 2])) for one in (groundtruth, odometry)]
+        slow = [np.median(np.diff(times)) > _SLOWEST_INTERPOLATED_S for times, _ in streams]
+        rough = [roughness(headings) for _, headings in streams]
+        sampled = int(slow[1] if slow[0] != slow[1] else rough[1] > rough[0])
+        if np.count_nonzero(inside) < _FEWEST_SAMPLES:
+            sampled = 0
+        times, headings = streams[sampled]
+        if sampled:
+            times, headings = times[inside], headings[inside]
+        stride = 1 + len(times) // _MOST_SAMPLES
+        return cls(
+            times[::stride],
+            headings[::stride],
+            *streams[1 - sampled],
+            float(np.mean(groundtruth.times_s)),
+            -1 if sampled else 1,
+        )
+
+    def differences(self, clock: FloatArray) -> FloatArray:
+        """(N,) heading of the ground truth minus heading of the odometry, by a clock (2,)."""
+        offset_s, drift = clock
+        if self.sign > 0:
+            times = self.times_s + offset_s + drift * (self.times_s - self.reference_s)
+        else:
+            times = (self.times_s - offset_s + drift * self.reference_s) / (1.0 + drift)
+        return np.asarray(self.sign * (self.headings - np.interp(times, self.other_s, self.other)))
+
+
+def roughness(values: FloatArray) -> float:
+    """Standard deviation of values (N,) beside their neighbours, in their unit.
+
+    Third differences cancel whatever changes smoothly; their median does not mind single jumps.
+    """
+    third = np.diff(values, 3)
+    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+
+
+def _mean_angle(differences: FloatArray) -> float:
+    return float(np.angle(np.mean(np.exp(1j * differences))))
+
+
+def _search(pair: HeadingPair, bounds: SyncSettings) -> FloatArray:
+    """(2,) offset (s) and drift of the least squared differences, the angle eliminated."""
+    largest = np.array(bounds.largest)
+
+    def squared(x: FloatArray) -> float:
+        differences = pair.differences(x * largest)
+        return float(np.mean(np.square(wrap_angle(differences - _mean_angle(differences)))))
+
+    found = direct(squared, Bounds([-1.0, -1.0], [1.0, 1.0]), maxfun=1500, maxiter=1000)
+    return np.asarray(found.x * largest)
+
+
+class ClockFit(NamedTuple):
+    """The clock that makes measured poses likeliest, given odometry's movements."""
+
+    clock: FloatArray  # (2,): offset at the reference time (s), drift
+    sigmas: FloatArray  # (2,)
+    problem_at: Callable[[FloatArray], MovementProblem]  # By the clock
+    noise: FloatArray  # (4,): odometry's random errors
+
+    def squared(self, clock: FloatArray) -> FloatArray:
+        """(M,) squared normalised errors of the measured poses by another clock, gated."""
+        problem = self.problem_at(clock)
+        return np.minimum(problem.account(self.noise).squared, problem.gate())
+
+    def uncertainty(self, measured: PlanarPoses) -> float:
+        """Variance of the offset at the ends of what was measured (s^2)."""
+        half = 0.5 * float(np.ptp(measured.times_s))
+        return float(np.sum(np.square(self.sigmas * [1.0, half])))
+
+
+def _likeliest(
+    odometry: PlanarPoses,
+    measured: PlanarPoses,
+    reference_s: float,
+    start: FloatArray,
+    bounds: SyncSettings,
+) -> ClockFit | None:
+    """The likeliest clock near a start and within the bounds; None where nothing is likeliest."""
+    largest = np.array(bounds.largest)
+    half = 0.5 * float(np.ptp(measured.times_s))
+
+    def problem_at(clock: FloatArray) -> MovementProblem:
+        offset_s, drift = clock
+        times = (odometry.times_s - offset_s + drift * reference_s) / (1.0 + drift)
+        own = PlanarPoses(times, odometry.poses)
+        return movement_problem(own, {"pose": measured}, FuseSettings())
+
+    def surprise(clock: FloatArray) -> float:
+        # Even between the bounds, before anything was measured.
+        prior = 3.0 * float(np.sum(np.square(clock / largest)))
+        return problem_at(clock).account(noise).surprise + prior
+
+    clock, unit = start, np.array([_STEP_S, _STEP_S / half])
+    for _ in range(_ROUNDS):
+        problem = problem_at(clock)
+        noise = likeliest_noise(problem)
+        noise *= math.sqrt(looser_over_seconds(problem, noise))
+        clock, unit = np.clip(clock, -0.999 * largest, 0.999 * largest), np.minimum(unit, largest)
+        inward = np.where(clock > 0.0, -unit, unit)
+        found = minimize(
+            lambda x, unit: surprise(x * unit),
+            clock / unit,
+            (unit,),
+            method="Nelder-Mead",
+            bounds=Bounds(-largest / unit, largest / unit),
+            options={
+                "xatol": 0.01,
+                "fatol": 0.01,
+                "initial_simplex": (clock + np.vstack([np.zeros(2), np.diag(inward)])) / unit,
+            },
+        )
+        clock = found.x * unit
+        deviations = _deviations(surprise, clock, _DERIVATIVE_STEP * unit)
+        if deviations is None:
+            return None
+        unit = deviations
+    sigmas = _SIGMA_FACTOR * unit
+    if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
+        around = np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0])
+        offset_s = minimize_scalar(
+            lambda offset_s: surprise(np.array([offset_s, 0.0])),
+            bounds=around,
+            method="bounded",
+            options={"xatol": 1e-4},
+        ).x
+        clock, sigmas = np.array([offset_s, 0.0]), np.array([sigmas[0], largest[1] / math.sqrt(3)])
+    return ClockFit(clock, sigmas, problem_at, noise)
+
+
+def _deviations(
+    surprise: Callable[[FloatArray], float], at: FloatArray, step: FloatArray
+) -> FloatArray | None:
+    """(2,) of two unknowns, from the curvature of minus twice the logarithm of the likelihood."""
+    e, f = np.diag(step)
+    here = surprise(at)
+    curvature = np.diag([surprise(at + d) + surprise(at - d) - 2.0 * here for d in (e, f)])
+    if not np.all(np.diag(curvature) > 0.0):
+        return None
+    cross = 0.25 * (
+        surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
+    )
+    # Where a gate opens or shuts, a step may pass for curvature.
+    if cross**2 < np.prod(np.diag(curvature)):
+        curvature[0, 1] = curvature[1, 0] = cross
+    return np.asarray(step * np.sqrt(2.0 * np.diag(np.linalg.inv(curvature))))
+
+
+def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
+    """Measured poses as uncertain as odometry's own jitter makes the comparison.
+
+    A localisation jitters from sample to sample, which is no error that adds up.
+    """
+    covariances = np.zeros((len(measured), 3, 3))
+    if measured.covariances is None:
+        covariances[:, 2, 2] = roughness(np.unwrap(measured.poses[:, 2])) ** 2
+    else:
+        covariances += measured.covariances
+    jitter = [
+        roughness(values) for values in (*odometry.poses[:, :2].T, np.unwrap(odometry.poses[:, 2]))
+    ]
+    return PlanarPoses(measured.times_s, measured.poses, covariances + np.diag(np.square(jitter)))
+
+
+def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
+    """Means of up to five samples: single ones are rough, and between two of them less so.
+
+    Where samples meet the measured poses at the same phase throughout, that difference would pass
+    for a better or worse fit of the clock.
+    """
+    x, y, theta = odometry.poses.T
+    # From the first one on: sums of times since 1970 lose digits.
+    begin_s = odometry.times_s[0]
+    columns = np.column_stack([odometry.times_s - begin_s, x, y, np.unwrap(theta)])
+    interval_s = float(np.median(np.diff(odometry.times_s)))
+    aside = min(_SMOOTHED_SAMPLES, int(_SMOOTHED_S / interval_s)) // 2
+    means = uniform_filter1d(columns, 1 + 2 * aside, axis=0)
+    return PlanarPoses(begin_s + means[:, 0], means[:, 1:])
+
+
+def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
+    """Poses of which nothing is known but the heading."""
+    assert measured.covariances is not None
+    covariances = np.tile(np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]), (len(measured), 1, 1))
+    covariances[:, 2, 2] = measured.covariances[:, 2, 2]
+    return PlanarPoses(measured.times_s, measured.poses, covariances)
+
+
+def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
+    """When the clock was set, on the ground truth's clock; None if it was not.
+
+    Each part before and after a place has the offset, of many and without a drift, that suits it
+    best; a jump is where both together are much better than the best clock without one.
+    """
+    spacing = max(float(fit.sigmas[0]), _JUMP_SPACING_S)
+    offsets = fit.clock[0] + spacing * _JUMP_OFFSETS
+    offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
+    squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
+    before = np.cumsum(squared, axis=1)
+    after = before[:, -1:] - before
+    times_s = fit.problem_at(fit.clock).measured_s
+    parted = before.min(axis=0) + after.min(axis=0)
+    parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < _LEAST_PART_S] = np.inf
+    if np.sum(fit.squared(fit.clock)) - parted.min() < _JUMP_GAIN:
+        return None
+    return float(times_s[np.argmin(parted)])
 
 
 def _differ(parts: list[ClockSegment]) -> bool:
@@ -208,103 +420,13 @@ def _differ(parts: list[ClockSegment]) -> bool:
         for part in (before, after):
             away = place - part.reference_s
             offsets.append(part.offset_s + (part.rate - 1.0) * away)
-            # A clock's drift is far smaller than the search bounds, which are used if it is open.
+            # Where the drift is not determined, it still is that of a quartz.
             rate_sigma = min(part.sigma_rate, _LARGEST_DRIFT_OF_A_QUARTZ)
             variances.append(part.sigma_offset_s**2 + (rate_sigma * away) ** 2)
         jump = abs(offsets[1] - offsets[0])
         if jump > _LEAST_JUMP_S and jump > _JUMP_SIGMAS * math.sqrt(sum(variances)):
             return True
     return False
-
-
-def _smoothed(headings: FloatArray) -> FloatArray:
-    """Headings without their noise, coarsely: means of ten."""
-    count = max(len(headings) // 10, 1)
-    return np.array([part.mean() for part in np.array_split(headings, count)])
-
-
-def _sum_of_squares(pair: HeadingPair, offset_s: float, drift: float) -> float:
-    """Squared differences after the best angle and the best of the systematic errors."""
-    level = without_turns(pair.differences(offset_s, drift))
-    level -= level.mean()
-    shapes = pair.systematic
-    # The systematic errors are weighted against a coarse guess of the noise.
-    information = shapes.T @ shapes + _COARSE_SIGMA_RAD**2 * np.eye(shapes.shape[1])
-    along = shapes.T @ level
-    return float((level @ level - along @ np.linalg.solve(information, along)) / len(level))
-
-
-def _search(pair: HeadingPair, bounds: SyncSettings) -> tuple[float, float]:
-    """Global least squares: offset and drift, the angle eliminated."""
-    stride = max(1, len(pair.times_s) // _MOST_COARSE_SAMPLES)
-    coarse = pair.kept(np.arange(len(pair.times_s)) % stride == 0)
-    box = Bounds([-1.0, -1.0], [1.0, 1.0])
-    scale = np.array(bounds.largest)
-    found = direct(lambda x: _sum_of_squares(coarse, *(x * scale)), box, maxfun=1500, maxiter=1000)
-    best = _minimum(lambda x: _sum_of_squares(pair, *(x * scale)), found.x, 1e-6, 1e-14)
-    offset, drift = best * scale
-    return float(offset), float(drift)
-
-
-def _simplex(start: FloatArray) -> FloatArray:
-    """A first simplex inside the box of -1 to 1."""
-    inward = np.where(start > 0.0, -_SIMPLEX_SIZE, _SIMPLEX_SIZE)
-    return np.asarray(start + np.vstack([np.zeros(len(start)), np.diag(inward)]))
-
-
-def _inliers(pair: HeadingPair, offset_s: float, drift: float) -> BoolArray:
-    """Which samples are no gross errors of one of the streams."""
-    level = without_turns(pair.differences(offset_s, drift))
-    centre = float(np.median(level))
-    sigma = float(np.median(np.abs(level - centre))) / 0.6745
-    return np.asarray(np.abs(level - centre) <= max(_OUTLIER_SIGMAS * sigma, 1e-6))
-
-
-def _refine(
-    pair: HeadingPair,
-    wandering: Wandering,
-    start: tuple[float, float],
-    bounds: SyncSettings,
-    unknowns: int = 2,
-) -> tuple[float, float]:
-    """Least whitened squares near a result of the global search; of one unknown, the offset."""
-    scale = np.array(bounds.largest)
-    best = np.clip(np.array(start) / scale, -1.0, 1.0)
-
-    def squared(x: FloatArray) -> float:
-        tried = np.concatenate([x, best[unknowns:]]) * scale
-        return wandering.squared(without_turns(pair.differences(*tried)))
-
-    best[:unknowns] = _minimum(squared, best[:unknowns], 1e-7, 1e-9)
-    offset, drift = best * scale
-    return float(offset), float(drift)
-
-
-def _minimum(
-    cost: Callable[[FloatArray], float], start: FloatArray, xatol: float, fatol: float
-) -> FloatArray:
-    """Minimum of a cost within -1 to 1, near a start."""
-    options = {"xatol": xatol, "fatol": fatol, "initial_simplex": _simplex(start)}
-    box = Bounds(-1.0, 1.0)
-    found = minimize(cost, start, method="Nelder-Mead", bounds=box, options=options)
-    return np.asarray(found.x)
-
-
-def _sigmas(
-    pair: HeadingPair,
-    wandering: Wandering,
-    offset_s: float,
-    drift: float,
-    bounds: SyncSettings,
-    unknowns: int = 2,
-) -> FloatArray:
-    """(2,) deviations of offset and drift by the information in the segment's turns."""
-    # In deviations before anything was measured, which differ much: even between the bounds.
-    prior = np.array(bounds.largest) / math.sqrt(3.0)
-    jacobian = (pair.sensitivities(offset_s, drift) * prior)[:, :unknowns]
-    information = jacobian.T @ wandering.whiten(jacobian) + np.eye(unknowns)
-    prior[:unknowns] *= np.sqrt(np.diag(np.linalg.inv(information)))
-    return prior
 
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
@@ -330,122 +452,3 @@ def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
         else segment
         for segment in segments
     ]
-
-
-_MARGIN_S = 2.0
-_LEAST_WAY_M = 1.0
-_FEWEST_POSES = 20
-_ROUNDS = 2
-# Ratio of the errors in simulated sessions to the deviations by the likelihood's curvature: errors
-# of wheels do not follow the model exactly.
-_SIGMA_FACTOR = 2.0
-
-
-def refine_by_movement(
-    segments: Sequence[ClockSegment],
-    odometry: PlanarPoses,
-    groundtruth: PlanarPoses,
-    largest: tuple[float, float],
-) -> list[ClockSegment]:
-    """Move each segment's offset and rate to where the movements fit best.
-
-    Refined are segments with the status `ok` or `jump` in which the robot drove a metre or more, if
-    the result is near the estimate by headings and within the bounds `largest` of offset (s) and
-    drift; the ground truth has covariances.
-    """
-    if groundtruth.covariances is None:
-        return list(segments)
-    return [
-        _refined(segment, odometry, groundtruth, largest)
-        if segment.status in ("ok", "jump")
-        else segment
-        for segment in segments
-    ]
-
-
-def _refined(
-    segment: ClockSegment,
-    odometry: PlanarPoses,
-    groundtruth: PlanarPoses,
-    largest: tuple[float, float],
-) -> ClockSegment:
-    assert groundtruth.covariances is not None
-    here = groundtruth.during(segment.from_s, segment.to_s)
-    near = odometry.during(
-        segment.from_s + segment.offset_s - _MARGIN_S, segment.to_s + segment.offset_s + _MARGIN_S
-    )
-    steps = np.diff(odometry.poses[near][:, :2], axis=0)
-    if (
-        np.count_nonzero(here) < _FEWEST_POSES
-        or np.count_nonzero(near) < _FEWEST_POSES
-        or float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))) < _LEAST_WAY_M
-    ):
-        return segment
-    measured = groundtruth.only(here)
-    robot_times, own = odometry.times_s[near], odometry.poses[near]
-    settings = FuseSettings()
-    noise = noise_of(settings)
-    # One unit of the search: what the headings leave open, but no less than a millisecond at the
-    # segment's middle and at its ends.
-    half = 0.5 * (segment.to_s - segment.from_s)
-    unit = np.array([max(segment.sigma_offset_s, 1e-3), max(segment.sigma_rate, 1e-3 / half)])
-    start = np.array([segment.offset_s, segment.rate - 1.0])
-    bounds = Bounds((-np.array(largest) - start) / unit, (np.array(largest) - start) / unit)
-
-    def moved(x: FloatArray) -> ClockSegment:
-        offset_s, rate = (segment.offset_s, segment.rate) + unit * x
-        return replace(segment, offset_s=float(offset_s), rate=float(rate))
-
-    def problem_at(x: FloatArray) -> MovementProblem:
-        times = ClockModel((moved(x),)).groundtruth_times(robot_times)
-        return movement_problem(PlanarPoses(times, own), {"pose": measured}, settings)
-
-    def surprise(x: FloatArray) -> float:
-        return problem_at(x).account(noise).surprise
-
-    best = np.zeros(2)
-    try:
-        for _ in range(_ROUNDS):
-            noise = likeliest_noise(problem_at(best))
-            found = minimize(
-                surprise,
-                best,
-                method="Nelder-Mead",
-                bounds=bounds,
-                options={"xatol": 0.01, "fatol": 0.01, "initial_simplex": best + _SIMPLEX},
-            )
-            best = found.x
-    except GroundTruthError:
-        return segment
-    at_bound = np.abs(start + unit * best) > _AT_A_BOUND * np.array(largest)
-    if np.max(np.abs(best)) > _FARTHEST or np.any(at_bound):
-        return segment
-    covariance = _curvature_covariance(surprise, best)
-    if covariance is None:
-        return segment
-    sigma = _SIGMA_FACTOR * unit * np.sqrt(np.diag(covariance))
-    return replace(moved(best), sigma_offset_s=float(sigma[0]), sigma_rate=float(sigma[1]))
-
-
-_SIMPLEX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-# Largest distance from the estimate by headings, in its deviations; beyond it is rejected.
-_FARTHEST = 8.0
-# Share of the bounds beyond which the search has not found a minimum within them.
-_AT_A_BOUND = 0.999
-
-
-def _curvature_covariance(
-    surprise: Callable[[FloatArray], float], at: FloatArray
-) -> FloatArray | None:
-    """Of the two unknowns, from the curvature of minus twice the logarithm of the likelihood."""
-    h = 0.7
-    e, f = h * np.eye(2)
-    hessian = np.empty((2, 2))
-    for i, step in enumerate((e, f)):
-        hessian[i, i] = (surprise(at + step) + surprise(at - step) - 2.0 * surprise(at)) / h**2
-    hessian[0, 1] = hessian[1, 0] = (
-        surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
-    ) / (2.0 * h) ** 2
-    if not (np.linalg.eigvalsh(hessian)[0] > 0.0 and math.isfinite(hessian.sum())):
-        return None
-    return np.asarray(2.0 * np.linalg.inv(hessian))

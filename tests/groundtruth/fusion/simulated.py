@@ -21,7 +21,7 @@ class Clocks:
     angle_rad: float = 2.9
     length_s: float = 60.0
     start_s: float = 0.0
-    truth_rate_hz: float = 75.0
+    truth_rate_hz: float = 25.0
     truth_sigma_rad: float = 0.0026
     walk: float = 0.003
     jump_at_s: float | None = None

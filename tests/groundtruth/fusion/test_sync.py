@@ -21,13 +21,7 @@ from redetect.groundtruth.fusion.clock import (
     read_clock,
     read_ptpd,
 )
-from redetect.groundtruth.fusion.headings import (
-    HeadingIntegral,
-    Wandering,
-    estimate_wandering,
-    heading_noise,
-)
-from redetect.groundtruth.fusion.sync import synchronise
+from redetect.groundtruth.fusion.sync import roughness, synchronise
 from redetect.groundtruth.settings import SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -37,9 +31,7 @@ from redetect.groundtruth.trajectories.streams import (
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.simulated import Clocks, headings_only, joined, simulate
 
-SEGMENT = ClockSegment(
-    10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, 1e-3, turned_rad=5.0, status="ok"
-)
+SEGMENT = ClockSegment(10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, turned_rad=5.0, status="ok")
 
 
 @pytest.mark.parametrize(("offset", "drift"), [(-0.97, -0.0095), (0.0, 0.0), (0.98, 0.0097)])
@@ -188,44 +180,16 @@ def test_a_clock_that_was_set_back_has_no_inverse() -> None:
         model.groundtruth_times([5.0])
 
 
-def test_means_of_straight_pieces_are_exact() -> None:
-    integral = HeadingIntegral(np.array([0.0, 1.0, 3.0]), np.array([0.0, 2.0, -2.0]))
-    means = integral.means(np.array([0.0, 0.5, 1.0, 2.0]), np.array([1.0, 1.5, 3.0, 2.5]))
-    np.testing.assert_allclose(means, [1.0, 1.5, 0.0, -0.5], atol=1e-12)
-    covered = integral.covers(np.array([0.0, 0.2, -0.1]), np.array([1.0, 2.0, 0.5]), 1.5)
-    np.testing.assert_array_equal(covered, [True, False, False])
-
-
 def test_noise_of_headings_is_told_from_turning() -> None:
     rng = np.random.default_rng(2)
     times = np.arange(0, 100, 0.02)
-    noise = heading_noise(3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
+    noise = roughness(3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
     assert noise == pytest.approx(0.01, rel=0.05)
 
 
 def test_cuts_are_where_the_pauses_are() -> None:
     parts = segments_between_gaps(np.array([0.0, 1.0, 7.0, 8.0, 30.0]), 5.0)
     assert [(part.start, part.stop) for part in parts] == [(0, 2), (2, 4), (4, 5)]
-
-
-def test_wandering_is_told_from_noise() -> None:
-    rng = np.random.default_rng(7)
-    times = np.arange(0, 400, 0.2)
-    walk = np.cumsum(rng.normal(0, np.sqrt(4e-5 * 0.2), len(times)))
-    found = estimate_wandering(times, walk + rng.normal(0, 0.004, len(times)))
-    assert found.sigma == pytest.approx(0.004, rel=0.1)
-    assert found.rate == pytest.approx(4e-5, rel=0.35)
-
-
-def test_whitening_is_the_inverse_of_the_covariance_with_free_level() -> None:
-    times = np.array([0.0, 0.3, 0.7, 1.5, 1.6])
-    shape = np.array([[0.0], [0.1], [0.1], [-0.2], [0.3]])
-    noise = Wandering(times, 0.02, 0.003, shape)
-    covariance = 0.02**2 * np.eye(5) + 0.003 * np.minimum.outer(times, times) + shape @ shape.T
-    inverse = np.linalg.inv(covariance)
-    ones = np.ones(5)
-    free = inverse - np.outer(inverse @ ones, ones @ inverse) / (ones @ inverse @ ones)
-    np.testing.assert_allclose(noise.whiten(np.eye(5)), free, rtol=1e-6, atol=1e-6)
 
 
 def test_clock_files_come_back(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
         (session / name).write_text(json.dumps(hostile))
     segment = {
         "from_s": 0.0, "to_s": 120.0, "reference_s": 0.0, "offset_s": 0.1, "rate": 1.0,
-        "angle_rad": 0.0, "sigma_offset_s": None, "sigma_rate": None, "sigma_angle_rad": None,
+        "angle_rad": 0.0, "sigma_offset_s": None, "sigma_rate": None,
         "turned_rad": 1.0, "status": "ok", "note": HOSTILE,
     }  # fmt: skip
     document = {"segments": [segment], "ptpd": {HOSTILE: HOSTILE}}
@@ -316,7 +316,7 @@ def test_odometry_is_brought_to_the_truth(session: Path) -> None:
     write_planar_poses(session / "odometry.csv", PlanarPoses(truth.times_s + 0.4, moved))
     segment = {
         "from_s": 0.0, "to_s": 120.0, "reference_s": 0.0, "offset_s": 0.4, "rate": 1.0,
-        "angle_rad": 0.0, "sigma_offset_s": 1e-3, "sigma_rate": 1e-6, "sigma_angle_rad": 1e-3,
+        "angle_rad": 0.0, "sigma_offset_s": 1e-3, "sigma_rate": 1e-6,
         "turned_rad": 1.0, "status": "ok", "note": "",
     }  # fmt: skip
     (session / "clock.json").write_text(json.dumps({"segments": [segment]}))

@@ -91,7 +91,7 @@ def session(tmp_path: Path) -> Path:
     write_scans(folder / "top.scans.npz", Scans(np.array(times), np.stack(ranges)))
     segment = {
         "from_s": -1.0, "to_s": 40.0, "reference_s": 0.0, "offset_s": CLOCK_OFFSET_S, "rate": 1.0,
-        "angle_rad": 0.0, "sigma_offset_s": 1e-3, "sigma_rate": 1e-6, "sigma_angle_rad": 1e-3,
+        "angle_rad": 0.0, "sigma_offset_s": 1e-3, "sigma_rate": 1e-6,
         "turned_rad": 10.0, "status": "ok", "note": "",
     }  # fmt: skip
     (folder / "clock.json").write_text(json.dumps({"segments": [segment]}))
