@@ -31,6 +31,8 @@ _MOMENTUM, _SQUARES = 0.9, 0.99
 _SMOOTHING = 0.01
 #: Grey values are multiplied by exp(N(0, _GAIN)), noise of up to _NOISE grey levels is added.
 _GAIN, _NOISE = 0.3, 4.0
+#: This share of the looks is fainter, by a factor of up to exp(_FAINTEST).
+_FAINT, _FAINTEST = 0.3, -2.5
 
 
 class Shape(NamedTuple):
@@ -138,8 +140,10 @@ def _varied(looks: Looks, chosen: NDArray[np.int64], rng: np.random.Generator) -
     grey, scale = looks.grey[chosen, view], looks.pixels_per_radius[chosen, view]
     mirrored = rng.random(n) < 0.5
     grey[mirrored], scale[mirrored] = grey[mirrored, ::-1], scale[mirrored, ::-1]
+    faint = np.where(rng.random((n, 1, 1)) < _FAINT, rng.uniform(_FAINTEST, 0.0, (n, 1, 1)), 0.0)
     noise = rng.normal(size=grey.shape) * rng.uniform(0.0, _NOISE, (n, 1, 1))
-    lit = grey * np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))) + noise
+    noise *= np.exp(0.5 * faint)
+    lit = grey * np.exp(rng.normal(0.0, _GAIN, (n, 1, 1)) + faint) + noise
     return batch_of(lit.astype(np.float32), scale, looks.features[chosen].astype(np.float32))
 
 

@@ -86,9 +86,9 @@ def test_a_disc_with_a_leg_on_its_middle_is_a_row(
 CLEAR_PLACES = [(-0.3, -1.4), (0.4, -1.5), (-0.9, -2.2)]
 
 
-@pytest.mark.parametrize(("dark", "rows"), [((), 8), ((0,), 8), ((0, 1), 0)])
-def test_without_a_polarity_two_discs_of_a_sign_have_to_be_clear(
-    published_camera: Camera, table: VoteTable, dark: tuple[int, ...], rows: int
+@pytest.mark.parametrize("dark", [(), (0,), (0, 1)])
+def test_without_a_polarity_discs_of_both_signs_are_found(
+    published_camera: Camera, table: VoteTable, dark: tuple[int, ...]
 ) -> None:
     place = PLACES[0]
     found_here = 0
@@ -100,7 +100,7 @@ def test_without_a_polarity_two_discs_of_a_sign_have_to_be_clear(
         found = detect_circles(image, published_camera, table, CircleSettings())
         assert all(found_at(found, np.array(other)).min() < 0.01 for other in CLEAR_PLACES)
         found_here += bool((found_at(found, place) < 0.03).any())
-    assert abs(found_here - rows) <= 1
+    assert found_here >= 7
 
 
 def square(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -1,0 +1,48 @@
+"""The table of votes: where pixels lie in the cells, kept and read back as it was computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera import Camera
+from lut import TableError, VoteShape, build_vote_table, cached_vote_table
+
+SHAPE = VoteShape()
+
+
+def test_pixels_lie_in_their_cells(published_camera: Camera) -> None:
+    table = build_vote_table(published_camera, SHAPE)
+    assert table.paired
+    for k in range(0, len(table.image_row), 20):
+        v = int(table.image_row[k])
+        here = table.pixel[k, :, 1]
+        counted = (here >= 0.0) & (here < len(table.row_of_step))
+        seen = np.flatnonzero(table.pixel[k, :, 2:].any(axis=1) & counted)[::37]
+        floor_xy = 0.5 * (table.floor_xy[v, 2 * seen] + table.floor_xy[v, 2 * seen + 1])
+        across, ahead = ((floor_xy - table.foot) @ table.turn.T).T
+        place = table.pixel[k, seen, :2]
+        np.testing.assert_allclose(table.left + table.cell * place[:, 0], across, atol=1e-3)
+        row = table.row_of_step[place[:, 1].astype(int)]
+        apart = np.abs(table.ahead[row] - ahead)
+        assert (apart < 0.6 * np.diff(table.ahead).max() + table.step).all()
+
+
+def test_a_table_is_read_back_as_it_was_kept(published_camera: Camera, tmp_path: Path) -> None:
+    built = build_vote_table(published_camera, SHAPE)
+    cached_vote_table(published_camera, SHAPE, tmp_path)
+    read = cached_vote_table(published_camera, SHAPE, tmp_path)
+    for name, ours, theirs in zip(built._fields, read, built, strict=True):
+        np.testing.assert_array_equal(ours, theirs, err_msg=name)
+        assert isinstance(ours, type(theirs)), name
+
+
+def test_a_camera_below_the_floor_is_refused(published_camera: Camera) -> None:
+    rows = np.array(published_camera.robot_from_camera)
+    rows[2, 3] = -1.0
+    below = replace(published_camera, robot_from_camera=tuple(map(tuple, rows.tolist())))
+    with pytest.raises(TableError, match="above the floor"):
+        build_vote_table(below, SHAPE)
