@@ -44,13 +44,13 @@ GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.4
 #: Least log-odds of a glance.
-_LEAST_GLANCE = -1.5
+_LEAST_GLANCE = -0.75
 #: Least share of the rim that is on a circle.
 LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
 _RIM_RADIUS = 0.98
-#: A rim that looks worse than this by the log-odds is not followed from its own middle.
-_HOPELESS = -4.0
+#: A rim that looks worse or better than this by the log-odds is not followed from its own middle.
+_HOPELESS, _CERTAIN = -4.0, 2.5
 #: Nearer to another rim than this share of the radius it is the same.
 _SAME = 0.1
 #: Features of the rim, in the order of the network's weights.
@@ -170,7 +170,7 @@ def judge(
         if _is_known(judged[:count], rim, sign, sought.radius):
             continue
         odds, noted, grey = _look(image, camera_numbers, rim, score[0], sign, sought, networks.look)
-        if odds >= _HOPELESS:
+        if _HOPELESS <= odds < _CERTAIN:
             # From its own middle a rim is seen best, but that may lead to another circle.
             again = follow_again(image, camera_numbers, sought.radius, rim)
             doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
