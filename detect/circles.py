@@ -55,7 +55,7 @@ _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
-_EDGE, _LEAST_STEP = 3.0, 5.0
+_EDGE, _LEAST_STEP = 2.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def candidates_of(
     image: NDArray[np.uint8], table: VoteTable, settings: CircleSettings, noise: float
 ) -> HoughCandidates:
     """Centres for which edges vote; parameters as of `detect_circles`, and the noise."""
-    edge = max(_EDGE, 0.7 * settings.noise_floor * max(noise, _LEAST_NOISE))
+    edge = max(_EDGE, 0.4 * settings.noise_floor * max(noise, _LEAST_NOISE))
     return hough_candidates(image, table, settings.radius_m, _SIGNS[settings.polarity], edge)
 
 
