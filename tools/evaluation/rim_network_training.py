@@ -18,7 +18,7 @@ from tyro.conf import Positional
 
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from redetect.storage import write_whole
-from tools.evaluation.second_look_data import Looks, gather
+from tools.evaluation.rim_data import Looks, gather
 
 FloatArray = NDArray[np.floating]
 
@@ -31,8 +31,6 @@ _MOMENTUM, _SQUARES = 0.9, 0.99
 _SMOOTHING = 0.01
 #: Grey values are multiplied by exp(N(0, _GAIN)), noise of up to _NOISE grey levels is added.
 _GAIN, _NOISE = 0.3, 4.0
-#: This share of the looks is fainter, by a factor of up to exp(_FAINTEST).
-_FAINT, _FAINTEST = 0.3, -2.5
 
 
 class Shape(NamedTuple):
@@ -44,7 +42,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(12, 8, 1, 40), "look": Shape(12, 16, 4, 60)}
+SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
@@ -140,10 +138,8 @@ def _varied(looks: Looks, chosen: NDArray[np.int64], rng: np.random.Generator) -
     grey, scale = looks.grey[chosen, view], looks.pixels_per_radius[chosen, view]
     mirrored = rng.random(n) < 0.5
     grey[mirrored], scale[mirrored] = grey[mirrored, ::-1], scale[mirrored, ::-1]
-    faint = np.where(rng.random((n, 1, 1)) < _FAINT, rng.uniform(_FAINTEST, 0.0, (n, 1, 1)), 0.0)
     noise = rng.normal(size=grey.shape) * rng.uniform(0.0, _NOISE, (n, 1, 1))
-    noise *= np.exp(0.5 * faint)
-    lit = grey * np.exp(rng.normal(0.0, _GAIN, (n, 1, 1)) + faint) + noise
+    lit = grey * np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))) + noise
     return batch_of(lit.astype(np.float32), scale, looks.features[chosen].astype(np.float32))
 
 
@@ -257,7 +253,7 @@ class TrainRimNetwork:
     """Train the network of the second look at discs, and print its finds in unseen buildings."""
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
-    every: int = 8  # Every n-th frame of the recorded run is used.
+    every: int = 4  # Every n-th frame of the recorded run is used.
     scenes: int = 1000  # Rendered floors with disturbed discs.
     seed: int = 1  # Of the disturbances and the networks.
     output: Path = Path("build/rim_network.npz")

@@ -8,7 +8,7 @@ import pytest
 from detect.discs.rim import DIRECTIONS, STEPS
 from detect.discs.rim_network import OTHERS, network_inputs, network_log_odds
 from tools.evaluation import rim_network_training as training
-from tools.evaluation.second_look_data import Looks
+from tools.evaluation.rim_data import Looks
 
 
 def looks_of(count: int, seed: int) -> Looks:

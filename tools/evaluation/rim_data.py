@@ -11,8 +11,9 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -36,9 +37,12 @@ from tools.evaluation.disturbed import BLURRED, BORDER, Stage, render_scene
 _SETTINGS = CircleSettings()
 #: Of a disc, metres.
 _RADIUS = 0.1
-#: How much a row counts: of a rendered building, a disturbed disc, a real image, a rendered floor,
-#: a board; and by how much a row less that is of the other polarity than the discs of the building.
-_BUILDING, _DISTURBED, _REAL, _SCENE, _BOARD, _OTHER_SIGN = 3.0, 0.2, 0.4, 0.4, 0.1, 0.3
+#: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
+#: rendered floor, a board; and how much less what is of the other polarity than the discs there.
+_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (1.5, 0.4)
+_SCENE, _BOARD, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), 0.3
+#: Frames of the recorded run that one process looks at.
+_AT_ONCE = 50
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
@@ -98,7 +102,7 @@ class _Gathering:
         self.looks: list[_Row] = []
 
     def add(
-        self, image: ByteArray, camera: Camera, truth: Truth, weight: float, source: str,
+        self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float], source: str,
         other_sign: float = 1.0,
     ) -> None:  # fmt: skip
         """Look at an image."""
@@ -116,7 +120,8 @@ class _Gathering:
                 else:
                     counts = is_disc or min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
                 if counts:
-                    yield k, is_disc, weight * (other_sign if other else 1.0), source
+                    counted = weight[0 if is_disc else 1] * (other_sign if other else 1.0)
+                    yield k, is_disc, counted, source
 
         candidates = candidates_of(image, table, _SETTINGS, noise)
         for k, *row in known(candidates.floor_xy, candidates.sign):
@@ -175,58 +180,45 @@ def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatA
 
 def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks]:
     """Glances and looks at all sources of a folder of data; of the real frames, every n-th."""
+    camera = read_camera(data / "dlr" / "e" / "e.cam")
+    kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
+    photographs = sorted((data / "york").glob("dev/*/images/*"))
+    frames = [
+        (data / "dlr" / "e" / "images" / f"{name}.jpg", mapped, shipped)
+        for name, mapped, shipped in _mapped(data / "dlr", camera)
+    ]
+    frames = [frame for frame in frames[::every] if frame[0].is_file()]
+    parts: list[tuple[Any, ...]] = [
+        *((_scenes, camera, kinds, _SCENES_PER_STAGE) for _ in range(scenes // _SCENES_PER_STAGE)),
+        *(
+            (_boards, photographs, _SCENES_PER_STAGE // 5)
+            for _ in range(scenes // _SCENES_PER_STAGE)
+        ),
+        *((_building, folder) for folder in sorted((data / "rendered").glob("r*"))),
+        *((_real, camera, frames[k : k + _AT_ONCE]) for k in range(0, len(frames), _AT_ONCE)),
+    ]
+    with ProcessPoolExecutor() as pool:
+        done = [pool.submit(_gather, [seed, n], *part) for n, part in enumerate(parts)]
+        rows = [future.result() for future in done]
+    glances, looks = (_looks_of([row for part in rows for row in part[which]]) for which in (0, 1))
+    return glances, looks
+
+
+def _gather(seed: list[int], add: Any, *of: Any) -> tuple[list[_Row], list[_Row]]:
+    """The glances and looks that a part of the sources gives."""
     rng = np.random.default_rng(seed)
     gathering = _Gathering(rng)
-    run_camera = read_camera(data / "dlr" / "e" / "e.cam")
-    _add_scenes(gathering, run_camera, scenes, rng)
-    photographs = sorted((data / "york").glob("dev/*/images/*"))
-    for number in range(scenes // 5):
-        image, camera, places = render_board(_read(photographs[number % len(photographs)]), rng)
-        if number % 2:
-            image = np.asarray(255 - image, np.uint8)
-        at = _images(camera, places)
-        truth = Truth(at, _NOWHERE, _NOWHERE) if number % 2 else Truth(_NOWHERE, at, _NOWHERE)
-        gathering.add(image, camera, truth, _BOARD, "boards")
-    for folder in sorted((data / "rendered").glob("r*")):
-        camera = read_camera(folder / f"{folder.name}.cam")
-        for frame in json.loads((folder / "truth.json").read_text())["frames"]:
-            image = _read(folder / "images" / f"{frame['prefix']}.jpg")
-            rows = [
-                (c["mandatory"], [c["u"], c["v"], *of[0, 2:]], [c["px"], c["py"]])
-                for c in frame["circles"]
-                if len(of := _images(camera, np.array([[c["px"], c["py"]]])))
-            ]
-            sure = np.array([at for mandatory, at, _ in rows if mandatory]).reshape(-1, 4)
-            unsure = np.array([at for mandatory, at, _ in rows if not mandatory]).reshape(-1, 4)
-            truth = Truth(sure, _NOWHERE, unsure)
-            gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
-            places = np.array([xy for mandatory, _, xy in rows if mandatory]).reshape(-1, 2)
-            _add_disturbed(gathering, image, camera, places, rng, f"{folder.name} disturbed")
-    for number, (name, mapped, rows_xy) in enumerate(_mapped(data / "dlr", run_camera)):
-        path = data / "dlr" / "e" / "images" / f"{name}.jpg"
-        if number % every or not path.is_file():
-            continue
-        image = _read(path)
-        shipped = np.array([xy for xy in rows_xy if _is_mapped(run_camera, xy, mapped)])
-        shipped = shipped.reshape(-1, 2)
-        light = np.array([_is_light(image, run_camera, xy) for xy in shipped], np.bool_)
-        of_light, of_dark = (_images(run_camera, shipped[of]) for of in (light, ~light))
-        truth = Truth(of_light, of_dark, mapped)
-        gathering.add(image, run_camera, truth, _REAL, "real")
-        if number % (3 * every) == 0:
-            _add_disturbed(gathering, image, run_camera, shipped[light], rng, "real disturbed")
-    return _looks_of(gathering.glances), _looks_of(gathering.looks)
+    add(gathering, rng, seed[1], *of)
+    return gathering.glances, gathering.looks
 
 
-def _add_scenes(
-    gathering: _Gathering, camera: Camera, scenes: int, rng: np.random.Generator
-) -> None:
+def _scenes(
+    gathering: _Gathering, rng: np.random.Generator, number: int, camera: Camera,
+    kinds: list[str], count: int,
+) -> None:  # fmt: skip
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
-    kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
-    for number in range(scenes):
-        if number % _SCENES_PER_STAGE == 0:
-            own = (number // _SCENES_PER_STAGE) % 2 == 0
-            stage = Stage(camera if own else other_camera(rng), _RADIUS, rng)
+    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng)
+    for _ in range(count):
         kind = str(rng.choice(kinds))
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
         at = _images(stage.camera, np.array(places))
@@ -237,6 +229,48 @@ def _add_scenes(
             clear = half >= _LEAST_HALF_PX if len(places) else np.zeros(0, np.bool_)
             truth = Truth(at[clear], _NOWHERE, at[~clear])
         gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN)
+
+
+def _boards(
+    gathering: _Gathering, rng: np.random.Generator, _: int, photographs: list[Path], count: int
+) -> None:
+    """Look at boards, every second one with light discs."""
+    for k in range(count):
+        path = photographs[rng.integers(len(photographs))]
+        image, camera, places = render_board(_read(path), rng)
+        at = _images(camera, places)
+        truth = Truth(_NOWHERE, at, _NOWHERE)
+        if k % 2:
+            image, truth = np.asarray(255 - image, np.uint8), Truth(at, _NOWHERE, _NOWHERE)
+        gathering.add(image, camera, truth, _BOARD, "boards")
+
+
+def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
+    """Look at a rendered building, as it is and with its discs disturbed."""
+    camera = read_camera(folder / f"{folder.name}.cam")
+    for frame in json.loads((folder / "truth.json").read_text())["frames"]:
+        image = _read(folder / "images" / f"{frame['prefix']}.jpg")
+        # The building's camera tilts: what counts is where discs are in the image.
+        seen = camera.floor_from_pixel(np.array([[c["u"], c["v"]] for c in frame["circles"]]))
+        sure = np.array([c["mandatory"] for c in frame["circles"]], np.bool_)
+        truth = Truth(_images(camera, seen[sure]), _NOWHERE, _images(camera, seen[~sure]))
+        gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
+        _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
+
+
+def _real(
+    gathering: _Gathering, rng: np.random.Generator, _: int, camera: Camera,
+    frames: list[tuple[Path, FloatArray, FloatArray]],
+) -> None:  # fmt: skip
+    """Look at frames of the recorded run, and at some of them with their discs disturbed."""
+    for number, (path, mapped, rows_xy) in enumerate(frames):
+        image = _read(path)
+        shipped = np.array([xy for xy in rows_xy if _is_mapped(camera, xy, mapped)]).reshape(-1, 2)
+        light = np.array([_is_light(image, camera, xy) for xy in shipped], np.bool_)
+        of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
+        gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
+        if number % 6 == 0:
+            _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
 
 
 def other_camera(rng: np.random.Generator) -> Camera:
