@@ -102,8 +102,8 @@ class _Gathering:
         self.looks: list[_Row] = []
 
     def add(
-        self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float], source: str,
-        other_sign: float = 1.0,
+        self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float],
+        source: str, other_sign: float = 1.0,
     ) -> None:  # fmt: skip
         """Look at an image."""
         table = cached_vote_table(camera, vote_shape(_SETTINGS))
