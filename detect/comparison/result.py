@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
@@ -137,7 +138,7 @@ class LinePairs:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(ABC):
     """How a run's detected rows compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Rows are counted as in
@@ -189,9 +190,9 @@ class Comparison:
         """More on extra rows where look-alikes are not known."""
         return " (look-alikes are not known)"
 
+    @abstractmethod
     def _errors(self) -> str:
         """How large errors are."""
-        raise NotImplementedError
 
     def figures(self) -> dict[str, Any]:
         """All figures by name, for JSON: the same names in the same order.
