@@ -49,6 +49,11 @@ def perform(command: Export) -> int:
         raise DetectError(
             f"{file}: is a folder: expected a .circles, .lines, .markers or .tilt file{such}"
         )
+    if file.suffix == ".cam":
+        raise DetectError(
+            f"{file}: is a calibration, not rows: camera convert {file} "
+            "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
+        )
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
     if to == "parquet":

@@ -152,6 +152,7 @@ def compare_frames(
         detected_quality_matched=quantile(second.quality),
         detected_quality_extra=quantile(extra.quality),
         bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
+        extra_beyond=_beyond(extra.xy, second.xy),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
@@ -159,6 +160,12 @@ def compare_frames(
         detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
         pairs=pairs,
     )
+
+
+def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
+    """How many positions are farther away than all of those that are known."""
+    farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
+    return int((np.linalg.norm(xy, axis=1) > farthest).sum())
 
 
 def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatArray:

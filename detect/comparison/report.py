@@ -109,9 +109,11 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 
 def summary_rows(c: Comparison) -> dict[str, str]:
-    """Every figure that is a number or a word, by its name in the JSON."""
+    """Every figure that is a number or a word, by its name in the JSON; no options."""
     rows = {}
     for name, value in c.figures().items():
+        if name == "options":
+            continue
         inner = value if isinstance(value, dict) else {"": value}
         for part, figure in inner.items():
             if (shown := _shown(figure)) is not None:

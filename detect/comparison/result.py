@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
@@ -137,7 +138,7 @@ class LinePairs:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(ABC):
     """How a run's detected rows compare with reference rows.
 
     Figures are None where there are no rows to compute them from. Rows are counted as in
@@ -177,7 +178,7 @@ class Comparison:
         extra = f"{self.matched} of {self.detected} detected rows are {self.what} of the reference;"
         alike = self.on_lookalikes
         if alike is None:
-            extra += f" {self.extra} are on nothing that it has (look-alikes are not known)."
+            extra += f" {self.extra} are on nothing that it has{self._beyond()}."
         else:
             extra += (
                 f" {alike} are on things known to look like a disc, and "
@@ -185,9 +186,13 @@ class Comparison:
             )
         return found, extra, self._errors(), _agreement(self.normalised_error)
 
+    def _beyond(self) -> str:
+        """More on extra rows where look-alikes are not known."""
+        return " (look-alikes are not known)"
+
+    @abstractmethod
     def _errors(self) -> str:
         """How large errors are."""
-        raise NotImplementedError
 
     def figures(self) -> dict[str, Any]:
         """All figures by name, for JSON: the same names in the same order.
@@ -241,12 +246,16 @@ class DiscComparison(Comparison):
     detected_quality_matched: float | None
     detected_quality_extra: float | None
     bins: tuple[DistanceBin, ...]
+    extra_beyond: int  # extra rows that are farther away than all that are on a reference row
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
     reference_levelled: int  # frames whose rows are levelled by a tilt
     detected_levelled: int
     pairs: DiscPairs = field(repr=False)
+
+    def _beyond(self) -> str:
+        return f", {self.extra_beyond} of them farther away than any that is on one"
 
     def _errors(self) -> str:
         median, most = (
@@ -294,7 +303,8 @@ def _agreement(error: NormalisedError) -> str:
     if 0.67 <= error.per_dof <= 1.5:
         return f"The errors agree with the stated covariances: {figure}."
     size = "small" if error.per_dof > 1.5 else "large"
-    return f"The stated covariances are too {size}: {figure}."
+    exact = " if the reference has no errors of its own" if error.per_dof > 1.5 else ""
+    return f"The stated covariances are too {size}{exact}: {figure}."
 
 
 def quantile(values: FloatArray, q: float = 0.5) -> float | None:

@@ -153,7 +153,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     result = inputs.discs
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
-    parts = [_summary_of(result)]
+    parts = [*_summary_of(result)]
     quality = [row.quality for match in result.frames for row in match.frame.detected]
     if len(set(quality)) > 1:
         levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
@@ -171,17 +171,19 @@ def _lines(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
     return [
-        _summary_of(result),
+        *_summary_of(result),
         *_honesty(result, "one for each matched vertical"),
         *([figures.bearings_figure(result.pairs)] if result.matched else []),
     ]
 
 
-def _summary_of(result: Comparison) -> Part:
+def _summary_of(result: Comparison) -> list[Part]:
     """What `detect compare` says."""
     rows = tuple(summary_rows(result).items())
-    words = " ".join(result.sentences())
-    return Part("table", words, ("what", "value"), rows, left=(0, 1))
+    table = Part(
+        "table", "Figures, by their names in the JSON", ("what", "value"), rows, left=(0, 1)
+    )
+    return [Part("text", " ".join(result.sentences())), table]
 
 
 def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:

@@ -111,8 +111,8 @@ def _suffix(name: str) -> str:
 
 def _natural_order(name: str) -> list[tuple[int, str]]:
     """Sort key of names with numbers by value, which come before letters' places."""
-    parts = re.findall("[0-9]+|[^0-9]+", name)
-    return [(-1, part) if not part.isdigit() else (int(part), "") for part in parts]
+    parts = re.findall("([0-9]+)|([^0-9]+)", name)
+    return [(int(number), "") if number else (-1, word) for number, word in parts]
 
 
 WILDCARDS = frozenset("*?[")

@@ -276,7 +276,7 @@ def test_text_shows_the_figures_plainly() -> None:
     text = format_text(compare(REFERENCE, DETECTED))
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[0] == "4 of 5 discs of the reference are found, 1 missed, in 2 frames."
-    assert {"found 4", "extra 1", "recall 0.8", "options gate m 0.1"} <= {*lines}
+    assert {"found 4", "extra 1", "recall 0.8", "extra beyond 0"} <= {*lines}
     (middle,) = (line for line in text.splitlines() if line.strip().startswith("2-2.5"))
     assert " ".join(middle.split()) == "2-2.5 1 1 0.000 1 1 0.000 -"
     assert "\x1b" not in text

@@ -16,10 +16,11 @@ from detect.sources.image_files import ImageNames
 
 def by_value(name: str) -> tuple[list[tuple[int, str]], str]:
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in parts], name
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], name
 
 
-FILE_NAMES = st.from_regex(r"[ab0-9][ab0-9]{0,5}\.(jpg|PNG)", fullmatch=True)
+#: A superscript is a digit by some definitions, and no number.
+FILE_NAMES = st.from_regex(r"[ab0-9][ab0-9\u00b2]{0,5}\.(jpg|PNG)", fullmatch=True)
 
 
 @given(names=st.sets(FILE_NAMES, min_size=1, max_size=12))

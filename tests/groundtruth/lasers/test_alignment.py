@@ -83,15 +83,15 @@ def test_exact_poses_come_back_from_measured_ones() -> None:
 def test_covariances_are_right() -> None:
     scanners = four_scanners()
     squared = []
-    for seed in range(8):
+    for seed in range(5):
         shifts = np.random.default_rng(seed).normal(0.0, [0.03, 0.03, 0.02], (4, 3))
         found = align_scanners(by_hand(scanners, shifts), furnished(scanners, 100 + seed, 40), ROOM)
         for one, exact in zip(found.scanners, scanners):
             error = one.pose - exact.pose
             error[2] = wrap_angle(error[2])
             squared.append(error @ np.linalg.solve(one.covariance, error) / 3.0)
-    # 32 draws: 3 sigma of their mean is 0.43; the floor on readings makes it rather too small.
-    assert 0.5 < float(np.mean(squared)) < 1.43
+    # 20 draws: 3 sigma of their mean is 0.55; the floor on readings makes it rather too small.
+    assert 0.45 < float(np.mean(squared)) < 1.55
 
 
 @pytest.mark.long

@@ -120,6 +120,7 @@ def test_the_minimum_and_the_covariances_are_scipys() -> None:
     solved = least_squares(
         lambda x: linearised(bundle.moved(x)).residual,
         np.zeros(bundle.unknowns),
+        lambda x: linearised(bundle.moved(x)).jacobian.toarray(),  # as for a step from there
         x_scale="jac",
         xtol=1e-12,
         ftol=1e-12,
