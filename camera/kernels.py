@@ -191,3 +191,12 @@ def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> t
 def project_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> tuple[float, float]:
     """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
     return project_direction(numbers, x_robot - numbers[19], y_robot - numbers[20], -numbers[21])
+
+
+@kernel()
+def project_floor_points(numbers: FloatArray, floor_xy: FloatArray) -> FloatArray:
+    """(N, 2) pixels of (N, 2) floor points, as `project_floor_point`."""
+    pixels = np.empty((len(floor_xy), 2))
+    for k in range(len(floor_xy)):
+        pixels[k, 0], pixels[k, 1] = project_floor_point(numbers, floor_xy[k, 0], floor_xy[k, 1])
+    return pixels

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import camera_numbers, published_camera_numbers
+from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
 from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
 from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
@@ -152,7 +152,7 @@ def _by_rims(
     discs, log_odds = judgement.where(best), log_odds[best]
     scene = scene_of(image, camera, table, settings, noise)
     floor_xy, fitted = fitted_positions(place_discs(scene, discs, working_space()[0]))
-    seen_at = np.rint(camera.project_floor(floor_xy))
+    seen_at = np.rint(project_floor_points(_kernel_camera(camera).numbers, floor_xy))
     # Of a disc whose centre is out of sight too little is seen to say where it is.
     in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
     order = np.flatnonzero(in_sight)

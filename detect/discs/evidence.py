@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from detect.discs.rim import median
+
 FloatArray = NDArray[np.float64]
 
 #: Discs of these log-odds are sure: others are compared with them.
@@ -44,8 +46,8 @@ def lost_by_paleness(
     for alike in (contrast > 0.0, contrast < 0.0):
         others, doubtful = sure & alike, ~sure & alike
         if np.count_nonzero(others) >= _LEAST_OTHERS and doubtful.any():
-            of_contrast = np.abs(contrast) / (_PALE * np.median(np.abs(contrast[others])))
-            of_ratio = ratio / max(np.median(ratio[others]), 1e-3)
+            of_contrast = np.abs(contrast) / (_PALE * median(np.abs(contrast[others])))
+            of_ratio = ratio / max(median(ratio[others]), 1e-3)
             paleness = np.maximum(np.maximum(of_contrast, of_ratio), 1e-3)[doubtful]
             lost[doubtful] = _PER_FACTOR * np.maximum(-np.log(paleness), 0.0)
     return lost

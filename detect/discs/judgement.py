@@ -24,8 +24,8 @@ from detect.discs.rim import (
     NEAREST,
     SIN,
     STEPS,
+    Profiles,
     Rim,
-    follow_again,
     follow_rim,
     median,
     profiles,
@@ -48,9 +48,11 @@ _LEAST_GLANCE = -0.75
 #: Least share of the rim that is on a circle.
 LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
-_RIM_RADIUS = 0.98
+RIM_RADIUS = 0.98
 #: A rim that looks worse or better than this by the log-odds is not followed from its own middle.
 _HOPELESS, _CERTAIN = -4.0, 2.5
+#: Followed again it may lose this share and is still the better one.
+_SLACK = 0.07
 #: Nearer to another rim than this share of the radius it is the same.
 _SAME = 0.1
 #: Features of the rim, in the order of the network's weights.
@@ -76,8 +78,8 @@ class Judgement(NamedTuple):
     sign : (N,) float64
         1 of light discs, -1 of dark ones.
     features : (N, len(FEATURES)) float64
-    relative_radius : (N,) float64
-        Of the rim, relative to that of one that fits best.
+    agreeing, radius : (N,) float64
+        Share of the rim that is on a circle, and the radius of that, metres.
     floor_xy : (N, 2) float64
         Centre of the rim, metres; where it was not followed, of the candidate.
     seen_from, doubt : (N, 2) float64
@@ -97,7 +99,8 @@ class Judgement(NamedTuple):
     value: FloatArray
     sign: FloatArray
     features: FloatArray
-    relative_radius: FloatArray
+    agreeing: FloatArray
+    radius: FloatArray
     floor_xy: FloatArray
     seen_from: FloatArray
     doubt: FloatArray
@@ -112,7 +115,7 @@ class Judgement(NamedTuple):
 
 
 NO_CANDIDATES = Judgement._make(
-    [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), np.empty(0),
+    [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), *np.empty((2, 0)),
      *np.empty((3, 0, 2)), *np.empty((4, 0))]
 )  # fmt: skip
 
@@ -148,7 +151,7 @@ def judge(
     seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
     step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     fate, value = np.full(n, _FEW_STEPS, np.int8), np.zeros(n)
-    relative_radius = np.ones(n)
+    agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
     for i in range(n):
@@ -162,35 +165,37 @@ def judge(
         fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
-        rim = follow_rim(image, camera_numbers, x, y, sought.radius, sign * contrast)
+        seen = profiles(image, camera_numbers, x, y, sought.radius)
+        rim = follow_rim(image, camera_numbers, seen, sign * contrast)
         fate[i], value[i] = _NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
         fate[i] = _SAME_RIM
         if _is_known(judged[:count], rim, sign, sought.radius):
             continue
-        odds, noted, grey = _look(image, camera_numbers, rim, score[0], sign, sought, networks.look)
+        seen = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+        odds, noted = _look(seen, rim, score[0], sign, networks.look)
         if _HOPELESS <= odds < _CERTAIN:
             # From its own middle a rim is seen best, but that may lead to another circle.
-            again = follow_again(image, camera_numbers, sought.radius, rim)
-            doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
-            more, noted_again, grey_again = _look(
-                image, camera_numbers, again, score[0], sign, sought, networks.look
-            )
-            if more > odds and not _is_known(judged[:count], again, sign, sought.radius):
-                x, y = rim.x, rim.y
-                rim, odds, noted, grey = again, more, noted_again, grey_again
+            again = follow_rim(image, camera_numbers, seen, rim.step)
+            if again.agreeing >= rim.agreeing - _SLACK:
+                seen_again = profiles(image, camera_numbers, again.x, again.y, sought.radius)
+                more, noted_again = _look(seen_again, again, score[0], sign, networks.look)
+                doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
+                if more > odds and not _is_known(judged[:count], again, sign, sought.radius):
+                    x, y = rim.x, rim.y
+                    rim, odds, noted, seen = again, more, noted_again, seen_again
         fate[i], value[i], log_odds[i], step[i] = JUDGED, odds, odds, rim.step
-        relative_radius[i] = rim.radius / (_RIM_RADIUS * sought.radius)
+        agreeing[i], radius[i] = rim.agreeing, rim.radius
         for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
             features[i, k] = noted[k]
-        quality[i], floor_grey[i] = _quality(grey)
+        quality[i], floor_grey[i] = _quality(seen.grey)
         place[i, 0], place[i, 1] = rim.x, rim.y
         seen_from[i, 0], seen_from[i, 1] = x, y
         judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
         count += 1
     return Judgement(
-        fate, value, candidates.sign, features, relative_radius, place, seen_from, doubt, step,
+        fate, value, candidates.sign, features, agreeing, radius, place, seen_from, doubt, step,
         floor_grey, quality, log_odds,
     )  # fmt: skip
 
@@ -283,20 +288,14 @@ def _quality(grey: FloatArray) -> tuple[float, float]:
 
 @kernel()
 def _look(
-    image: NDArray[np.uint8],
-    camera_numbers: FloatArray,
-    rim: Rim,
-    score: float,
-    sign: float,
-    sought: Sought,
-    network: RimNetwork,
-) -> tuple[float, FloatArray, FloatArray]:
-    """Log-odds that a rim is a disc's; its features, and the grey values about it.
+    seen: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
+) -> tuple[float, FloatArray]:
+    """Log-odds that a rim, seen from its middle, is a disc's; and its features.
 
     Each feature is bounded, for a single one is never to decide.
     """
     noted = np.empty(len(FEATURES))
-    off = abs(math.log(min(max(rim.radius / sought.radius, 0.3), 3.0) / _RIM_RADIUS))
+    off = abs(math.log(min(max(rim.radius / seen.radius, 0.3), 3.0) / RIM_RADIUS))
     noted[0] = rim.agreeing
     noted[1] = min(rim.runs, 4)
     noted[2] = rim.scatter
@@ -304,6 +303,5 @@ def _look(
     noted[4] = 10.0 * off * off
     noted[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     noted[6] = min(score, 12.0)
-    grey, scale = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
-    inputs, scales = network_inputs(pairs_of_steps(grey), scale, sign)
-    return network_log_odds(inputs, scales, noted, network), noted, grey
+    inputs, scales = network_inputs(pairs_of_steps(seen.grey), seen.pixels_per_radius, sign)
+    return network_log_odds(inputs, scales, noted, network), noted

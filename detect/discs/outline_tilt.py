@@ -229,23 +229,23 @@ def _tilts_of_discs(
     point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
-        grey, scale = profiles(image, numbers, x, y, radius)
+        seen = profiles(image, numbers, x, y, radius)
         long_enough = 0
         for m in range(DIRECTIONS):
-            long_enough += scale[m] >= LEAST_AXIS_PX
+            long_enough += seen.pixels_per_radius[m] >= LEAST_AXIS_PX
         if long_enough < DIRECTIONS:
             continue
-        contrast = _contrast(grey)
+        contrast = _contrast(seen.grey)
         if not abs(contrast) >= LEAST_CONTRAST:
             continue
-        distance, _ = rim_points(grey, scale, contrast)
-        seen = 0
+        distance, _ = rim_points(seen, contrast)
+        count = 0
         for m in range(DIRECTIONS):
-            seen += not math.isnan(distance[m])
+            count += not math.isnan(distance[m])
             point_xy[m, 0] = radius * distance[m] * COS[m]
             point_xy[m, 1] = radius * distance[m] * SIN[m]
-            px_per_m[m] = scale[m] / radius
-        if seen < LEAST_DIRECTIONS:
+            px_per_m[m] = seen.pixels_per_radius[m] / radius
+        if count < LEAST_DIRECTIONS:
             continue
         # What a higher camera sees is larger than the calibrated floor has it.
         found, pitch, roll, cpp, cpr, crr = fit_outline(

@@ -52,7 +52,7 @@ from detect.discs.patch import (
     floor_steps,
     gather_by_sector,
 )
-from detect.discs.rim import Rim, follow_rim, median
+from detect.discs.rim import Rim, follow_rim, median, profiles
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
@@ -563,8 +563,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> Any:
     whole = np.zeros(count, np.bool_)
     clear = 0
     for k in range(count):
-        rim = _rim_of(scene, discs, k, scene.radius)
-        whole[k] = _fit_whole(scene, rim, work, results[k])
+        whole[k] = _fit_whole(scene, discs, k, work, results[k])
         if whole[k] and results[k].explained >= _WELL_EXPLAINED:
             radii[clear] = results[k].radius
             clear += 1
@@ -580,13 +579,15 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> Any:
 @kernel()
 def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
     x, y = discs.seen_from[k, 0], discs.seen_from[k, 1]
-    return follow_rim(scene.image, scene.camera_numbers, x, y, radius, discs.step[k])
+    seen = profiles(scene.image, scene.camera_numbers, x, y, radius)
+    return follow_rim(scene.image, scene.camera_numbers, seen, discs.step[k])
 
 
 @kernel()
-def _fit_whole(scene: Scene, rim: Rim, work: Any, result: Any) -> bool:
+def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any, result: Any) -> bool:
     """Fit the whole disc of a rim; whether that explains what is seen."""
-    start, blur = Start(rim.x, rim.y, rim.radius, _BLUR_PX), _BLUR_PX
+    x, y = discs.floor_xy[k]
+    start, blur = Start(x, y, discs.radius[k], _BLUR_PX), _BLUR_PX
     for _ in range(1 + _MOST_REFITS):
         at, disc = _candidate_at(scene, scene.radius, start)
         candidate = Candidate(at.u, at.v, at.radius, blur)
@@ -596,8 +597,8 @@ def _fit_whole(scene: Scene, rim: Rim, work: Any, result: Any) -> bool:
             break
         # Too blurred for its patch: once more, in a wider one.
         start, blur = Start(result.x, result.y, result.radius, result.blur), result.blur_bound
-    least = _EXPLAINS_WHOLE if rim.agreeing >= _WHOLE_RIM else _EXPLAINS_PART
-    return bool(result.explained >= least and result.contrast * rim.step > 0.0)
+    least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
+    return bool(result.explained >= least and result.contrast * discs.step[k] > 0.0)
 
 
 @kernel()

@@ -67,9 +67,6 @@ _ARRIVED = 1e-4
 #: With this share of the points on it, no other circle has more.
 _CERTAINLY_BEST = 0.9
 
-#: A rim followed from its own middle may lose this share and is still the better one.
-_SLACK = 0.07
-
 _1 = np.uint64(1)
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -113,10 +110,24 @@ class Rim(NamedTuple):
     doubt_y: float
 
 
+class Profiles(NamedTuple):
+    """Grey values along the directions from a point of the floor."""
+
+    x: float
+    """Where the directions begin, metres."""
+    y: float
+    radius: float
+    """Nominal radius, metres."""
+    grey: NDArray[np.float64]
+    """(DIRECTIONS, STEPS) NaN outside the image."""
+    pixels_per_radius: NDArray[np.float64]
+    """(DIRECTIONS,) Length of a radius in the image in each direction, pixels."""
+
+
 @kernel()
 def profiles(
     image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], x: float, y: float, radius: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> Profiles:
     """Grey values along the directions from a point of the floor.
 
     Parameters
@@ -126,13 +137,6 @@ def profiles(
         `camera.kernels.camera_numbers`.
     x, y, radius : float
         Where the directions begin, and the nominal radius, metres.
-
-    Returns
-    -------
-    grey : (DIRECTIONS, STEPS) float64
-        NaN outside the image.
-    pixels_per_radius : (DIRECTIONS,) float64
-        Length of a radius in the image in each direction, pixels.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
@@ -156,19 +160,16 @@ def profiles(
                 lower = np.float32(image[j + _1, i])
                 lower += a * (np.float32(image[j + _1, i + _1]) - lower)
                 grey[k, m] = upper + b * (lower - upper)
-    return grey, scale
+    return Profiles(x, y, radius, grey, scale)
 
 
 @kernel()
-def rim_points(
-    grey: NDArray[np.float64], pixels_per_radius: NDArray[np.float64], contrast: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rim_points(seen: Profiles, contrast: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where along each direction the grey value changes most from the disc's to the floor's.
 
     Parameters
     ----------
-    grey, pixels_per_radius
-        Of `profiles`.
+    seen : Profiles
     contrast : float
         Grey levels inside minus outside.
 
@@ -186,13 +187,13 @@ def rim_points(
     for k in range(DIRECTIONS):
         distance[k] = math.nan
         # The step is taken over two pixels, and at least over a sixth of the radius.
-        reach = max(2, round(1.0 / (pixels_per_radius[k] * per_step)))
+        reach = max(2, round(1.0 / (seen.pixels_per_radius[k] * per_step)))
         reach = min(reach, STEPS // 4)
         best = -1
         for m in range(STEPS):
             change[m] = -math.inf
             if reach <= m < STEPS - reach:
-                value = sign * (grey[k, m - reach] - grey[k, m + reach])
+                value = sign * (seen.grey[k, m - reach] - seen.grey[k, m + reach])
                 if value == value:
                     change[m] = value
                     if best < 0 or value > change[best]:
@@ -380,12 +381,7 @@ def best_circle(
 
 @kernel()
 def follow_rim(
-    image: NDArray[np.uint8],
-    camera_numbers: NDArray[np.float64],
-    x: float,
-    y: float,
-    radius: float,
-    contrast: float,
+    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], seen: Profiles, contrast: float
 ) -> Rim:
     """Follow the rim of a candidate.
 
@@ -394,10 +390,8 @@ def follow_rim(
     image : (H, W) uint8
     camera_numbers : (K,) float64
         `camera.kernels.camera_numbers`.
-    x, y : float
-        About the middle of the candidate, metres.
-    radius : float
-        Nominal radius, metres.
+    seen : Profiles
+        From about the middle of the candidate.
     contrast : float
         About how much lighter the disc is than the floor, grey levels.
 
@@ -406,8 +400,8 @@ def follow_rim(
     Rim
         With nothing agreeing where there is no circle.
     """
-    grey, scale = profiles(image, camera_numbers, x, y, radius)
-    distance, step = rim_points(grey, scale, contrast)
+    x, y, radius, scale = seen.x, seen.y, seen.radius, seen.pixels_per_radius
+    distance, step = rim_points(seen, contrast)
     at_x, at_y = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     weight, tolerance = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     log_px = 0.0
@@ -462,15 +456,6 @@ def follow_rim(
         area * best.cov_xx, area * best.cov_xy, area * best.cov_yy, radius_px,
         radius * doubt[0], radius * doubt[1],
     )  # fmt: skip
-
-
-@kernel()
-def follow_again(
-    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], radius: float, rim: Rim
-) -> Rim:
-    """The rim followed from its own middle, unless less of it is found from there."""
-    again = follow_rim(image, camera_numbers, rim.x, rim.y, radius, rim.step)
-    return again if again.agreeing >= rim.agreeing - _SLACK else rim
 
 
 @kernel()

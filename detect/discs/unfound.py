@@ -26,7 +26,7 @@ from detect.circles import (
     judged,
     vote_shape,
 )
-from detect.discs.judgement import FATES, LEAST_RIM, Judgement
+from detect.discs.judgement import FATES, LEAST_RIM, RIM_RADIUS, Judgement
 from detect.discs.radius import FACTOR, find_radius
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
@@ -263,7 +263,8 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
         radius_m = None if estimate is None else estimate.radius_m
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
         yield f"--radius-m {radius_m:.3f} finds a disc {'there' if at is not None else 'here'}."
-    sizes = scene.judgement[1].relative_radius[scene.judgement[1].log_odds > settings.evidence]
+    rims = scene.judgement[1]
+    sizes = rims.radius[rims.log_odds > settings.evidence] / (RIM_RADIUS * settings.radius_m)
     if len(sizes) >= _FEWEST_RIMS:
         off = float(np.median(sizes)) - 1.0
         if abs(off) > _OTHER_RADIUS:

@@ -144,8 +144,8 @@ class _Gathering:
         numbers = camera_numbers(camera)
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
-            steps, scale[k] = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
-            grey[k] = sign * pairs_of_steps(steps)
+            seen = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
+            grey[k], scale[k] = sign * pairs_of_steps(seen.grey), seen.pixels_per_radius
         return grey, scale
 
 
@@ -225,8 +225,8 @@ def _scenes(
         if kind in LOOK_ALIKES:
             truth = Truth(_NOWHERE, _NOWHERE, _NOWHERE, at)
         else:
-            half = np.ptp([stage.outline(place)[:, 1] for place in places], axis=1) / 2.0
-            clear = half >= _LEAST_HALF_PX if len(places) else np.zeros(0, np.bool_)
+            heights = np.array([np.ptp(stage.outline(place)[:, 1]) for place in places])
+            clear = heights >= 2.0 * _LEAST_HALF_PX
             truth = Truth(at[clear], _NOWHERE, at[~clear])
         gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN)
 
