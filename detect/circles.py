@@ -204,15 +204,15 @@ def judged(
 
 def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates beside each other; minus infinity of those without a rim."""
-    is_rim = judgement.fate == JUDGED
-    rims = judgement.where(is_rim)
-    sure = rims.log_odds >= SURE
-    lost = lost_by_paleness(rims.step, rims.floor_grey, sure)
+    rims = np.flatnonzero(judgement.fate == JUDGED)
+    step, log_odds = judgement.step[rims], judgement.log_odds[rims]
+    sure = log_odds >= SURE
+    lost = lost_by_paleness(step, judgement.floor_grey[rims], sure)
     if settings.polarity == "any":
-        lost += lost_by_sign(rims.step, sure)
-    log_odds = np.full(len(is_rim), -np.inf)
-    log_odds[is_rim] = rims.log_odds - lost
-    return log_odds
+        lost += lost_by_sign(step, sure)
+    adjusted = np.full(len(judgement.fate), -np.inf)
+    adjusted[rims] = log_odds - lost
+    return adjusted
 
 
 def best_discs(

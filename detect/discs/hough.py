@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.candidates import suppress_neighbours
+from detect.discs.candidates import apart
 from lut import VoteTable
 from redetect.compiled import kernel
 
@@ -71,10 +71,8 @@ def hough_candidates(
     places, scores = [], []
     for votes in count_votes(image, table, radius * signs, least_step):
         place, score = _peaks(votes, table)
-        alone = suppress_neighbours(place, score, _APART * radius)
-        place, score = place[alone], score[alone]
-        most = max(_MOST_DOUBTFUL, int((score >= _CLEAR_SCORE).sum()))
-        best = np.argsort(-score, kind="stable")[:most]
+        best = apart(place, np.argsort(-score, kind="stable"), _APART * radius)
+        best = best[: max(_MOST_DOUBTFUL, np.count_nonzero(score[best] >= _CLEAR_SCORE))]
         places.append(place[best] @ table.turn + table.foot)
         scores.append(score[best])
     number = [len(score) for score in scores]
