@@ -35,7 +35,7 @@ OTHERS, SCALES = 2, 2
 #: Of the grey values' deviations, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
 #: Log-odds by one network below which the others are not asked.
-_HOPELESS = -4.0
+HOPELESS = -4.0
 
 _Weights = NDArray[np.float32]
 
@@ -169,6 +169,6 @@ def network_log_odds(
             odds += max(unit, np.float32(0.0)) * network.out[n, d]
         for f in range(len(features)):
             odds += features[f] * network.out[n, units + f]
-        if n == 0 and odds < _HOPELESS:
+        if n == 0 and odds < HOPELESS:
             return float(odds)
     return float(odds / members)

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.circles import CircleDetections, detect_circles, vote_shape
-from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim
+from detect.discs.rim import (
+    DIRECTIONS,
+    RADIUS_SIGMA,
+    Circle,
+    Rim,
+    fit_circle,
+    follow_rim,
+    profiles,
+)
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
@@ -27,8 +35,9 @@ def table(published_camera: Camera) -> VoteTable:
 
 
 def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Rim:
-    contrast = grey - FLOOR
-    return follow_rim(image, camera_numbers(camera), near[0], near[1], RADIUS, contrast)
+    numbers = camera_numbers(camera)
+    seen = profiles(image, numbers, near[0], near[1], RADIUS)
+    return follow_rim(image, numbers, seen, grey - FLOOR)
 
 
 def door_over(
@@ -77,7 +86,7 @@ def test_what_is_no_disc_has_no_such_rim(published_camera: Camera) -> None:
 
 def test_outside_the_image_nothing_is_visible(published_camera: Camera) -> None:
     image = np.full((published_camera.height, published_camera.width), 90, np.uint8)
-    rim = follow_rim(image, camera_numbers(published_camera), 0.0, 3.0, RADIUS, 50.0)
+    rim = rim_of(published_camera, image, np.array([0.0, 3.0]), FLOOR + 50.0)
     assert rim.agreeing == 0.0
 
 
