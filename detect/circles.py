@@ -55,7 +55,7 @@ _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 16
 #: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
-_EDGE, _LEAST_STEP = 2.0, 5.0
+_EDGE, _LEAST_STEP = 4.0, 5.0
 
 
 @dataclass(frozen=True)

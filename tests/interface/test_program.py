@@ -104,7 +104,7 @@ def test_help_has_the_common_flags_and_help_all_has_all(capsys: Captured) -> Non
     for flag in ("--circles.radius-m", "--circles.polarity", "--jobs", "--odometry", "--force"):
         assert flag in common
         assert flag in everything
-    for flag in ("--circles.rows-apart", "--lines.regulariser", "--cluster", "--wheel-base-m"):
+    for flag in ("--circles.separation", "--lines.regulariser", "--cluster", "--wheel-base-m"):
         assert flag not in common
         assert flag in everything
     assert "More flags are shown by --help-all" in common
@@ -113,8 +113,8 @@ def test_help_has_the_common_flags_and_help_all_has_all(capsys: Captured) -> Non
 
 def test_flags_for_experts_are_taken(tmp_path: Path) -> None:
     parsed = import_module(PROGRAMS["detect"]).parsed
-    command = parsed(["all", str(tmp_path), "--circles.rows-apart", "0.5", "--line-ends", "crlf"])
-    assert (command.circles.rows_apart, command.line_ends) == (0.5, "crlf")
+    command = parsed(["all", str(tmp_path), "--circles.separation", "0.5", "--line-ends", "crlf"])
+    assert (command.circles.separation, command.line_ends) == (0.5, "crlf")
 
 
 @pytest.mark.parametrize("place", [0, 1, 9])

@@ -1,4 +1,4 @@
-"""The network of the second look as its equation is written."""
+"""The network of rims as its equation is written."""
 
 from __future__ import annotations
 

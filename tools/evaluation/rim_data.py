@@ -72,7 +72,7 @@ _BY_RIM = Networks(
 
 
 class Looks(NamedTuple):
-    """Glances at candidates or second looks, of known truth."""
+    """Glances at candidates, or looks at rims, of known truth."""
 
     features: FloatArray  # (N, F)
     grey: Float32Array  # (N, V, K, M) Of a dark disc, turned into a light one.

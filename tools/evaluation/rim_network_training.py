@@ -1,6 +1,6 @@
-"""Trains the network of the second look (`detect.discs.rim_network`) on looks of known truth.
+"""Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: some 6,000 looks and 2,000 weights take seconds. Forward and backward pass are written
+Plain NumPy: 80,000 looks and 13,000 weights take some minutes. Forward and backward pass are written
 out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter, Decoupled Weight
 Decay Regularization, ICLR 2019), their length rises and falls once.
 """
@@ -251,7 +251,7 @@ def cross_validation(glances: Looks, looks: Looks, seed: int) -> Iterable[str]:
 
 @dataclass(frozen=True)
 class TrainRimNetwork:
-    """Train the network of the second look at discs, and print its finds in unseen buildings."""
+    """Train the networks that judge candidates, and print their finds in unseen buildings."""
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
     every: int = 4  # Every n-th frame of the recorded run is used.

@@ -1,4 +1,4 @@
-"""The network of the second look against its equation, and its laws."""
+"""The network of rims against its equation, and its laws."""
 
 from __future__ import annotations
 

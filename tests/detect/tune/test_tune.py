@@ -82,7 +82,7 @@ def test_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
         ("threshold", "0.5", (0.5,)),
         ("threshold", "0.5, 0.2,0.5", (0.5, 0.2)),
         ("samples", "8:16:4", (8, 12, 16)),
-        ("verify", "true,False", (True, False)),
+        ("refine", "true,False", (True, False)),
         ("polarity", "light,any", ("light", "any")),
         ("evidence", "-1,2.5", (-1.0, 2.5)),
     ],
@@ -105,7 +105,7 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
         ("threshold", "a:b:c", "FROM:TO:STEP"),
         ("threshold", "much", "expected a number"),
         ("samples", "8:9:0.5", "expected a whole number"),
-        ("verify", "maybe", "True or False"),
+        ("refine", "maybe", "True or False"),
         ("polarity", "grey", "any, light, dark"),
     ],
 )

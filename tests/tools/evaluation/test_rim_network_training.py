@@ -1,4 +1,4 @@
-"""Training of the network of the second look: its gradient, and that it learns what is there."""
+"""Training of the network of rims: its gradient, and that it learns what is there."""
 
 from __future__ import annotations
 
