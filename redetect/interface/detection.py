@@ -390,7 +390,7 @@ class Explanation(Table):
     Attributes
     ----------
     candidates : tuple of detect.discs.unfound.Candidate
-        Those that were found first, then by falling quality.
+        Those that were found first, then by falling votes.
     place : str
         Of the pixel that was pointed at; empty without one.
     suggestions : tuple of str
@@ -408,7 +408,7 @@ class Explanation(Table):
     def columns(self) -> dict[str, Any]:
         """One row per candidate, numbered as in the picture."""
         rows = self.candidates
-        fields = ("u", "v", "x_m", "y_m", "quality", "contrast", "stage", "value", "limit")
+        fields = Candidate._fields
         return {
             "number": list(range(1, len(rows) + 1)),
             **{name: [getattr(row, name) for row in rows] for name in fields},

@@ -153,7 +153,7 @@ def test_explain(demo_image: Path, demo: Path, tmp_path: Path, capsys: Captured)
     words = ["explain", str(demo_image), "--polarity", "light", "--at", "258", "111", *outputs]
     assert main(words) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "of the other sign" in shown
+    assert "it is of the other polarity" in shown
     assert "Try: --polarity any finds 1 there." in shown
     content = json.loads((tmp_path / "why.json").read_text())
     assert [row["stage"] for row in content["candidates"]] == ["polarity"]

@@ -243,7 +243,7 @@ def test_every_disc_that_is_found_is_explained(
     why = rd.explain(demo_image, demo_camera, polarity="light")
     assert sum(row.is_disc for row in why.candidates) == len(found.discs)
     stages = {row.stage for row in why.candidates}
-    assert {"disc", "few steps", "polarity", "quality"} <= stages
+    assert {"disc", "steps", "glance", "polarity"} <= stages
     for row in why.candidates:
         assert row.is_disc == row.reason().startswith("found")
         assert not row.is_disc or row.contrast > 15.0  # of large discs, too
@@ -267,7 +267,7 @@ def test_the_right_radius_is_found_at_a_place(
     at = float(found.discs.u[clearest]), float(found.discs.v[clearest])
     why = rd.explain(demo_image, demo_camera, at, radius_m=0.06)
     assert not any(row.is_disc for row in why.candidates)
-    assert "best quality" in why.place
+    assert "the usual votes" in why.place
     (words,) = [words for words in why.suggestions if "--radius-m" in words]
     assert float(words.split()[1]) == pytest.approx(0.10, rel=0.1)
 

@@ -1,8 +1,8 @@
 """Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: 80,000 looks and 13,000 weights take some minutes. Forward and backward pass are written
-out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter, Decoupled Weight
-Decay Regularization, ICLR 2019), their length rises and falls once.
+Plain NumPy: 80,000 looks and 13,000 weights take some minutes. Forward and backward pass are
+written out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter,
+Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls once.
 """
 
 from __future__ import annotations
