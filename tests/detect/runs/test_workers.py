@@ -122,8 +122,7 @@ def test_kernels_are_compiled_once_and_first(
     assert began == [
         "0 work_on_chunk False True images",
         "1 work_on_chunk True False images",
-        f"{rest} look_again False True images",
-        f"{rest} place_discs False True images",
+        f"{rest} place_none False True images",
         "compiled images",
         "compiled images",
     ]
