@@ -71,7 +71,7 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
         ('{"settings": {"circles": 3}}', "names and values"),
         ('{"settings": {"circles": {"radius": 1}}}', "radius is no parameter of CircleSettings"),
         ('{"settings": {"circles": {"radius_m": "1"}}}', "expected a number"),
-        ('{"settings": {"circles": {"verify": 1}}}', "expected True or False"),
+        ('{"settings": {"circles": {"refine": 1}}}', "expected True or False"),
         ('{"settings": {"circles": {"radius_m": -1}}}', "radius_m"),
         ('{"settings": {"lines": {"refine_steps_px": 3}}}', "expected a list of numbers"),
         ('{"settings": {"circles": {"polarity": "grey"}}}', "expected one of any, light, dark"),
