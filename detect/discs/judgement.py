@@ -44,7 +44,7 @@ GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.4
 #: Least log-odds of a glance.
-_LEAST_GLANCE = -0.75
+_LEAST_GLANCE = 0.0
 #: Least share of the rim that is on a circle.
 LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
