@@ -39,7 +39,7 @@ _SETTINGS = CircleSettings()
 _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
 #: rendered floor, a board; and how much less what is of the other polarity than the discs there.
-_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (1.5, 0.4)
+_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (2.0, 1.0)
 _SCENE, _BOARD, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), 0.3
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
@@ -271,6 +271,15 @@ def _real(
         gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
         if number % 6 == 0:
             _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
+    gathering.looks = [
+        row for row in gathering.looks if row[-1] != "real" or row[3] or not _is_clear(row[0])
+    ]
+
+
+def _is_clear(features: FloatArray) -> bool:
+    """Where no disc is mapped, that is a disc nevertheless."""
+    rim, _, scatter, radius_off, _, _, score = features
+    return bool(rim >= 0.65 and scatter < 0.45 and radius_off <= 0.06 and score >= 4.5)
 
 
 def other_camera(rng: np.random.Generator) -> Camera:
