@@ -31,7 +31,7 @@ from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import FrameError
-from detect.grey_values import blank_margins, estimate_noise
+from detect.grey_values import blank_margins, estimate_noise, steep_gradient
 from detect.settings import CircleSettings, Polarity
 from lut import (
     DiscShape,
@@ -54,8 +54,9 @@ _LEAST_NOISE = 1.0
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Rows of an image from which its noise is estimated.
 _NOISE_ROWS = 16
-#: Least gradient of an edge that votes, and least step of a rim, grey levels (per pixel).
-_EDGE, _LEAST_STEP = 4.0, 5.0
+#: Gradient of an edge that votes, at least and where the image is full of edges, grey levels per
+#: pixel, and in deviations of the noise as a share of `noise_floor`; least step of a rim.
+_FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ def candidates_of(
     image: NDArray[np.uint8], table: VoteTable, settings: CircleSettings, noise: float
 ) -> HoughCandidates:
     """Centres for which edges vote; parameters as of `detect_circles`, and the noise."""
-    edge = max(_EDGE, 0.4 * settings.noise_floor * max(noise, _LEAST_NOISE))
+    usual = min(max(steep_gradient(image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
+    edge = max(usual, _EDGE_NOISE * settings.noise_floor * max(noise, _LEAST_NOISE))
     return hough_candidates(image, table, settings.radius_m, _SIGNS[settings.polarity], edge)
 
 
