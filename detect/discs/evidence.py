@@ -10,7 +10,7 @@ from detect.discs.rim import median
 FloatArray = NDArray[np.float64]
 
 #: Discs of these log-odds are sure: others are compared with them.
-SURE = 1.5
+SURE = 2.5
 #: A disc of less than this share of the others' contrast is pale, and what it loses for each factor
 #: of e, log-odds; the least number of others, and the least grey value that a ratio is taken of.
 _PALE, _PER_FACTOR = 0.5, 4.0
