@@ -270,7 +270,7 @@ def _cheapest_paths(steps: Sequence[_Step], frame: IntArray) -> FloatArray:
         ahead[b] = min(ahead[b], ahead[a] + cost)
     for a, b, cost in reversed(steps):
         back[a] = min(back[a], back[b] + cost)
-    return ahead + back
+    return np.asarray(ahead + back)
 
 
 def _motion_costs(
