@@ -36,7 +36,7 @@ Values = Sequence[Any]
 # Forward and left, from left and backward.
 _FROM_DATASET = np.array([[0.0, -1.0], [1.0, 0.0]])
 _DELETE_ALL = 3  # Action of a `Marker`: those shown before go.
-# Kinds of a `Marker`, and its size (m), that stand for discs and for bearings of verticals.
+# Kind of a `Marker` and its size (m), as a symbol of a disc, and of the bearing of a vertical.
 _CYLINDER_OR_ARROW = {"circles": (3, (0.2, 0.2, 0.01)), "lines": (0, (5.0, 0.02, 0.02))}
 _POLYGON = 3
 
@@ -115,7 +115,7 @@ def _transform(types: Types, header: Any, place: complex, heading: float) -> Any
 def _shapes(
     types: Types, header: Any, table: TableName, poses: Sequence[Any], identifiers: Sequence[Any]
 ) -> Any:
-    """What stands for the discs or verticals of an image, in the place of those shown before."""
+    """Symbols of the discs or verticals of an image, which replace those shown before."""
     kind, size = _CYLINDER_OR_ARROW[table]
     zero = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
     nowhere = types["geometry_msgs/msg/Pose"](zero, _quaternion(types, np.zeros(3)))
