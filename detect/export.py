@@ -2,8 +2,7 @@
 
 CSV has a line of names at the top, the shortest numbers that give the same float64, empty cells for
 unknown values. Columns of Parquet (package ``pyarrow``) have units and descriptions. MCAP (package
-``rosbags``; no ROS is needed) has a message for each frame and table; the messages' definitions
-follow from the tables' columns (`message_definitions`) and are in the file.
+``rosbags``; no ROS is needed) has standard messages of ROS 2 (`detect.ros_messages`).
 """
 
 from __future__ import annotations
@@ -13,21 +12,18 @@ import csv
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
-
-import numpy as np
+from typing import Any, BinaryIO
 
 from detect.errors import DetectError
+from detect.ros_messages import TOPICS, ros_messages
 from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
-from redetect.landmarks.columns import FRAME_COLUMNS, TABLES, TableName, Value, table_of, values_of
+from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
 from redetect.landmarks.times import read_times
 from redetect.storage import demand_place, write_whole
-
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
 
 # Which table a file of a kind has rows of, even where there are none.
 _TABLES: dict[str, TableName] = {
@@ -97,18 +93,6 @@ def _times(command: Export) -> dict[str, float] | None:
         if beside.is_file():
             return read_times(beside)
     return None
-
-
-#: The robot frame of the data set, X left and Y backward: not ROS's base_link.
-FRAME_ID = "robot_left_backward"
-
-_PACKAGE = "redetect_msgs/msg"
-_TYPES = {
-    "text": "string",
-    "number": "float64",
-    "whole number": "int64",
-    "whole numbers": "int64[]",
-}
 
 
 #: The values of all columns of a table: number, prefix and time of the frame, and what follows.
@@ -196,62 +180,44 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
     pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), stream)
 
 
-def message_definitions(table: TableName) -> dict[str, str]:
-    """The definitions of a table's messages, by their names, in ROS's own notation."""
-    row, frame = _message_types(table)
-    columns = TABLES[table][len(FRAME_COLUMNS) :]
-    return {
-        row: "".join(
-            f"{_TYPES[c.kind]} {c.name}  # {f'{c.unit}: ' if c.unit else ''}{c.meaning}\n"
-            for c in columns
-        ),
-        frame: (
-            f"std_msgs/Header header  # time of the image; frame_id {FRAME_ID}\n"
-            f"int64 frame  # {FRAME_COLUMNS[0].meaning}\n"
-            f"string image  # {FRAME_COLUMNS[1].meaning}\n"
-            f"{row.replace('/msg', '')}[] {table}\n"
-        ),
-    }
-
-
-def topic_of(table: TableName) -> str:
-    """The topic that a table's messages are recorded under."""
-    return f"/redetect/{table}"
-
-
 def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
-    """Write a message for each frame and table, also where there are no rows; returns how many."""
-    store = _typestore()
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    frames = {row[:3]: dict[TableName, list[Row]]() for rows in tables.values() for row in rows}
+    """Write the messages of each frame, at its time; returns how many there are."""
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise DetectError(
+            "MCAP is written by the package rosbags: install it by "
+            "pip install 'redetect[bags]', or write --to csv"
+        ) from None
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    frames = {row[:3]: {table: list[Row]() for table in tables} for row in chain(*tables.values())}
     for table, rows in tables.items():
         for row in rows:
-            frames[row[:3]].setdefault(table, []).append(row[3:])
+            frames[row[:3]][table].append(row[3:])
+    timed = [
+        (_nanoseconds(image, time_s, source), found)
+        for (_, image, time_s), found in sorted(frames.items())
+    ]
+    written = 0
     with tempfile.TemporaryDirectory(prefix="redetect-") as folder:
         bag = Path(folder) / "detections"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             connections = {
-                table: writer.add_connection(
-                    topic_of(table), _message_types(table)[1], typestore=store
-                )
+                topic: writer.add_connection(topic, message_type, typestore=store)
                 for table in tables
+                for topic, message_type in TOPICS[table].items()
             }
-            for frame, found in sorted(frames.items()):
-                for table, connection in connections.items():
-                    time_ns, message = _message(store, table, frame, found.get(table, []), source)
-                    content = store.serialize_cdr(message, message.__msgtype__)
-                    writer.write(connection, time_ns, content)
+            for time_ns, topic, message in ros_messages(store.types, timed):
+                content = store.serialize_cdr(message, message.__msgtype__)
+                writer.write(connections[topic], time_ns, content)
+                written += 1
         stream.write((bag / "detections.mcap").read_bytes())
-    return len(frames) * len(tables)
+    return written
 
 
-def _message(
-    store: Typestore, table: TableName, frame: Row, rows: Sequence[Row], source: str
-) -> tuple[int, Any]:
-    """The time (ns) and the message of a frame: its number, image and time."""
-    types = store.types
-    number, image, time_s = frame
+def _nanoseconds(image: Value, time_s: Value, source: str) -> int:
+    """The time of a message about an image."""
     if not isinstance(time_s, float):
         raise DetectError(
             f"{source}: no time of {image}: messages need one: name a file of rows "
@@ -260,37 +226,4 @@ def _message(
     time_ns = round(time_s * 1e9)
     if not 0 <= time_ns < 2**31 * 10**9:
         raise DetectError(f"{source}: {image} is from {time_s:g} s: expected 0 to 2^31 s")
-    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID)
-    row_type, frame_type = (types[name] for name in _message_types(table))
-    content = [row_type(*map(_ros_value, row)) for row in rows]
-    return time_ns, frame_type(header, _ros_value(number), _ros_value(image), content)
-
-
-def _message_types(table: TableName) -> tuple[str, str]:
-    """The types of a row and of a frame's message, such as Circle and Circles."""
-    name = table.capitalize()
-    return f"{_PACKAGE}/{name.removesuffix('s')}", f"{_PACKAGE}/{name}"
-
-
-def _ros_value(value: Value) -> Any:
-    if isinstance(value, tuple):
-        return np.array(value, dtype=np.int64)
-    if isinstance(value, str):
-        return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-    return value
-
-
-def _typestore() -> Typestore:
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise DetectError(
-            "MCAP is written by the package rosbags: install it by "
-            "pip install 'redetect[bags]', or write --to csv"
-        ) from None
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for table in TABLES:
-        for name, definition in message_definitions(table).items():
-            store.register(get_types_from_msg(definition, name))
-    return store
+    return time_ns

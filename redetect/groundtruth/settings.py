@@ -21,7 +21,6 @@ from redetect.storage.bounds import (
 )
 
 Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
-Loss = Literal["linear", "huber", "cauchy"]
 
 _ODDS = Bounds("more than 1", 1.0, above=True, below=True)
 
@@ -41,8 +40,6 @@ class PoseSettings(_Bounded):
     """Settings of the poses."""
 
     solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
-    loss: Loss = "huber"  # How markers that fit badly are weighted in the least squares.
-    loss_scale: Positive = 2.0  # Normalised error of a marker at which its weight begins to fall.
     # A marker in an image is left out, and listed, if its normalised error is larger than this
     # and its residual larger than --outlier-px.
     outlier_sigma: Positive = 5.0

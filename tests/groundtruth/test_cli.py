@@ -146,12 +146,12 @@ def test_files_and_settings_that_options_name(tmp_path: Path, capsys: Captured) 
     arguments = [
         "poses", str(session), "--rig", str(session / "rig.json"),
         "--network", str(session / "network.json"),
-        "--solver", "ippe", "--loss", "cauchy", "-o", str(output),
+        "--solver", "ippe", "-o", str(output),
     ]  # fmt: skip
     assert main(arguments) == 0
     assert len(read_planar_poses(output)) == 6
     beside = json.loads((tmp_path / "out.json").read_text())
-    assert beside["settings"]["loss"] == "cauchy"
+    assert beside["settings"]["solver"] == "ippe"
     assert capsys.readouterr().err == ""
 
 
@@ -267,9 +267,9 @@ def test_two_outputs_in_one_place_are_refused(
 
 def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["poses", "somewhere", "--loss-scale", "0"])
+        main(["poses", "somewhere", "--outlier-sigma", "0"])
     assert caught.value.code == 2
-    assert "loss_scale is 0" in capsys.readouterr().err
+    assert "outlier_sigma is 0" in capsys.readouterr().err
 
 
 @pytest.mark.long

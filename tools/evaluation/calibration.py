@@ -181,16 +181,12 @@ def compare(
     group: str,
     *,
     free_aspect: bool,
-    polynomial: bool = False,
     peers: Sequence[str] = tuple(OPENCV),
     every: int = 1,
 ) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
-    settings = CalibrationSettings(
-        aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
-        keep_outliers=True,
-    )  # fmt: skip
+    settings = CalibrationSettings(None if free_aspect else 1.0, robust=False)
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
     points, lens = result.points, result.lens
@@ -256,7 +252,6 @@ class CameraPhotographs:
     folder: Positional[Path]  # Folder of photographs with truth.
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras: the names' beginnings.
     free_aspect: bool = True  # Both scales free, as OpenCV has them; else equal.
-    polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
 
     def __call__(self) -> int:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
@@ -266,9 +261,7 @@ class CameraPhotographs:
              "free here": "<"}
         )  # fmt: skip
         for group in self.groups:
-            r = compare(
-                self.folder, group, free_aspect=self.free_aspect, polynomial=self.polynomial
-            )
+            r = compare(self.folder, group, free_aspect=self.free_aspect)
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
         return 0

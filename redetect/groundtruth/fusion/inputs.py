@@ -45,10 +45,12 @@ def noise_of(settings: FuseSettings) -> FloatArray:
 #: covariances.
 CREEP_M2_PER_S = (1e-4) ** 2
 CREEP_RAD2_PER_S = (1e-4) ** 2
-# A turn is distinct if, from a second before to a second after, odometry turned by more than so
-# many of its standard deviations.
+# The share of turns is one of distinct turns: by more than this (rad) from a second before to a
+# second after, some four standard deviations of wheels at 1 m/s. Less may be odometry's random
+# errors, which measured headings contradict, so that the share would be biased towards -1
+# (regression dilution).
 _DISTINCT_OVER_S = 1.0
-_DISTINCT_SIGMAS = 4.0
+_DISTINCT_RAD = 0.06
 # Odometry pauses where samples are farther apart than both, in seconds and in usual intervals.
 _PAUSE_S = 1.0
 _PAUSE_INTERVALS = 10.0
@@ -73,9 +75,7 @@ def _paused(times_s: FloatArray) -> BoolArray:
     return np.asarray(interval > max(_PAUSE_S, _PAUSE_INTERVALS * float(np.median(interval))))
 
 
-def movements(
-    odometry: PlanarPoses, node_times_s: FloatArray, settings: FuseSettings
-) -> tuple[FloatArray, FloatArray]:
+def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Movements between nodes, each a share of an arc between two samples of odometry.
 
     `odometry` has two samples or more, no two of one time; (N,) node times ascend within its time.
@@ -84,7 +84,8 @@ def movements(
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
-    distinct = np.where(_distinct(odometry.times_s, way, turn, settings), turn, 0.0)
+    turned, _ = _within(odometry.times_s, turn, _DISTINCT_OVER_S)
+    distinct = np.where(np.abs(turned) > _DISTINCT_RAD, turn, 0.0)
     arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, way, turn)])
     last = len(odometry) - 2
     at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
@@ -100,25 +101,6 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
     total = np.concatenate([[0.0], np.cumsum(steps)])
     ends = (np.interp(at, times_s, total) for at in (to_s, from_s))
     return np.asarray(np.subtract(*ends)), to_s - from_s
-
-
-def _distinct(
-    times_s: FloatArray, way: FloatArray, turn: FloatArray, settings: FuseSettings
-) -> BoolArray:
-    """Between which samples the robot turned by more than odometry's random errors explain.
-
-    Only there can the scale error of its turns be estimated. Elsewhere, apparent turns are random
-    errors, which measured headings contradict, so that the estimate would be biased towards -1
-    (regression dilution).
-    """
-    turned, passed = _within(times_s, turn, _DISTINCT_OVER_S)
-    driven, _ = _within(times_s, way, _DISTINCT_OVER_S)
-    variance = (
-        settings.turn_sigma**2 * np.abs(turned)
-        + settings.turn_per_metre_sigma**2 * driven
-        + CREEP_RAD2_PER_S * passed
-    )
-    return np.asarray(turned**2 > _DISTINCT_SIGMAS**2 * variance)
 
 
 def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:

@@ -5,17 +5,18 @@ poses are those of the ground truth after one rigid motion, and their errors bes
 an Ornstein-Uhlenbeck process for x, y and the heading, of a deviation and a correlation time each
 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, appendix B). The process is
 Markov: in a gap between measurements the errors depend only on those at its two ends, in closed
-form. Odometry is taken for a localisation only if, as such, it predicts the measurements a hundred
-times as well as by the movements between its poses.
+form. Odometry is taken for a localisation if, as such, it predicts the measurements better than by
+the movements between its poses.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from redetect.array_types import FloatArray
@@ -35,7 +36,6 @@ from redetect.landmarks import wrap_angle
 _SPACING_S = 2.0
 _FEWEST = 10
 _LEAST_GAP_S = 20.0
-_CLEAR_LEAD = 2.0 * math.log(100.0)
 _MOST_TO_LEARN_FROM = 500
 # A few visits hardly determine a correlation time: a mean and a deviation of its logarithm are
 # assumed.
@@ -64,7 +64,7 @@ class LocalisationErrors:
 def as_localisation(
     odometry: PlanarPoses, problem: MovementProblem, noise: FloatArray, path: PlanarPoses
 ) -> tuple[PlanarPoses, LocalisationErrors] | None:
-    """The path from odometry that is a localisation, if it clearly is one.
+    """The path from odometry that is a localisation, if it is one.
 
     `problem` has the same odometry, no two samples of which are of one time; `noise` (4,): its
     random errors over seconds. `path` is the one by movements, with covariances: it stays where
@@ -84,74 +84,104 @@ def as_localisation(
         if np.count_nonzero(usual) < _FEWEST:
             return None
     times_s, errors = measured.times_s[usual], errors[usual]
-    offset = float(np.mean(errors[:, 2]))
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
-    position_sigma, position_s, by_position = _stationary(
-        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1)
+    positions = moved_poses(own, motion).poses[usual, :2]
+    centre = positions.mean(axis=0)
+    position = _stationary(
+        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(positions - centre)
     )
-    heading_sigma, heading_s, by_heading = _stationary(
-        times_s, errors[:, 2:] - offset, variances[:, 2]
-    )
-    surprise = by_position + by_heading + _OUTLIER_SURPRISE * np.count_nonzero(~usual)
-    if not surprise < thin.account(noise).surprise - _CLEAR_LEAD:
+    heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
+    surprise = position.surprise + heading.surprise + _OUTLIER_SURPRISE * np.count_nonzero(~usual)
+    if not surprise < thin.account(noise).surprise:
         return None
-    found = LocalisationErrors(position_sigma, heading_sigma, position_s, heading_s, offset)
     aligned = moved_poses(odometry, motion)
-    aligned.poses[:, 2] += offset
-    centre = moved_poses(own, motion).poses[usual, :2]
-    return _bridged(path, aligned, centre, problem.measured_s, found), found
+    by_motion = _by_motion(aligned.poses[:, :2] - centre)
+    aligned.poses[:, :2] += by_motion @ position.mean
+    aligned.poses[:, 2] += heading.mean
+    spread = np.zeros((len(aligned), POSE, POSE))
+    spread[:, :2, :2] = by_motion @ position.mean_covariance @ np.swapaxes(by_motion, 1, 2)
+    spread[:, 2, 2] = heading.mean_covariance[0, 0]
+    found = LocalisationErrors(
+        position.sigma,
+        heading.sigma,
+        position.lasting_s,
+        heading.lasting_s,
+        float(heading.mean[0]),
+    )
+    aligned = PlanarPoses(aligned.times_s, aligned.poses, spread)
+    return _bridged(path, aligned, problem.measured_s, found), found
+
+
+def _by_motion(from_centre: FloatArray) -> FloatArray:
+    """(M, 2, 3) derivatives of positions (M, 2) by a motion x, y, theta about their centre."""
+    derivatives = np.zeros((len(from_centre), 2, POSE))
+    derivatives[:, :, :2] = np.eye(2)
+    derivatives[:, 0, 2], derivatives[:, 1, 2] = -from_centre[:, 1], from_centre[:, 0]
+    return derivatives
+
+
+class _Stationary(NamedTuple):
+    """A process of one deviation and correlation time about a mean of k unknowns."""
+
+    sigma: float
+    lasting_s: float
+    mean: FloatArray  # (k,)
+    mean_covariance: FloatArray  # (k, k)
+    surprise: float  # Minus twice the logarithm of the likelihood
 
 
 def _stationary(
-    times_s: FloatArray, values: FloatArray, variances: FloatArray
-) -> tuple[float, float, float]:
-    """Deviation and correlation time (s) of a process that make (M, k) values of it likeliest.
+    times_s: FloatArray, values: FloatArray, variances: FloatArray, design: FloatArray
+) -> _Stationary:
+    """The process that makes (M, n) values of it likeliest, whatever its mean is.
 
-    Their level is unknown; each value is as uncertain as its time's variance (M,) says. Returns
-    minus twice the logarithm of their likelihood, too.
+    `design` (M, n, k): the values' derivatives by the unknowns of the mean. Each value is as
+    uncertain as its time's variance (M,) says. A mean that is estimated follows the errors, of few
+    visits most of all: their likelihood is the one that is left (restricted maximum likelihood;
+    Rasmussen and Williams, section 2.7).
     """
     stride = 1 + len(times_s) // _MOST_TO_LEARN_FROM
     apart = np.abs(times_s[::stride, None] - times_s[::stride])
-    some, noise = values[::stride], np.diag(variances[::stride])
+    noise = np.diag(variances[::stride])
+    columns = np.concatenate([design, values[:, :, None]], axis=2)[::stride]
 
-    def surprise(logarithms: FloatArray) -> float:
-        sigma, lasting = np.exp(logarithms)
-        factor = cho_factor(sigma**2 * np.exp(-apart / lasting) + _LEVEL_SIGMA**2 + noise)
-        determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(factor[0])))
-        return float(determinant + np.sum(some * cho_solve(factor, some)))
+    def fitted(logarithms: FloatArray) -> _Stationary:
+        sigma, lasting = np.exp(logarithms).tolist()
+        lower = cholesky(sigma**2 * np.exp(-apart / lasting) + noise, lower=True)
+        white = solve_triangular(lower, columns.reshape(len(columns), -1), lower=True)
+        white = white.reshape(-1, columns.shape[2])
+        normal = white.T @ white
+        covariance = np.linalg.inv(normal[:-1, :-1])
+        mean = covariance @ normal[:-1, -1]
+        squared = normal[-1, -1] - normal[:-1, -1] @ mean
+        determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(lower)))
+        determinant -= np.linalg.slogdet(covariance / _LEVEL_SIGMA**2)[1]
+        return _Stationary(sigma, lasting, mean, covariance, stride * float(squared + determinant))
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
-        return surprise(logarithms) + float(off / _LOG_CORRELATION_SIGMA) ** 2
+        return fitted(logarithms).surprise / stride + float(off / _LOG_CORRELATION_SIGMA) ** 2
 
     start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
     found = minimize(
         with_prior, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02}
     )
-    sigma, lasting = np.exp(found.x).tolist()
-    return sigma, lasting, stride * surprise(found.x)
+    return fitted(found.x)
 
 
 def _bridged(
-    path: PlanarPoses,
-    aligned: PlanarPoses,
-    aligned_by: FloatArray,
-    measured_s: FloatArray,
-    errors: LocalisationErrors,
+    path: PlanarPoses, aligned: PlanarPoses, measured_s: FloatArray, errors: LocalisationErrors
 ) -> PlanarPoses:
     """A path whose gaps are those of an aligned localisation plus its errors given at both ends.
 
-    `aligned_by` (M, 2): the positions, `_SPACING_S` apart, by which it was aligned.
+    The localisation's covariances are those of its alignment.
     """
     assert path.covariances is not None
     times, poses, covariances = path.times_s, path.poses.copy(), path.covariances.copy()
     there, _ = interpolate_poses(aligned, times)
+    assert there.covariances is not None
     lasting = np.array([errors.position_correlation_s] * 2 + [errors.heading_correlation_s])
     variances = np.square([errors.position_sigma] * 2 + [errors.heading_sigma])
-    # How well the motion is known: errors that last count as fewer.
-    of_mean = variances / np.tanh(0.5 * _SPACING_S / lasting) / len(aligned_by)
-    centre = aligned_by.mean(axis=0)
-    of_turn = of_mean[0] / np.mean(np.sum((aligned_by - centre) ** 2, axis=1))
     for gap in np.flatnonzero(np.diff(measured_s) > UNMEASURED_S):
         first = max(int(np.searchsorted(times, measured_s[gap], side="right")) - 1, 0)
         last = min(int(np.searchsorted(times, measured_s[gap + 1])), len(times) - 1)
@@ -165,16 +195,12 @@ def _bridged(
         by_last = (before - whole * after) / (1.0 - whole**2)
         free = 1.0 - by_first - by_last
         poses[within] = there.poses[within] + by_first * ends[0] + by_last * ends[1]
-        lever = np.column_stack(
-            [centre[1] - there.poses[within, 1], there.poses[within, 0] - centre[0]]
-        )
-        lever = np.column_stack([lever, np.zeros(len(lever))]) * free
         covariances[within] = (
             by_first[:, :, None] * path.covariances[first] * by_first[:, None]
             + by_last[:, :, None] * path.covariances[last] * by_last[:, None]
-            + of_turn * lever[:, :, None] * lever[:, None]
+            + free[:, :, None] * there.covariances[within] * free[:, None]
         )
-        own = variances * (1.0 - by_first * after - by_last * before) + of_mean * free**2
+        own = variances * (1.0 - by_first * after - by_last * before)
         covariances[within] += own[:, :, None] * np.eye(POSE)
     poses[:, 2] = wrap_angle(poses[:, 2])
     return PlanarPoses(times, poses, covariances)

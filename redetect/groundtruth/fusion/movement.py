@@ -313,7 +313,7 @@ def movement_problem(
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
-    controls, unseen = movements(odometry, node_times, settings)
+    controls, unseen = movements(odometry, node_times)
     return MovementProblem(
         times_s=node_times,
         controls=controls,

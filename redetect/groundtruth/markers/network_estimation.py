@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
@@ -21,7 +22,7 @@ from redetect.groundtruth.markers.adjustment import (
     adjust_bundle,
 )
 from redetect.groundtruth.markers.boards import FIRST, SECOND, WORLD, BoardsFile, BoardView
-from redetect.groundtruth.markers.pairs import chained_poses, spanning_tree
+from redetect.groundtruth.markers.pairs import chained_poses
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
@@ -99,7 +100,8 @@ def _estimated_offset(seen: _Seen) -> FloatArray:
     """`first_from_second`, from shots in which two cameras, or one, see both faces.
 
     With A_k the pose of the first face in one camera and B_k that of the second in another, both
-    fixed, (A_1^-1 A_k) X = X (B_1^-1 B_k): the hand-eye problem (Park & Martin 1994).
+    fixed, (A_1^-1 A_k) X = X (B_1^-1 B_k): the hand-eye problem. Of several pairs of cameras, that
+    with the most shots counts.
     """
     together: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for shot in seen:
@@ -109,29 +111,23 @@ def _estimated_offset(seen: _Seen) -> FloatArray:
                     if view_a.camera == view_b.camera:
                         return np.asarray(inverse(a) @ b)
                     together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
-    left, right = [], []
-    for pairs in together.values():
-        first_a, first_b = pairs[0]
-        left += [inverse(first_a) @ a for a, _ in pairs[1:]]
-        right += [inverse(first_b) @ b for _, b in pairs[1:]]
-    axes = np.array([log_se3(motion)[3:] for motion in left]).reshape(-1, 3)
-    if len(left) < 2 or np.linalg.svd(axes, compute_uv=False)[1] < 0.05:
+    pairs = np.array(max(together.values(), key=len, default=[])).reshape(-1, 2, 4, 4)
+    left, right = (inverse(poses[:1]) @ poses[1:] for poses in pairs.swapaxes(0, 1))
+    if len(left) < 2 or np.linalg.svd(log_se3(left)[:, 3:], compute_uv=False)[1] < 0.05:
         raise GroundTruthError(
             f"the offset of boards {FIRST} and {SECOND} cannot be estimated: "
             "expected 3 or more shots of two cameras with the boards turned about different axes"
         )
-    return hand_eye(np.stack(left), np.stack(right))
+    return hand_eye(left, right)
 
 
 def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
     """(4, 4) X with left_k X = X right_k in the sense of least squares (Park & Martin 1994)."""
-    a, b = log_se3(left)[:, 3:], log_se3(right)[:, 3:]
-    u, _, vt = np.linalg.svd(a.T @ b)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = Rotation.align_vectors(log_se3(left)[:, 3:], log_se3(right)[:, 3:])[0]
     matrix = np.concatenate(left[:, :3, :3] - np.eye(3))
-    vector = np.concatenate(right[:, :3, 3] @ rotation.T - left[:, :3, 3])
+    vector = np.concatenate(rotation.apply(right[:, :3, 3]) - left[:, :3, 3])
     translation = np.linalg.lstsq(matrix, vector, rcond=None)[0]
-    return transform(rotation, translation)
+    return transform(rotation.as_matrix(), translation)
 
 
 def _chained(
@@ -155,15 +151,15 @@ def _chained(
                     if a != b:
                         estimates.setdefault((a, b), []).append(a_from_body @ inverse(b_from_body))
     support = {pair: len(poses) for pair, poses in estimates.items()}
-    parents = spanning_tree(support, 1 + len(names), 0)
-    if min(parents) < 0:
+    central = {pair: _most_central(poses) for pair, poses in estimates.items()}
+    poses = chained_poses(central, support, 1 + len(names), 0)
+    lost = np.flatnonzero(np.isnan(poses[1:, 0, 0]))
+    if lost.size:
         raise GroundTruthError(
-            f"camera {names[parents.index(-1) - 1]} is not connected to the world: expected shots "
+            f"camera {names[lost[0]]} is not connected to the world: expected shots "
             "in which it sees a board of the world, or the double board together with a camera "
             "that is connected"
         )
-    central = {pair: _most_central(poses) for pair, poses in estimates.items()}
-    poses = chained_poses(central, parents, 0)
     bodies = {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
     return poses[1:], bodies
 

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.trajectories.transforms import (
@@ -106,41 +108,27 @@ def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     return PairConsensus(consensus, covariance, poses[best], distance < _AGREES, first)
 
 
-def spanning_tree(pairs: Mapping[tuple[int, int], int], count: int, root: int) -> list[int]:
-    """Parents of markers, or cameras, in the tree over the best supported pairs (Prim).
-
-    The root's parent is itself; those that are not connected have -1. `pairs` is each pair's
-    support.
-    """
-    parents = [-1] * count
-    parents[root] = root
-    while True:
-        reaching = [
-            (support, -inside, -outside)
-            for (a, b), support in pairs.items()
-            for inside, outside in ((a, b), (b, a))
-            if support > 0 and parents[inside] >= 0 > parents[outside]
-        ]
-        if not reaching:
-            return parents
-        _, inside, outside = max(reaching)
-        parents[-outside] = -inside
-
-
 def chained_poses(
-    relative: Mapping[tuple[int, int], FloatArray], parents: Sequence[int], root: int
+    relative: Mapping[tuple[int, int], FloatArray],
+    support: Mapping[tuple[int, int], int],
+    count: int,
+    root: int,
 ) -> FloatArray:
-    """(M, 4, 4) poses in the root's frame along a tree; `relative` are `a_from_b` of pairs a, b.
+    """(count, 4, 4) poses of markers, or cameras, in the root's frame; NaN where not connected.
 
-    All are connected.
+    Chained along the tree over the best supported pairs. `relative` are `a_from_b` of pairs a, b,
+    `support` how often each was seen.
     """
-
-    def placed(marker: int) -> FloatArray:
-        if marker == root:
-            return np.eye(4)
-        parent = parents[marker]
-        known = relative.get((parent, marker))
-        step = inverse(relative[marker, parent]) if known is None else known
-        return np.asarray(placed(parent) @ step)
-
-    return np.stack([placed(marker) for marker in range(len(parents))])
+    first, second = np.array(list(support), dtype=np.int64).reshape(-1, 2).T
+    weights = coo_array((-np.array(list(support.values()), float), (first, second)), (count, count))
+    # Of negative weights: the tree with the most support.
+    order, parents = breadth_first_order(minimum_spanning_tree(weights), root, directed=False)
+    poses = np.full((count, 4, 4), np.nan)
+    poses[root] = np.eye(4)
+    for number in order[1:].tolist():
+        parent = int(parents[number])
+        known = relative.get((parent, number))
+        poses[number] = poses[parent] @ (
+            inverse(relative[number, parent]) if known is None else known
+        )
+    return poses

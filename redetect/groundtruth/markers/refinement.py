@@ -36,6 +36,8 @@ from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
 _ROWS = 8
+# Normalised error of a view at which its weight begins to fall.
+_HUBER = 2.0
 # Steps (m, rad) that are as good as none, and the share of the cost that rounding may hide.
 _SMALLEST_STEP, _COST_TOLERANCE, _MOST_STEPS = 1e-10, 1e-15, 200
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
@@ -112,7 +114,7 @@ class _Corners(NamedTuple):
 def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
     """Go down from a start to the nearest minimum.
 
-    A marker's four corners are weighted together, by the settings' loss. `start` (4, 4) is a pose
+    A marker's four corners are weighted together, by Huber's loss. `start` (4, 4) is a pose
     `world_from_robot`. Raises `GeometryError` if a corner is behind its camera there, or the
     corners do not determine a pose.
     """
@@ -254,13 +256,8 @@ def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
 
 
 def _view_weights(problem: PoseProblem, here: _Corners) -> FloatArray:
-    loss = problem.settings.loss
-    if loss == "linear":
-        return np.ones(problem.views)
-    relative = _view_errors(problem, here) / problem.settings.loss_scale
-    if loss == "huber":
-        return np.asarray(1.0 / np.maximum(relative, 1.0))
-    return np.asarray(1.0 / (1.0 + relative**2))
+    """Huber's."""
+    return np.asarray(1.0 / np.maximum(_view_errors(problem, here) / _HUBER, 1.0))
 
 
 def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> ChainPoints:

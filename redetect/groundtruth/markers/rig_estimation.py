@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers.adjustment import (
     AdjustedBundle,
@@ -28,7 +28,6 @@ from redetect.groundtruth.markers.pairs import (
     chained_poses,
     pair_consensus,
     pair_estimates,
-    spanning_tree,
 )
 from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
@@ -111,18 +110,17 @@ def estimate_rig(
             "expected images that show two or more markers of the rig"
         )
     root = _root(ids, support, reference)
-    parents = spanning_tree(support, len(ids), root)
-    kept = [i for i in range(len(ids)) if parents[i] >= 0]
-    left_out = _reasons(ids, parents, seen, settings)
-    renumbered = {old: new for new, old in enumerate(kept)}
-    tree = [renumbered[parents[i]] for i in kept]
+    relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
+    start = chained_poses(relative, support, len(ids), root)
+    kept = np.flatnonzero(np.isfinite(start[:, 0, 0]))
+    start = start[kept]
+    left_out = _reasons(ids, kept, seen, settings)
+    renumbered = {old: new for new, old in enumerate(kept.tolist())}
     pairs = {
         (renumbered[a], renumbered[b]): c
         for (a, b), c in pairs.items()
         if a in renumbered and b in renumbered
     }
-    relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
-    start = chained_poses(relative, tree, renumbered[root])
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionaries[0], kept_ids, width_m)
     priors: tuple[PosePrior, ...] = ()
@@ -181,7 +179,7 @@ def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) ->
         rig,  # with identities: the marker itself is the body
         chain_points([view], rig, settings.corner_floor_px),
         np.zeros(4, dtype=np.int64),
-        PoseSettings(loss="linear"),
+        PoseSettings(),
     )
     found = []
     for start in view_poses(problem, 0):
@@ -229,14 +227,14 @@ def _root(
 
 def _reasons(
     ids: tuple[int, ...],
-    parents: Sequence[int],
+    kept: IntArray,
     seen: Sequence[Sequence[View]],
     settings: RigSettings,
 ) -> dict[int, str]:
     reasons = {}
     for index, marker in enumerate(ids):
         alone = sum(any(v.rig_index == index for v in views) for views in seen)
-        if parents[index] < 0:
+        if index not in kept:
             reasons[marker] = (
                 f"seen at {alone} times, but not {settings.least_support} times in agreement with "
                 "a marker of the rig"

@@ -196,6 +196,7 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
 _JUMP_COST = 20.0
 _REJECT_COST = 15.0
 _MOST_LEFT_OUT = 3
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -216,12 +217,14 @@ def choose_candidates(
     if not estimates:
         return []
     frame = np.repeat(np.arange(len(estimates)), [len(e.candidates) for e in estimates])
-    begins = np.searchsorted(frame, np.arange(len(estimates)))
-    through, without = _cheapest_paths(_steps(times_s, estimates, frame, settings), frame, begins)
+    through = _cheapest_paths(_steps(times_s, estimates, frame, settings), frame)
+    cheapest = min(float(through.min()), _REJECT_COST * len(estimates))
     choices = []
-    for estimate, costs, left_out in zip(estimates, np.split(through, begins[1:]), without):
-        if left_out < costs.min():
-            choices.append(Choice(None, "rejected", float(costs.min() - left_out)))
+    for number, estimate in enumerate(estimates):
+        costs = through[frame == number]
+        # The cheapest sequence leaves the frame out.
+        if cheapest < costs.min() - _ROUNDING:
+            choices.append(Choice(None, "rejected", float(costs.min() - cheapest)))
             continue
         total = costs + np.array(estimate.log_odds)
         order = np.argsort(total, kind="stable")
@@ -260,29 +263,14 @@ def _steps(
     return list(zip(first.tolist(), second.tolist(), costs.tolist()))
 
 
-def _cheapest_paths(
-    steps: Sequence[_Step], frame: IntArray, begins: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Cost of the cheapest sequence through each candidate (K,), and without each frame (N,).
-
-    `frame` (K,) is each candidate's frame, `begins` (N,) each frame's first candidate.
-    """
-    count = len(begins)
-    ahead, back = _REJECT_COST * frame, _REJECT_COST * (count - 1 - frame)
+def _cheapest_paths(steps: Sequence[_Step], frame: IntArray) -> FloatArray:
+    """(K,) cost of the cheapest sequence through each candidate; `frame` (K,) is that of each."""
+    ahead, back = _REJECT_COST * frame, _REJECT_COST * (frame[-1] - frame)
     for a, b, cost in steps:
         ahead[b] = min(ahead[b], ahead[a] + cost)
     for a, b, cost in reversed(steps):
         back[a] = min(back[a], back[b] + cost)
-    without = np.full(count, _REJECT_COST * count)
-    left_out = _REJECT_COST * np.arange(1, count)
-    # The sequence ends before the frame, begins after it, or leads past it.
-    before, after = (np.minimum.reduceat(costs, begins) for costs in (ahead, back))
-    without[1:] = np.minimum(without[1:], before[:-1] + left_out[::-1])
-    without[:-1] = np.minimum(without[:-1], after[1:] + left_out)
-    for a, b, cost in steps:
-        past = slice(frame[a] + 1, frame[b])
-        without[past] = np.minimum(without[past], ahead[a] + cost + back[b])
-    return ahead + back, without
+    return np.asarray(ahead + back)
 
 
 def _motion_costs(

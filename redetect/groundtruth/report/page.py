@@ -248,10 +248,9 @@ def _errors(inputs: Inputs) -> list[Part]:
             "so that it scatters more than the number of poses suggests.",
         )
     )
-    words = "Each point is the largest error in its stretch of time; pauses are cut out."
     return [
         *content,
-        series_figure(f"Position error over time. {words}", "mm", place, inputs.visits),
+        series_figure("Position error over time in each visit.", "mm", place, inputs.visits),
         series_figure("Heading error over time, without sign.", "deg", turn, inputs.visits),
     ]
 

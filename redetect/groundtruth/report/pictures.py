@@ -31,10 +31,7 @@ if TYPE_CHECKING:
 _WIDE_IN, _TALLEST_IN, _SERIES_HIGH_IN = 7.9, 7.9, 2.9
 _MOST_POINTS, _MOST_STAGE_POINTS = 1500, 400
 _BREAK_S = 1.0
-# Stretches of time of which the largest value is drawn, over all visits.
-_BINS = 340
-# Pauses between visits, as a share of all time that is shown.
-_PAUSE = 0.02
+_MOST_VISITS = 12
 
 
 class Track(NamedTuple):
@@ -72,20 +69,35 @@ def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Par
 def series_figure(
     words: str, unit: str, series: Sequence[Series], visits: Sequence[tuple[float, float]]
 ) -> Part:
-    """Values on a logarithmic scale over the visits' times, the pauses between them cut out."""
+    """Values on a logarithmic scale over time, each of the longest visits beside the others."""
+    positive = np.concatenate([s.values[s.values > 0.0] for s in series] or [np.zeros(0)])
+    if not (len(positive) and visits):
+        return Part("note", f"{words} There is nothing to show.")
+    longest = sorted(sorted(visits, key=lambda visit: visit[0] - visit[1])[:_MOST_VISITS])
+    spans = [max(last - first, 1e-3) for first, last in longest]
     with figure_file((_WIDE_IN, _SERIES_HIGH_IN), "svg") as (figure, content):
-        axes = figure.subplots()
-        positive = np.concatenate([s.values[s.values > 0.0] for s in series] or [np.zeros(0)])
-        if len(positive) and visits:
-            _draw_series(axes, series, visits)
-            least = 10.0 ** math.floor(math.log10(max(float(np.quantile(positive, 0.05)), 1e-9)))
-            axes.set_yscale("log")
-            axes.set_ylim(least, max(1.3 * float(positive.max()), 10.0 * least))
-            axes.legend(loc="upper right", ncols=4, fontsize=8)
-        else:
-            axes.text(0.5, 0.5, "nothing to show", ha="center", transform=axes.transAxes)
-        axes.set_ylabel(unit)
-        axes.grid(axis="y", alpha=0.25, lw=0.6)
+        grid = figure.subplots(1, len(spans), sharey=True, squeeze=False, width_ratios=spans)
+        for axes, (first, last), span in zip(grid[0], longest, spans):
+            for s in series:
+                inside = (s.times_s >= first) & (s.times_s <= last)
+                times, values = s.times_s[inside] - first, s.values[inside]
+                breaks = np.flatnonzero(np.diff(times) > _BREAK_S) + 1
+                axes.plot(
+                    np.insert(times, breaks, np.nan), np.insert(values, breaks, np.nan),
+                    color=s.colour, lw=1.1, dashes=s.dashes, label=s.label,
+                )  # fmt: skip
+            axes.set(xlim=(0.0, span), yscale="log")
+            axes.grid(axis="y", alpha=0.25, lw=0.6)
+            if span > 0.08 * sum(spans):
+                axes.set_xlabel(
+                    f"visit {visits.index((first, last)) + 1}: {span:.0f} s", fontsize=8
+                )
+            else:
+                axes.set_xticks([])
+        least = 10.0 ** math.floor(math.log10(max(float(np.quantile(positive, 0.05)), 1e-9)))
+        grid[0, 0].set_ylim(least, max(1.3 * float(positive.max()), 10.0 * least))
+        grid[0, 0].set_ylabel(unit)
+        grid[0, -1].legend(loc="upper right", ncols=4, fontsize=8)
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE_IN, 96.0 * _SERIES_HIGH_IN)
 
 
@@ -103,42 +115,6 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     outlines = np.einsum("nij,pj->npi", vectors * (factor * axes)[:, None, :], circle)
     return poses.poses[chosen, None, :2] + outlines, factor
-
-
-def largest_per_bin(
-    times: FloatArray, values: FloatArray, span: float, bins: int
-) -> tuple[FloatArray, FloatArray]:
-    """The largest value of each bin of time, and its time."""
-    if len(times) <= bins:
-        return times, values
-    bin_of = np.minimum((times / span * bins).astype(np.int64), bins - 1)
-    order = np.lexsort((-values, bin_of))
-    _, first = np.unique(bin_of[order], return_index=True)
-    return times[order[first]], values[order[first]]
-
-
-def _draw_series(
-    axes: Axes, series: Sequence[Series], visits: Sequence[tuple[float, float]]
-) -> None:
-    spans = np.array([max(b - a, 1e-3) for a, b in visits])
-    total = float(spans.sum())
-    begins = np.concatenate([[0.0], np.cumsum(spans + min(_PAUSE, 0.3 / len(visits)) * total)[:-1]])
-    ticks = []
-    for number, ((first, last), span, begin) in enumerate(zip(visits, spans, begins), 1):
-        axes.axvline(begin, color="0.6", lw=0.8)
-        if span > 0.08 * total:
-            ticks.append((begin + 0.5 * span, f"visit {number}: {span:.0f} s"))
-        bins = max(int(_BINS * span / total), 2)
-        for s in series:
-            inside = (s.times_s >= first) & (s.times_s <= last)
-            times, values = largest_per_bin(s.times_s[inside] - first, s.values[inside], span, bins)
-            breaks = np.flatnonzero(np.diff(times) > max(3.0 * span / bins, _BREAK_S)) + 1
-            axes.plot(
-                begin + np.insert(times, breaks, np.nan), np.insert(values, breaks, np.nan),
-                color=s.colour, lw=1.1, dashes=s.dashes, label=s.label if number == 1 else None,
-            )  # fmt: skip
-    axes.set_xlim(0.0, begins[-1] + spans[-1])
-    axes.set_xticks([at for at, _ in ticks], [words for _, words in ticks], fontsize=8)
 
 
 def _bounds(tracks: Sequence[Track], building: FloatArray | None) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from detect.cli import main
-from detect.export import FRAME_ID, message_definitions, topic_of
+from detect.ros_messages import TOPICS
 from redetect.landmarks import read_frames, read_tilts
 from redetect.landmarks.columns import TABLES, TableName, values_of
 
@@ -125,35 +125,75 @@ def test_parquet_has_the_files_numbers_and_units(file: Path) -> None:
         assert read.schema.metadata[b"source"].decode() == file.name
 
 
-@pytest.mark.lowest
-def test_mcap_has_the_files_numbers(file: Path) -> None:
-    pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
+def messages(path: Path) -> list[tuple[str, float, Any]]:
+    """Topic, time (s) and message of all in a recording."""
     from rosbags.highlevel import AnyReader
 
+    with AnyReader([path]) as bag:
+        return [
+            (c.topic, time_ns * 1e-9, bag.deserialize(content, c.msgtype))
+            for c, time_ns, content in bag.messages()
+        ]
+
+
+@pytest.mark.lowest
+def test_mcap_has_standard_messages_of_each_frame(file: Path) -> None:
+    pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
     assert main(["export", str(file), "--to", "mcap", "--rate-hz", "4"]) == 0
-    expected = expected_rows(file)
-    found: dict[str, list[tuple[Any, ...]]] = {table: [] for table in expected}
-    with AnyReader([file.with_name(f"{file.name}.mcap")]) as bag:
-        assert {c.topic for c in bag.connections} == {topic_of(table) for table in expected}
-        for connection, time_ns, content in bag.messages():
-            message: Any = bag.deserialize(content, connection.msgtype)
-            table = connection.topic.rpartition("/")[2]
-            stamp = message.header.stamp
-            assert stamp.sec + 1e-9 * stamp.nanosec == message.frame / 4 == time_ns * 1e-9
-            assert message.header.frame_id == FRAME_ID
-            names = [column.name for column in TABLES[table][3:]]  # type: ignore[index]
-            for row in getattr(message, table):
-                values = [getattr(row, name) for name in names]
-                values = [tuple(v.tolist()) if hasattr(v, "tolist") else v for v in values]
-                found[table].append((message.frame, message.image, *values))
-    assert found == expected
+    found = messages(file.with_name(f"{file.name}.mcap"))
+    rows = expected_rows(file)
+    standard = get_typestore(Stores.ROS2_HUMBLE).types
+    for topic, time_s, message in found:
+        (type_name,) = (types[topic] for types in TOPICS.values() if topic in types)
+        assert message.__msgtype__ == type_name
+        assert type_name in standard
+        if hasattr(message, "header"):
+            assert message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec == time_s
+    for table, of_table in rows.items():
+        topic = "/tf" if table == "steps" else f"/redetect/{table}"
+        if table in ("circles", "lines", "tilts"):
+            topic += "/poses"
+        assert [t for name, t, _ in found if name == topic] == [row[0] / 4 for row in of_table]
 
 
-def test_definitions_are_made_of_the_columns() -> None:
-    """The notation of ROS, with the units: as the documentation shows it."""
-    circle = message_definitions("circles")["redetect_msgs/msg/Circle"].splitlines()
-    assert circle[0].startswith("float64 px_m  # m: ")
-    assert circle[-1].startswith("int64[] ids  # ")
+def test_messages_are_in_the_axes_of_ros(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
+    from scipy.spatial.transform import Rotation
+
+    def turn(q: Any) -> Any:
+        return Rotation.from_quat([q.x, q.y, q.z, q.w]).as_rotvec()
+
+    by_topic: dict[str, list[Any]] = {}
+    for kind, text in FILES.items():
+        path = tmp_path / f"x.{kind}"
+        path.write_text(text)
+        assert main(["export", str(path), "--to", "mcap", "--rate-hz", "4"]) == 0
+        for topic, _, message in messages(path.with_name(f"{path.name}.mcap")):
+            by_topic.setdefault(topic, []).append(message)
+
+    disc = by_topic["/redetect/circles/poses"][0]
+    assert disc.header.frame_id == "base_link"
+    assert (disc.pose.pose.position.x, disc.pose.pose.position.y) == (1.20003, 0.1)
+    assert disc.pose.covariance[[0, 1, 6, 7]] == pytest.approx([0.00161, 1e-7, 1e-7, 0.0016])
+    shapes = by_topic["/redetect/circles"]
+    assert [len(array.markers) for array in shapes] == [3, 1, 2]  # The first one clears
+    assert shapes[0].markers[1].text == "4 7"
+    assert shapes[0].markers[1].pose == disc.pose.pose
+    vertical = by_topic["/redetect/lines/poses"][0].pose
+    assert turn(vertical.pose.orientation) == pytest.approx([0.0, 0.0, 0.333333])
+    assert vertical.covariance[35] == pytest.approx(0.0013**2)
+    tilt = by_topic["/redetect/tilts/poses"][0].pose
+    assert turn(tilt.pose.orientation) == pytest.approx([0.010553, 0.036596, 0.0])
+    assert tilt.covariance[[21, 22, 28]] == pytest.approx([3e-6, 2e-8, 1e-6])
+    (square,) = by_topic["/redetect/markers"]
+    assert (square.ns, square.id) == ("rawseeds", 12)
+    assert [(p.x, p.y) for p in square.points] == [(10.5, 20.25), (30.1, 20), (30, 40.2), (10, 40)]
+    # The first file's: 0.25 m forward and 1.25 mm to the left, then 1 mm to the left, turned.
+    places = [message.transforms[0].transform.translation for message in by_topic["/tf"][:3]]
+    assert (places[0].x, places[0].y) == pytest.approx((0.25, 0.00125))
+    assert (places[2].x, places[2].y) == pytest.approx((0.25 - 1e-5, 0.00225), abs=1e-7)
 
 
 def test_times_stand_beside_the_rows(tmp_path: Path) -> None:

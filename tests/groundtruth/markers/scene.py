@@ -28,8 +28,7 @@ COEF = (-0.02, -0.08, 0.1, 0.1, 0.0)
 NO_MOUNTING = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
-#: Of the poses, without a robust loss.
-LEAST_SQUARES = PoseSettings(loss="linear")
+SETTINGS = PoseSettings()
 
 
 def lens(scale_px: float = 900.0, coef: tuple[float, ...] = COEF) -> Camera:
@@ -139,7 +138,7 @@ def pose_problem(
     noise: np.random.Generator | None = None,
     camera_covariance: FloatArray | None = None,
     marker_covariance: FloatArray | None = None,
-    settings: PoseSettings = LEAST_SQUARES,
+    settings: PoseSettings = SETTINGS,
     rig: Rig | None = None,
     scale_px: float = 900.0,
 ) -> PoseProblem:

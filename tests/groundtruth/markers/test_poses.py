@@ -155,7 +155,7 @@ def test_nothing_seen_is_no_pose() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("loss_scale", 0.0), ("outlier_px", -1.0), ("speed_m_s", float("nan")), ("ambiguity_odds", 1)],
+    [("outlier_px", -1.0), ("speed_m_s", float("nan")), ("ambiguity_odds", 1)],
 )
 def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
     with pytest.raises(GroundTruthError, match=name):

@@ -12,9 +12,9 @@ from scipy.stats import chi2
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
+    chained_poses,
     pair_consensus,
     pair_estimates,
-    spanning_tree,
 )
 from redetect.groundtruth.markers.rig_estimation import (
     RigEstimate,
@@ -327,7 +327,12 @@ def test_several_measured_markers_define_the_frame_together() -> None:
 
 def test_the_tree_prefers_support() -> None:
     pairs = {(0, 1): 5, (0, 2): 50, (1, 2): 40, (3, 4): 9}
-    assert spanning_tree(pairs, 5, 0) == [0, 2, 0, -1, -1]
+    poses = exp_se3(np.random.default_rng(4).normal(size=(3, 6)))
+    relative = {(a, b): inverse(poses[a]) @ poses[b] for a, b in ((0, 2), (1, 2))}
+    relative |= {(0, 1): np.eye(4), (3, 4): np.eye(4)}
+    found = chained_poses(relative, pairs, 5, 0)
+    np.testing.assert_allclose(found[:3], inverse(poses[0]) @ poses, atol=1e-12)
+    assert np.all(np.isnan(found[3:]))
 
 
 def test_the_mean_of_poses_weights_by_covariance() -> None:

@@ -20,7 +20,6 @@ from redetect.groundtruth.report.pictures import (
     Track,
     ellipse_figure,
     ellipses,
-    largest_per_bin,
     map_figure,
     series_figure,
 )
@@ -304,7 +303,8 @@ def test_streams_of_other_times_and_many_visits_are_survived(session: Path) -> N
     inputs = gather(session)
     assert len(inputs.visits) == 400
     series = Series("a", "red", (), times, np.ones(1200))
-    assert "nothing to show" not in drawn(series_figure("s", "mm", [series], inputs.visits))
+    assert "visit " in drawn(series_figure("s", "mm", [series], inputs.visits))
+    assert "nothing to show" in series_figure("s", "mm", [], inputs.visits).words
     assert "400 visits" in Page(report_page(inputs, "1")).text
 
 
@@ -342,17 +342,6 @@ def test_ellipses_are_three_sigma() -> None:
     assert np.abs(apart[:, 0]).max() == pytest.approx(0.009 * factor, rel=0.01)
     part = ellipse_figure(Track("a", "red", (), small), None, 2)
     assert "times as large" in part.words
-
-
-def test_the_worst_of_each_stretch_is_drawn() -> None:
-    times = np.linspace(0.0, 100.0, 20_001)
-    values = np.ones_like(times)
-    values[7777] = 100.0
-    at, largest = largest_per_bin(times, values, 100.0, 50)
-    assert len(at) == 50
-    assert largest.max() == 100.0
-    assert at[np.argmax(largest)] == times[7777]
-    assert "nothing to show" in drawn(series_figure("s", "mm", [], [(0.0, 1.0)]))
 
 
 @pytest.mark.parametrize(("nees", "marked"), [(1.05, False), (2.5, True)])
