@@ -57,8 +57,8 @@ def choose_lens(
     fitted = partial(_fitted, points, settings, radius_m)
     rational = [lens for lens in settings.lenses if not lens.polynomial]
     polynomials = [lens for lens in settings.lenses if lens.polynomial]
-    chosen, tried = _with_tangential(fitted, start, fitted(start, rational))
-    if not polynomials:
+    chosen, tried = _with_tangential(fitted, start, fitted(start, rational or polynomials))
+    if not (rational and polynomials):
         return chosen, tried
     others = fitted(start, [lens._replace(tangential=chosen.tangential) for lens in polynomials])
     other = _fewest_needed(others)

@@ -193,19 +193,18 @@ def test_a_polynomial_instead_of_the_rational_function_comes_back() -> None:
         polynomial=(-0.28340811, 0.07395907, 0.0),
     )  # fmt: skip
     views = seen_views(euroc, 9, 0.1, seed=3)
-    polynomials = FreeLens(0, polynomial=2), FreeLens(0, polynomial=3)
-    lenses = (FreeLens(0), FreeLens(1), FreeLens(2), *polynomials)  # a3 is k1
+    lenses = tuple(FreeLens(0, polynomial=count) for count in (1, 2, 3))
     result = calibrate(views, BOARD, (752, 480), CalibrationSettings(lenses=lenses))
     # k3 is 0, and one coefficient is seen through.
     assert result.lens == FreeLens(0, False, 2)
     assert str(result.lens) == "k1 k2"
-    assert result.holdout_px[FreeLens(1)] > 1.2 * result.holdout_px[result.lens]
+    assert result.holdout_px[FreeLens(0, False, 1)] > 1.2 * result.holdout_px[result.lens]
     assert result.intrinsics[4:11].tolist() == [0.0] * 7
     sigma = np.sqrt(np.diag(result.adjusted.covariance)[11:13])
     assert np.all(sigma > 0.0)
     assert np.all(np.abs(result.intrinsics[11:13] - euroc.polynomial[:2]) < 4.0 * sigma)
     found = with_intrinsics(euroc, result.intrinsics)
-    assert projection_difference(euroc, found).max() < 0.7
+    assert projection_difference(euroc, found).max() < 0.5
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
 from camera.calibration.images import read_grey
-from camera.calibration.model import CalibrationSettings, FreeLens
+from camera.calibration.model import LENSES, CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from camera.uncertainty import (
     intrinsics_of,
@@ -181,12 +181,14 @@ def compare(
     group: str,
     *,
     free_aspect: bool,
+    polynomial: bool = False,
     peers: Sequence[str] = tuple(OPENCV),
     every: int = 1,
 ) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
-    settings = CalibrationSettings(None if free_aspect else 1.0, robust=False)
+    lenses = tuple(FreeLens(0, polynomial=count) for count in (1, 2, 3)) if polynomial else LENSES
+    settings = CalibrationSettings(None if free_aspect else 1.0, lenses, robust=False)
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
     points, lens = result.points, result.lens
@@ -252,6 +254,7 @@ class CameraPhotographs:
     folder: Positional[Path]  # Folder of photographs with truth.
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras: the names' beginnings.
     free_aspect: bool = True  # Both scales free, as OpenCV has them; else equal.
+    polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
 
     def __call__(self) -> int:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
@@ -261,7 +264,9 @@ class CameraPhotographs:
              "free here": "<"}
         )  # fmt: skip
         for group in self.groups:
-            r = compare(self.folder, group, free_aspect=self.free_aspect)
+            r = compare(
+                self.folder, group, free_aspect=self.free_aspect, polynomial=self.polynomial
+            )
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
         return 0
