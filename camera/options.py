@@ -49,6 +49,21 @@ class Calibrate(BoardFlags):
     images: Positional[tuple[Path, ...]]  #: Photographs, folders of them, or a video.
     #: Pictures are half-height: every second line of square pixels, as the data set's.
     half: bool = False
+    #: Horizontal and vertical scale are independent of each other, unless the pictures leave their
+    #: ratio open. --no-free-aspect: pixels are square (with --half, twice as high as wide).
+    free_aspect: bool = True
+    #: Number of free radial distortion coefficients, 0 to 5; `auto`: as many as make the error in
+    #: pictures that were held out smaller.
+    coefficients: Literal["auto", "0", "1", "2", "3", "4", "5"] = "auto"
+    #: Whether the tangential terms p1 and p2 of a decentred lens are free: `on`, `off`, or `auto`:
+    #: if they make that error smaller and are more than noise.
+    tangential: Literal["auto", "on", "off"] = "auto"
+    #: Whether the radial distortion is OpenCV's polynomial k1 k2 k3 instead of the rational
+    #: function: `on` (then --coefficients are 0 to 3), `off`, or `auto`: if fewer coefficients do
+    #: as well then in pictures that were held out, or their error is much smaller.
+    polynomial: Literal["auto", "on", "off"] = "auto"
+    #: Keep pictures whose residuals are far above the others'.
+    keep_outliers: bool = False
     #: Use at most this many pictures, and at most this many frames per video, evenly spaced.
     max_images: int = 60
     #: Folder for pictures to check by: the corners found and projected in each photograph.

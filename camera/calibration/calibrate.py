@@ -170,7 +170,7 @@ def calibrate(
     try:
         # With the fullest model: residuals of a simpler one are partly its own.
         consensus = find_consensus(measured, names, settings, radius)
-        kept = consensus.agree
+        kept = np.isfinite(consensus.rms_px) if settings.keep_outliers else consensus.agree
         outliers = tuple((names[v], float(consensus.rms_px[v])) for v in np.flatnonzero(~kept))
         demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)

@@ -55,27 +55,42 @@ def choose_lens(
     terms is then tested as well.
     """
     fitted = partial(_fitted, points, settings, radius_m)
-    rational = [lens for lens in settings.lenses if not lens.polynomial]
-    polynomials = [lens for lens in settings.lenses if lens.polynomial]
-    chosen, tried = _with_tangential(fitted, start, fitted(start, rational or polynomials))
-    if not (rational and polynomials):
+    chosen, tried = _chosen_of_a_kind(fitted, start, settings)
+    if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
-    others = fitted(start, [lens._replace(tangential=chosen.tangential) for lens in polynomials])
-    other = _fewest_needed(others)
+    counts = (2, 3)  # one coefficient, a3, is k1
+    others = [FreeLens(0, chosen.tangential, count) for count in counts]
+    polynomials = fitted(start, others)
+    other = _fewest_needed(polynomials)
     # Coefficients that the pictures do not need make the projection unsure where nothing was seen.
     worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
-    if _is_lower(others[other], tried[chosen], worth):
+    if _is_lower(polynomials[other], tried[chosen], worth):
         chosen = other
         if not chosen.tangential:
-            chosen, others = _with_tangential(fitted, start, others)
-    return chosen, tried | others
+            chosen, polynomials = _with_tangential(fitted, start, settings, polynomials)
+    return chosen, tried | polynomials
+
+
+def _chosen_of_a_kind(
+    fitted: Fitted, start: Estimate, settings: CalibrationSettings
+) -> tuple[FreeLens, Candidates]:
+    """`choose_lens` among rational functions, or polynomials."""
+    counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
+    if settings.tangential is True:
+        decentred = [settings.lens(count, tangential=True) for count in counts]
+        tried = fitted(start, decentred)
+        return _fewest_needed(tried), tried
+    tried = fitted(start, [settings.lens(count) for count in counts])
+    return _with_tangential(fitted, start, settings, tried)
 
 
 def _with_tangential(
-    fitted: Fitted, start: Estimate, radial: Candidates
+    fitted: Fitted, start: Estimate, settings: CalibrationSettings, radial: Candidates
 ) -> tuple[FreeLens, Candidates]:
     """Choose among radial lenses, and tangential terms where they are worth it."""
     chosen = _fewest_needed(radial)
+    if settings.tangential is False:
+        return chosen, radial
     beside = chosen._replace(tangential=True)
     tried = radial | fitted(radial[chosen].adjusted.estimate, [beside])
     if not _is_worth_it(tried[chosen], tried[beside]):

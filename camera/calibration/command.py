@@ -17,6 +17,7 @@ from camera.calibration.calibrate import (
     BoardView,
     Calibration,
     aspect_of,
+    calibrate,
     calibrate_freely,
 )
 from camera.calibration.consensus import view_rms
@@ -39,6 +40,7 @@ _RIGHT = {
     "checkerboard": "--rows right? A board of 10 x 7 squares has 9 x 6 inner corners",
     "charuco": "--rows right, and the --dictionary?",
 }
+_WHETHER = {"auto": None, "on": True, "off": False}
 
 
 def perform(options: Calibrate) -> int:
@@ -53,7 +55,13 @@ def perform(options: Calibrate) -> int:
     for path in (output, report, *names.values()):
         demand_place(path, overwrite=options.force)
     board = board_of(options)
-    settings = CalibrationSettings(aspect=0.5 if options.half else 1.0)
+    settings = CalibrationSettings(
+        aspect=0.5 if options.half else 1.0,
+        coefficients=None if options.coefficients == "auto" else int(options.coefficients),
+        tangential=_WHETHER[options.tangential],
+        polynomial=_WHETHER[options.polynomial],
+        keep_outliers=options.keep_outliers,
+    )
 
     def images() -> Iterator[tuple[str, GreyImage]]:
         return calibration_images(options.images, options.max_images)
@@ -61,7 +69,8 @@ def perform(options: Calibrate) -> int:
     if board.kind == "checkerboard":
         board = true_board(images(), board)
     views, size = find_views(images(), board)
-    calibration = calibrate_freely(views, board, size, settings)
+    calibrated = calibrate_freely if options.free_aspect else calibrate
+    calibration = calibrated(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
 
@@ -195,7 +204,7 @@ def camera_of(calibration: Calibration) -> Camera:
     except CameraError as error:
         raise CalibrationError(
             f"the calibration is no possible camera: {error}; take pictures out to the image's "
-            "corners"
+            "corners, or fewer --coefficients"
         ) from None
 
 
@@ -225,7 +234,7 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     )
     for name, rms in calibration.outliers:
         lines.append(
-            f"left out: {name}, residuals of {rms:.2f} px"
+            f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)"
             if np.isfinite(rms)
             else f"left out: {name}, where no pose of the board is seen as it was found"
         )

@@ -72,23 +72,25 @@ def find_consensus(
     if used.any():
         used &= errors <= _FAR_AT_FIRST * np.median(errors[used])
     _demand_most(used, names)
-    for lens in (FreeLens(1), FreeLens(2)):
-        found = fitted(estimate, used, lens)
-        estimate = best_poses(found.estimate, points)
-    most = max(settings.lenses)
-    for count in range(2, most.coefficients + 1):
-        found = fitted(estimate, used, FreeLens(count))
+    few = min(2, settings.most)
+    for count in (1, few):
+        fit = fitted(estimate, used, settings.lens(count))
+        estimate = best_poses(fit.estimate, points)
+    for count in range(few, settings.most + 1):
+        found = fitted(estimate, used, settings.lens(count))
         estimate = found.estimate
     # Checked before terms are fitted that such views do not determine.
     demand_different_views(found.fit)
-    lens = most._replace(tangential=True)
-    found = fitted(estimate, used, lens)
+    lens = settings.lens(settings.most, tangential=settings.tangential is not False)
+    if lens.tangential:
+        found = fitted(estimate, used, lens)
     for _ in range(_ROUNDS):
         if np.array_equal(found.agree, used):
             break
         used = found.agree
         found = fitted(found.estimate, used, lens)
-    _demand_most(found.agree, names)
+    if not settings.keep_outliers:
+        _demand_most(found.agree, names)
     return found
 
 

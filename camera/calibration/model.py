@@ -21,8 +21,10 @@ from camera.distortion import (
     one_to_one_radius,
     radial_factor,
 )
+from camera.errors import CalibrationError
 from camera.model_checks import border_pixels
 from redetect.array_types import FloatArray
+from redetect.storage.bounds import ABOVE_0, demand, whole
 
 #: Names of the intrinsics, in order.
 INTRINSICS = (
@@ -174,22 +176,37 @@ class FreeLens(NamedTuple):
         return " ".join(names) or "none"
 
 
-#: Those that a calibration chooses from: the rational function, and OpenCV's polynomial, of which
-#: one coefficient, k1, is a3.
-LENSES = (
-    *(FreeLens(count) for count in range(len(FREE_COEFFICIENTS))),
-    FreeLens(0, polynomial=2),
-    FreeLens(0, polynomial=3),
-)
-
-
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How to calibrate."""
+    """How to calibrate: what is None is chosen, as by the flags (`camera.options.Calibrate`)."""
 
     #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
     #: are free
     aspect: float | None = 1.0
-    #: Radial lenses to choose from; whether tangential terms are free is found out in any case
-    lenses: tuple[FreeLens, ...] = LENSES
+    #: Number of free radial coefficients: 0 to 5 of the rational function, 0 to 3 of a polynomial
+    coefficients: int | None = None
+    tangential: bool | None = None  #: Whether the tangential terms p1 and p2 are free
+    polynomial: bool | None = None  #: Whether the radial distortion is the polynomial k1, k2, k3
     robust: bool = True  #: Huber's loss; points found wrongly pull less
+    keep_outliers: bool = False
+
+    def __post_init__(self) -> None:
+        if self.aspect is not None:
+            demand(self, CalibrationError, aspect=ABOVE_0)
+        if self.coefficients is not None:
+            demand(self, CalibrationError, coefficients=whole(0, self._all))
+
+    @property
+    def _all(self) -> int:
+        return len(POLYNOMIAL) if self.polynomial else len(FREE_COEFFICIENTS) - 1
+
+    @property
+    def most(self) -> int:
+        """The largest number of radial coefficients that may be free."""
+        return self._all if self.coefficients is None else self.coefficients
+
+    def lens(self, count: int, *, tangential: bool = False) -> FreeLens:
+        """The lens with `count` free radial coefficients."""
+        if self.polynomial:
+            return FreeLens(0, tangential, count)
+        return FreeLens(count, tangential)

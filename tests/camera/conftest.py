@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,6 @@ import pytest
 
 from camera import Camera
 from camera.boards.board import Board
-from camera.calibration import command
-from camera.calibration.model import CalibrationSettings, FreeLens
 from tools.evaluation.boards import Rays, board_poses, rays_of, render_board
 
 BOARD = Board("checkerboard", 9, 6, 0.04)
@@ -36,10 +33,3 @@ def photographs(rays: Rays, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i, (R, t) in enumerate(poses):
         cv2.imwrite(str(folder / f"{i:02d}.png"), render_board(rays, BOARD, R, t, seed=i))
     return folder
-
-
-@pytest.fixture
-def few_lenses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`camera calibrate` has one lens to choose, for speed."""
-    settings = partial(CalibrationSettings, lenses=(FreeLens(2),))
-    monkeypatch.setattr(command, "CalibrationSettings", settings)

@@ -11,7 +11,7 @@ import pytest
 from camera.calibration.calibrate import BoardView, Calibration, aspect_of, calibrate_freely
 from camera.calibration.command import true_board
 from camera.calibration.images import calibration_images
-from camera.calibration.model import CalibrationSettings, FreeLens
+from camera.calibration.model import CalibrationSettings
 from tests.camera.conftest import BOARD, CAMERA
 from tools.evaluation.boards import board_poses
 
@@ -26,7 +26,7 @@ def calibrated(aspect: float, views: int, seed: int, noise_px: float = 0.1) -> C
         pixels = camera.project(BOARD.points @ R.T + t)
         noise = noise_px * rng.standard_normal(pixels.shape)
         seen.append(BoardView(f"{number}", np.arange(len(pixels)), pixels + noise))
-    settings = CalibrationSettings(lenses=(FreeLens(2),))
+    settings = CalibrationSettings(coefficients=2, tangential=False, polynomial=False)
     return calibrate_freely(seen, BOARD, (320, 240), settings)
 
 

@@ -45,20 +45,24 @@ RATIONAL = {
 
 
 @pytest.mark.parametrize(
-    ("errors", "chosen"),
+    ("errors", "tangential", "chosen"),
     [
         # Five rational coefficients explain the pictures as well, and are 52 px off beside them.
-        (DEPTH_CAMERA, FreeLens(0, True, 3)),
+        (DEPTH_CAMERA, None, FreeLens(0, True, 3)),
+        (DEPTH_CAMERA, True, FreeLens(0, True, 3)),
+        (DEPTH_CAMERA, False, FreeLens(0, False, 3)),
         # What no rational function follows hides that the lens is decentred.
-        (TELEPHONE, FreeLens(0, True, 3)),
-        (STRAIGHT, FreeLens(0, False, 0)),
+        (TELEPHONE, None, FreeLens(0, True, 3)),
+        (TELEPHONE, False, FreeLens(0, False, 3)),
+        (STRAIGHT, None, FreeLens(0, False, 0)),
         # Not for one coefficient less than it has itself.
-        (RATIONAL, FreeLens(2, False, 0)),
+        (RATIONAL, None, FreeLens(2, False, 0)),
     ],
 )
 def test_the_fewest_coefficients_that_explain_what_was_held_out(
     monkeypatch: pytest.MonkeyPatch,
     errors: dict[tuple[int, int], tuple[float, float]],
+    tangential: bool | None,
     chosen: FreeLens,
 ) -> None:
     def tried(
@@ -82,6 +86,6 @@ def test_the_fewest_coefficients_that_explain_what_was_held_out(
         return Candidate(fit, POINTS, radial[lens.tangential])
 
     monkeypatch.setattr(calibration_choice, "_fitted", tried)
-    found, candidates = choose_lens(START, POINTS, CalibrationSettings(), 0.0)
+    found, candidates = choose_lens(START, POINTS, CalibrationSettings(tangential=tangential), 0.0)
     assert found == chosen
     assert found in candidates

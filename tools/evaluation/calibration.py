@@ -17,7 +17,7 @@ from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
 from camera.calibration.images import read_grey
-from camera.calibration.model import LENSES, CalibrationSettings, FreeLens
+from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from camera.uncertainty import (
     intrinsics_of,
@@ -187,8 +187,10 @@ def compare(
 ) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
-    lenses = tuple(FreeLens(0, polynomial=count) for count in (1, 2, 3)) if polynomial else LENSES
-    settings = CalibrationSettings(None if free_aspect else 1.0, lenses, robust=False)
+    settings = CalibrationSettings(
+        aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
+        keep_outliers=True,
+    )  # fmt: skip
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV knows nothing of circles.
     points, lens = result.points, result.lens
