@@ -31,7 +31,7 @@ from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
 from detect.verticals.tilt import with_error
-from detect.verticals.tracking import follow_again, follow_edges
+from detect.verticals.tracking import follow_edges
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
@@ -102,7 +102,7 @@ def detect_lines(
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
         tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
-        tracks = follow_again(
+        tracks = follow_edges(
             image, strip, tools.window, starts, numbers.tracking, tracks, judged.doubtful, tilt
         )
         judged = fit_and_judge(image, strip, tracks, tools.steps, numbers, judged)

@@ -127,7 +127,7 @@ def compare_frames(
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("circles", wanted, found, options, names, sight, unlisted)
     matches: Sequence[FrameMatch] = common["frames"]
-    first, second, missed, extra = sides = (
+    first, second, _, extra = sides = (
         circle_arrays([row for m in matches for row in m.paired[0]]),
         circle_arrays([row for m in matches for row in m.paired[1]]),
         circle_arrays([row for m in matches for row in m.missed]),
@@ -147,10 +147,6 @@ def compare_frames(
         normalised_error=normalised_error(pairs.offset, second.covariance),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
-        reference_quality_matched=quantile(first.quality),
-        reference_quality_missed=quantile(missed.quality),
-        detected_quality_matched=quantile(second.quality),
-        detected_quality_extra=quantile(extra.quality),
         bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
         extra_beyond=_beyond(extra.xy, second.xy),
         in_image=in_image,

@@ -235,16 +235,12 @@ class Comparison(ABC):
 
 @dataclass(frozen=True)
 class DiscComparison(Comparison):
-    """How a run's detected discs compare with reference rows; qualities are medians."""
+    """How a run's detected discs compare with reference rows."""
 
     what, unit = "discs", "m"
 
     error_median_m: float | None
     error_95_m: float | None
-    reference_quality_matched: float | None
-    reference_quality_missed: float | None
-    detected_quality_matched: float | None
-    detected_quality_extra: float | None
     bins: tuple[DistanceBin, ...]
     extra_beyond: int  # extra rows that are farther away than all that are on a reference row
     in_image: bool

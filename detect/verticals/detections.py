@@ -8,16 +8,12 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.verticals.joining import Lines
 from detect.verticals.judgement import FATES, Judgement
-from detect.verticals.refinement import LineFits
 from detect.verticals.tilt import TiltEstimate
 from detect.verticals.tracking import LineTracks
 from redetect.landmarks import LineLandmark, wrap_angle
-
-FloatArray = NDArray[np.float64]
 
 #: A reference line is the same as a detected one within this bearing, or two standard deviations.
 _SAME_LINE_RAD = np.radians(0.5)
@@ -47,37 +43,6 @@ class LineDetections:
     def __len__(self) -> int:
         return len(self.lines.alpha_rad)
 
-    @property
-    def line_numbers(self) -> FloatArray:
-        """(8, N) ends, bearings, inclinations, deviations and noise, as described below, by row."""
-        own = self.lines
-        return np.stack([*own.ends.T, own.alpha_rad, own.beta_rad, own.sigma_rad, own.noise_rad])
-
-    @property
-    def ends(self) -> FloatArray:
-        """(N, 4) xtop, ytop, xbottom, ybottom: undistorted normalised coordinates."""
-        return self.lines.ends
-
-    @property
-    def alpha_rad(self) -> FloatArray:
-        """(N,) bearings."""
-        return self.lines.alpha_rad
-
-    @property
-    def beta_rad(self) -> FloatArray:
-        """(N,) inclinations."""
-        return self.lines.beta_rad
-
-    @property
-    def sigma_rad(self) -> FloatArray:
-        """(N,) standard deviations of the bearings."""
-        return self.lines.sigma_rad
-
-    @property
-    def noise_rad(self) -> FloatArray:
-        """(N,) the part of them that is due to noise in the grey values."""
-        return self.lines.noise_rad
-
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
         """The tracks that each line consists of, the strongest first; its ends are that one's."""
@@ -89,28 +54,20 @@ class LineDetections:
         """None where too few lines agree."""
         return self.judged.tilt
 
-    @property
-    def evidence(self) -> FloatArray:
-        """(T,) evidence for each track."""
-        return self.judged.evidence
-
     @cached_property
     def fate(self) -> tuple[str, ...]:
         """(T,) "accepted", "joined" (to a stronger one), or why the track is no line."""
         return tuple(FATES[number] for number in self.judged.fate.tolist())
 
-    @property
-    def fits(self) -> LineFits:
-        """The lines of all tracks."""
-        return self.judged.fits
-
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
+        own = self.lines
+        numbers = np.column_stack([own.ends, own.alpha_rad, own.beta_rad, own.sigma_rad])
         return tuple(
             LineLandmark(
                 xtop, ytop, xbottom, ybottom, alpha, beta, quality=0.0, sigma=sigma, ids=(-1,)
             )
-            for xtop, ytop, xbottom, ybottom, alpha, beta, sigma, _ in self.line_numbers.T.tolist()
+            for xtop, ytop, xbottom, ybottom, alpha, beta, sigma in numbers.tolist()
         )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import JudgementNumbers, LineNumbers
-from detect.verticals.refinement import NO_FITS, LineFits, StepFilters, fit_lines
+from detect.verticals.refinement import LineFits, StepFilters, fit_lines
 from detect.verticals.response import FloatArray, Strip
 from detect.verticals.tilt import (
     TiltEstimate,
@@ -62,7 +62,6 @@ FATES = (
 
 #: Tracks with at least this part of the least evidence might have more if followed otherwise.
 _NEARLY = 0.7
-_NONE = np.empty(0, np.bool_)
 
 
 class Judgement(NamedTuple):
@@ -107,8 +106,12 @@ def fit_and_judge(
     """
     own = numbers.judgement
     least = own.least_points, own.least_evidence / strip.row_aspect
-    known, again = (before.fits, before.doubtful) if before is not None else (NO_FITS, _NONE)
-    fits = fit_lines(image, strip, tracks, filters, least, known, again)
+    if before is None:
+        fits = fit_lines(image, strip, tracks, filters, least, 0)
+    else:
+        kept = np.flatnonzero(~before.doubtful)
+        new = fit_lines(image, strip, tracks, filters, least, len(kept))
+        fits = LineFits(*(np.concatenate([old[kept], own]) for old, own in zip(before.fits, new)))
     evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = NOT_VERTICAL

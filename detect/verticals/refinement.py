@@ -70,10 +70,6 @@ class LineFits(NamedTuple):
     sharpness: FloatArray
 
 
-#: Of no tracks.
-NO_FITS = LineFits(*(np.empty((0, *shape)) for shape in [(), (), (2,), (2, 2), *[()] * 5]))
-
-
 class StepFilters(NamedTuple):
     """The K steps of the refinement, and tables of their filters.
 
@@ -171,53 +167,31 @@ class Eigenline(NamedTuple):
 
 
 @kernel(inline="always")
-def _fits(count: int, known: LineFits, again: NDArray[np.bool_]) -> tuple[LineFits, int]:
-    """Lines that are known, their number, and others of tracks that have none yet."""
-    line, covariance, sharpness = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
-    scatter_px, shift_px, spread = np.empty(count), np.empty(count), np.empty(count)
-    reference_rad, pixel_rad, contrast = np.empty(count), np.empty(count), np.empty(count)
-    for t in range(count):
-        scatter_px[t] = shift_px[t] = spread[t] = contrast[t] = np.nan
-        line[t, 0] = line[t, 1] = covariance[t, 0, 0] = covariance[t, 1, 1] = np.nan
-        covariance[t, 0, 1] = covariance[t, 1, 0] = np.nan
-        sharpness[t] = 1.0
-    n = 0
-    for t in range(len(again)):
-        if again[t]:
-            continue
-        reference_rad[n], pixel_rad[n] = known.reference_rad[t], known.pixel_rad[t]
-        scatter_px[n], shift_px[n] = known.scatter_px[t], known.shift_px[t]
-        spread[n], contrast[n] = known.spread[t], known.contrast[t]
-        sharpness[n] = known.sharpness[t]
-        for i in range(2):
-            line[n, i] = known.line[t, i]
-            for k in range(2):
-                covariance[n, i, k] = known.covariance[t, i, k]
-        n += 1
-    fits = LineFits(
-        reference_rad,
-        pixel_rad,
-        line,
-        covariance,
-        scatter_px,
-        shift_px,
-        spread,
-        contrast,
-        sharpness,
+def _no_fits(count: int) -> LineFits:
+    """Places for the lines of tracks: none yet."""
+    return LineFits(
+        np.empty(count),
+        np.empty(count),
+        np.full((count, 2), np.nan),
+        np.full((count, 2, 2), np.nan),
+        np.full(count, np.nan),
+        np.full(count, np.nan),
+        np.full(count, np.nan),
+        np.full(count, np.nan),
+        np.ones(count),
     )
-    return fits, n
 
 
 @kernel(inline="always")
 def _fit_points(
     strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
-    fits: LineFits,
+    fits: LineFits, k: int,
 ) -> Eigenline:  # fmt: skip
     """Fit a line to track t by the eigen-decomposition of its points' scatter.
 
     Tracks of fewer points or a lower sum of scores than `least` have none. `chart`, (2, N), gets X
-    and Z of the points, `fits` the line; the covariance is that of independent points with the
-    scatter that the track shows.
+    and Z of the points, `fits` the line at place k; the covariance is that of independent points
+    with the scatter that the track shows.
     """
     begin, end = tracks.bounds[t], tracks.bounds[t + 1]
     n, row, column, score = end - begin, tracks.row, tracks.column, tracks.score
@@ -227,29 +201,29 @@ def _fit_points(
         total += score[i]
     origin = min(max(int(middle / n + 0.5), 1), len(strip.bearing) - 2)
     pixel = 1.0 / abs(strip.columns_per_rad[origin])
-    fits.reference_rad[t], fits.pixel_rad[t] = strip.bearing[origin], pixel
+    fits.reference_rad[k], fits.pixel_rad[k] = strip.bearing[origin], pixel
     if n < least[0] or total < least[1]:
         return Eigenline(np.nan, np.nan, np.nan, np.nan, np.nan)
     x, z = chart[0, :n], chart[1, :n]
     _place_in_chart(strip, row[begin:end], column[begin:end], strip.bearing[origin], x, z)
     line = _eigenline(x, z)
-    fits.scatter_px[t], fits.spread[t] = math.sqrt(line.scatter) / pixel, line.spread
+    fits.scatter_px[k], fits.spread[k] = math.sqrt(line.scatter) / pixel, line.spread
     if line.spread > line.scatter:
         variance = line.scatter / (max(n - 2, 1) * line.spread)
-        fits.line[t, 0], fits.line[t, 1] = line.a, line.b
-        fits.covariance[t, 0, 0] = (line.spread + line.middle**2) * variance
-        fits.covariance[t, 0, 1] = fits.covariance[t, 1, 0] = -line.middle * variance
-        fits.covariance[t, 1, 1] = variance
-        fits.shift_px[t] = 0.0
+        fits.line[k, 0], fits.line[k, 1] = line.a, line.b
+        fits.covariance[k, 0, 0] = (line.spread + line.middle**2) * variance
+        fits.covariance[k, 0, 1] = fits.covariance[k, 1, 0] = -line.middle * variance
+        fits.covariance[k, 1, 1] = variance
+        fits.shift_px[k] = 0.0
     return line
 
 
 @kernel()
 def fit_lines(
     image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
-    least: tuple[int, float], known: LineFits, again: NDArray[np.bool_],
+    least: tuple[int, float], first: int,
 ) -> LineFits:  # fmt: skip
-    """Fit lines to tracks, and refine them on the grey values in some steps.
+    """Fit lines to tracks from the `first` on, and refine them on the grey values in some steps.
 
     Parameters
     ----------
@@ -259,37 +233,36 @@ def fit_lines(
         The table, the tracks, the steps.
     least : int, float
         Tracks of fewer points or a lower sum of scores have no line.
-    known : LineFits
-        Lines of other tracks. Those that are not followed again are the first of these.
-    again : (K,) bool
-        Which are.
+    first : int
+        Tracks before this one are left out.
     """
-    fits, first = _fits(len(tracks.polarity), known, again)
+    fits = _no_fits(len(tracks.polarity) - first)
     height = image.shape[0]
     chart, column = np.empty((2, height)), np.empty(height)
     by_a, by_b = np.empty(height), np.empty(height)
-    for t in range(first, len(tracks.polarity)):
-        line = _fit_points(strip, tracks, t, least, chart, fits)
-        if len(filters.half) == 0 or np.isnan(fits.line[t, 0]):
+    for k in range(len(fits.sharpness)):
+        t = first + k
+        line = _fit_points(strip, tracks, t, least, chart, fits, k)
+        if len(filters.half) == 0 or np.isnan(fits.line[k, 0]):
             continue
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
-        n, sign, pixel = end - begin, tracks.polarity[t], fits.pixel_rad[t]
+        n, sign, pixel = end - begin, tracks.polarity[t], fits.pixel_rad[k]
         crossings = Crossings(tracks.row[begin:end], column[:n], by_a[:n], by_b[:n])
         x, z = chart[0, :n], chart[1, :n]
         _cross_rows(strip, tracks.column[begin:end], x, z, line, crossings)
         steps = _climb(image, crossings, filters, sign, line.middle, pixel)
         # NaN where there is no maximum.
-        fits.line[t, 0] += steps.change_a
-        fits.line[t, 1] += steps.change_b
-        fits.covariance[t, 0, 0], fits.covariance[t, 1, 1] = steps.aa, steps.bb
-        fits.covariance[t, 0, 1] = fits.covariance[t, 1, 0] = steps.ab
-        fits.shift_px[t] = abs(steps.change_a + steps.change_b * line.middle) / pixel
+        fits.line[k, 0] += steps.change_a
+        fits.line[k, 1] += steps.change_b
+        fits.covariance[k, 0, 0], fits.covariance[k, 1, 1] = steps.aa, steps.bb
+        fits.covariance[k, 0, 1] = fits.covariance[k, 1, 0] = steps.ab
+        fits.shift_px[k] = abs(steps.change_a + steps.change_b * line.middle) / pixel
         if np.isnan(steps.aa):
             continue
         rows, fine, coarse = _contrasts(image, crossings, filters.heights)
-        fits.contrast[t] = sign * fine / rows if rows > 0 else 0.0
+        fits.contrast[k] = sign * fine / rows if rows > 0 else 0.0
         sharp = fine / coarse if sign * coarse > 0.0 else 1.0
-        fits.sharpness[t] = min(max(sharp, 0.0), 1.0)
+        fits.sharpness[k] = min(max(sharp, 0.0), 1.0)
     return fits
 
 

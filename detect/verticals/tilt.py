@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import DEFAULT, LineNumbers, LineSettings, TiltNumbers
+from detect.line_settings import TiltNumbers
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
@@ -85,15 +85,12 @@ class TiltEstimate(NamedTuple):
         Of (pitch, roll) (rad^2).
     lines : int
         How many verticals agree with it.
-    votes : float
-        Their share of all votes.
     """
 
     pitch_rad: float
     roll_rad: float
     covariance: FloatArray
     lines: int
-    votes: float = math.nan
 
 
 class Verticals(NamedTuple):
@@ -115,32 +112,6 @@ class Verticals(NamedTuple):
     variance: FloatArray
     tolerance: FloatArray
     weight: FloatArray
-
-
-def consensus(
-    lines: Verticals, settings: LineSettings = DEFAULT
-) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
-    """Estimate the tilt from the largest consistent set of lines; returns the set as well.
-
-    Parameters
-    ----------
-    lines : Verticals
-        The lines, each an edge of its own.
-    settings : LineSettings
-        Largest tilt, its prior, number of lines that propose and that must agree, share of strays.
-
-    Returns
-    -------
-    tilt : TiltEstimate or None
-        None where too few lines agree.
-    consistent : (N,) bool
-        Lines that are vertical under that tilt; without an estimate, under no tilt.
-    """
-    numbers = LineNumbers.of(settings).tilt
-    tilt, consistent = agree_on_tilt(lines, numbers)
-    if tilt.lines == 0:
-        return None, consistent
-    return with_error(tilt, lines, np.arange(len(lines.weight)), numbers), consistent
 
 
 def with_error(
@@ -173,23 +144,33 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 
 @kernel()
 def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
-    """`consensus` with the covariance of least squares; of 0 lines where too few agree."""
+    """Estimate the tilt from the largest consistent set of lines.
+
+    Parameters
+    ----------
+    lines : Verticals
+        The lines.
+    numbers : TiltNumbers
+        Largest tilt, its prior, number of lines that propose and that must agree.
+
+    Returns
+    -------
+    tilt : TiltEstimate
+        Its covariance is that of least squares; of 0 lines where too few agree.
+    agrees : (N,) bool
+        Lines that are vertical under that tilt; without an estimate, under no tilt.
+    """
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
     pitch, roll = _vote_for_tilt(lines, numbers)
     prior = math.radians(numbers.tilt_prior_deg)
     pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
-    count, votes, total = 0, 0.0, 0.0
-    for i in range(len(agrees)):
-        total += lines.weight[i]
-        if agrees[i]:
-            count += 1
-            votes += lines.weight[i]
+    count = int(np.count_nonzero(agrees))
     largest = max(abs(pitch), abs(roll))
     if count < numbers.least_lines or largest > math.radians(numbers.largest_tilt_deg):
         count = 0
         for i in range(len(agrees)):
             agrees[i] = abs(lines.normal[i, 2]) <= lines.tolerance[i]
-    return TiltEstimate(pitch, roll, covariance, count, votes / total), agrees
+    return TiltEstimate(pitch, roll, covariance, count), agrees
 
 
 @kernel()

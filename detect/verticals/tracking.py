@@ -71,26 +71,6 @@ class LineTracks(NamedTuple):
     column: FloatArray
     score: SingleArray
 
-    @property
-    def points(self) -> NDArray[np.int64]:
-        """(T,) number of points of each track."""
-        return self.bounds[1:] - self.bounds[:-1]
-
-    @property
-    def top_row(self) -> NDArray[np.int32]:
-        """(T,) first row of each track."""
-        return self.row[self.bounds[:-1]]
-
-    @property
-    def bottom_row(self) -> NDArray[np.int32]:
-        """(T,) last row of each track."""
-        return self.row[self.bounds[1:] - 1]
-
-    @property
-    def total_score(self) -> FloatArray:
-        """(T,) sum of the scores of each track."""
-        return np.add.reduceat(self.score, self.bounds[:-1], dtype=np.float64)
-
 
 _NO_TRACKS = LineTracks(
     np.empty(0), np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32)
@@ -127,7 +107,8 @@ class _Edge(NamedTuple):
 
 def follow_edges(
     image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers,
+    numbers: TrackingNumbers, tracks: LineTracks = _NO_TRACKS,
+    again: NDArray[np.bool_] = _NONE, tilt: tuple[float, float] = _NO_TILT,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
@@ -141,20 +122,15 @@ def follow_edges(
         Where to start, in this order.
     numbers : TrackingNumbers
         Threshold, gaps, border, and how a track is guided.
+    tracks : LineTracks
+        Those that were followed before.
+    again : (T,) bool
+        Which of these are followed again; the others come first in the result.
+    tilt : float, float
+        Pitch and roll (rad) along whose verticals edges are followed; NaN if their leans are to be
+        found along the way.
     """
-    return _follow_edges(image, strip, window, starts, numbers, _NO_TRACKS, _NONE, _NO_TILT)
-
-
-def follow_again(
-    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
-    tilt_rad: tuple[float, float],
-) -> LineTracks:  # fmt: skip
-    """Follow some of the tracks again, along the verticals of a tilt; the others come first.
-
-    The starts are all those that are on none of the others.
-    """
-    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
+    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt)
 
 
 @kernel()
@@ -163,7 +139,6 @@ def _follow_edges(
     numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
     tilt: tuple[float, float],
 ) -> LineTracks:  # fmt: skip
-    """`follow_again`; without a tilt (NaN) the leans are found along the way."""
     height, width = image.shape
     lowest, highest = height, -1
     for v in starts.row:

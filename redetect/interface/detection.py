@@ -331,7 +331,7 @@ def _detection(
     assert found.image is not None
     assert found.discs is not None
     assert found.lines is not None
-    lines, discs = found.lines, found.discs
+    verticals, discs = found.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
     unknown = np.full(len(discs), -1)
     rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
@@ -345,11 +345,11 @@ def _detection(
             evidence=discs.evidence,
         ),
         verticals=Verticals(
-            bearing_rad=lines.alpha_rad,
-            sigma_rad=lines.sigma_rad,
-            inclination_rad=lines.beta_rad,
-            top=camera.distort(lines.ends[:, :2]),
-            bottom=camera.distort(lines.ends[:, 2:]),
+            bearing_rad=verticals.lines.alpha_rad,
+            sigma_rad=verticals.lines.sigma_rad,
+            inclination_rad=verticals.lines.beta_rad,
+            top=camera.distort(verticals.lines.ends[:, :2]),
+            bottom=camera.distort(verticals.lines.ends[:, 2:]),
         ),
         tilt=_tilt_of(found.tilt, axes),
         axes=axes,
@@ -357,7 +357,7 @@ def _detection(
         image=found.image,
         camera=camera,
         settings=settings,
-        frame=Frame(step, (*rows, *lines.landmarks()), discs.levelled_by),
+        frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
     )
 
 

@@ -7,13 +7,12 @@ command ends with its exit code, and one line on the terminal where something wa
 from __future__ import annotations
 
 import difflib
-import io
 import os
 import select
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Union, cast, get_type_hints
 
 import tyro
-from tyro.conf import OmitArgPrefixes, Suppress, arg, subcommand
+from tyro.conf import Suppress, arg, subcommand
 
 from redetect.storage import __version__
 from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
@@ -178,35 +177,17 @@ class Program:
             for name, kind in self.commands.items()
         )
         choice: Any = Union.__getitem__(commands)
-        said = io.StringIO()
-        try:
-            with redirect_stderr(said):
-                return tyro.cli(
-                    Annotated[choice, arg(name="")],
-                    prog=self.name,
-                    description=f"{self.description}\n\n{FOR_ALL}",
-                    args=["--help" if word == _HELP_ALL else word for word in words],
-                )
-        except SystemExit as end:
-            if end.code == EXIT_WRONG_COMMAND_LINE:
-                self._demand_flags(words)
-            print(said.getvalue(), end="", file=sys.stderr)
-            raise
+        return tyro.cli(
+            Annotated[choice, arg(name="")],
+            prog=self.name,
+            description=f"{self.description}\n\n{FOR_ALL}",
+            args=["--help" if word == _HELP_ALL else word for word in words],
+        )
 
     def carry_out(self, command: Any) -> int:
         """Carry out a command; returns the exit code."""
         code: int = import_module(self.performed_by[type(command)]).perform(command)
         return code
-
-    def _demand_flags(self, words: Sequence[str]) -> None:
-        """End with one line if a command line has a flag that its command doesn't."""
-        if not words or words[0] not in self.commands:
-            return
-        known = {*flags_of(self.commands[words[0]]), "--help", _HELP_ALL, "--quiet"}
-        for word in words[1:]:
-            flag = word.partition("=")[0].replace("_", "-")
-            if flag.startswith("--") and flag not in known and not flag.startswith("--tyro-"):
-                end_with(no_such(f"{self.name} {words[0]}: no flag", flag, known))
 
     def _brief(self, kind: type) -> type:
         """The dataclass of a command without the flags for experts, for its help."""
@@ -257,23 +238,6 @@ def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
         if path.exists():
             sys.stdout.write(path.read_text("utf-8"))
     return code
-
-
-def flags_of(kind: type, prefix: str = "") -> Iterator[str]:
-    """The flags of a dataclass as tyro names them."""
-    (omitted,) = OmitArgPrefixes[int].__metadata__  # type: ignore[attr-defined]
-    hints = get_type_hints(kind, include_extras=True)
-    for each in fields(kind):
-        inner, marks = _parted(hints[each.name])
-        if is_dataclass(inner):
-            inside = prefix if omitted in marks else f"{prefix}{each.name}."
-            yield from flags_of(cast(type, inner), inside)
-        else:
-            name = f"{prefix}{each.name}".replace("_", "-")
-            yield f"--{name}"
-            if inner is bool:
-                head, dot, last = name.rpartition(".")
-                yield f"--{head}{dot}no-{last}"
 
 
 def _parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:

@@ -15,9 +15,10 @@ from camera.uncertainty import with_covariance
 from detect.cli import main
 from detect.levelling import common_covariance
 from detect.seen import level_seen
-from detect.verticals.tilt import Verticals, consensus
+from detect.verticals.tilt import Verticals
 from redetect.landmarks import read_frames
 from tests.camera.test_uncertainty import moved
+from tests.detect.verticals.stages import consensus
 
 SIGMAS = np.array(
     [1.0, 0.5, 1.0, 0.7, *[1e-9] * 5, 1e-9, 1e-9, *[1e-9] * 3, *[2e-3] * 3, 3e-3, 3e-3, 2e-3]

@@ -86,10 +86,10 @@ def look_through(radial: Camera, lens: Camera) -> None:
         image = render(tilted(seen_by, *turn), EDGES, noise=2.0, rng=rng)
         found = detect_lines(image, build_vertical_table(believed))
         assert found.tilt is not None
-        assert len(found.alpha_rad) == len(EDGES)
+        assert len(found.lines.alpha_rad) == len(EDGES)
         tilt = np.array([found.tilt.pitch_rad, found.tilt.roll_rad])
         errors.append(
-            (np.abs(found.alpha_rad - truth).max(), np.degrees(np.abs(tilt - turn).max()))
+            (np.abs(found.lines.alpha_rad - truth).max(), np.degrees(np.abs(tilt - turn).max()))
         )
         if believed is lens:
             # Ends are undistorted: through the lens they lie on the edges.

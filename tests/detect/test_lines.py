@@ -57,7 +57,7 @@ def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> 
     """Calibrated with one pose, standing in another: bearings are those of the world."""
     pitch, roll = np.radians(tilt_deg)
     found = detect_lines(scene(tilted(CAMERA, pitch, roll)), TABLE)
-    np.testing.assert_allclose(found.alpha_rad, truth(), atol=4e-4)
+    np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=4e-4)
     assert found.tilt is not None
     assert found.tilt.lines == len(EDGES)
     assert (found.tilt.pitch_rad, found.tilt.roll_rad) == pytest.approx(
@@ -65,7 +65,7 @@ def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> 
     )
     # Uncompensated bearings are off by more.
     if max(np.abs(tilt_deg)) > 3.0:
-        raw = compensated_bearings(plane_normals(found.ends, CAMERA.rotation), None)
+        raw = compensated_bearings(plane_normals(found.lines.ends, CAMERA.rotation), None)
         assert np.abs(raw - truth()).max() > 1e-3
 
 
@@ -80,9 +80,9 @@ def test_cameras_that_do_not_see_the_horizon_see_verticals(
     assert abs(table.anchor_elevation_rad) > 0.1
     pitch, roll = np.radians([0.8, -0.5])
     found = detect_lines(scene(tilted(camera, pitch, roll)), table)
-    order = np.argsort(-found.alpha_rad)
-    off = found.alpha_rad[order] - truth()
-    assert np.all(np.abs(off) < 3.0 * found.sigma_rad[order])
+    order = np.argsort(-found.lines.alpha_rad)
+    off = found.lines.alpha_rad[order] - truth()
+    assert np.all(np.abs(off) < 3.0 * found.lines.sigma_rad[order])
     assert np.abs(off).max() < 2e-3
     assert found.tilt is not None
     deviation = np.sqrt(np.diag(found.tilt.covariance))
@@ -111,7 +111,7 @@ def test_rows_hold_ends_beta_and_sigma() -> None:
         expected = edge_columns(tilted(CAMERA, 0.02, -0.01), bearing, pixels[:, 1])
         np.testing.assert_allclose(pixels[:, 0], expected, atol=0.3)
     # Leftmost first.
-    assert np.all(np.diff(found.alpha_rad) < 0.0)
+    assert np.all(np.diff(found.lines.alpha_rad) < 0.0)
 
 
 def test_published_convention_turns_the_other_way() -> None:
@@ -119,15 +119,15 @@ def test_published_convention_turns_the_other_way() -> None:
     level = detect_lines(image, TABLE)
     other = detect_lines(image, TABLE, replace(DEFAULT, alpha="published"))
     assert level.tilt is not None
-    np.testing.assert_allclose(other.ends, level.ends, atol=1e-9)
+    np.testing.assert_allclose(other.lines.ends, level.lines.ends, atol=1e-9)
     np.testing.assert_allclose(
-        other.alpha_rad,
+        other.lines.alpha_rad,
         compensated_bearings(
-            plane_normals(level.ends, CAMERA.rotation), level.tilt, published=True
+            plane_normals(level.lines.ends, CAMERA.rotation), level.tilt, published=True
         ),
         atol=1e-6,
     )
-    assert np.abs(other.alpha_rad - level.alpha_rad).max() > 1e-3
+    assert np.abs(other.lines.alpha_rad - level.lines.alpha_rad).max() > 1e-3
 
 
 @pytest.mark.parametrize(("preset", "margin"), [(REPORT, 22.0), (PUBLISHED, 23.0)])
@@ -135,8 +135,8 @@ def test_published_presets_keep_their_margins(preset: LineSettings, margin: floa
     camera = pinhole(240, 160, 200.0)
     table = build_vertical_table(camera)
     found = detect_lines(scene(camera), table, preset)
-    np.testing.assert_allclose(found.alpha_rad, truth(), atol=3e-3)
-    rows = camera.distort(found.ends.reshape(-1, 2, 2))[..., 1]
+    np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=3e-3)
+    rows = camera.distort(found.lines.ends.reshape(-1, 2, 2))[..., 1]
     np.testing.assert_allclose(rows, [[margin, 159.0 - margin]] * len(EDGES), atol=0.02)
 
 
@@ -148,7 +148,7 @@ def test_affine_brightness_does_not_matter(gain: float, offset: float) -> None:
     changed = [Edge(edge.bearing_rad, gain * edge.contrast) for edge in plain]
     first = detect_lines(render(CAMERA, plain, grey=60.0), TABLE)
     second = detect_lines(render(CAMERA, changed, grey=60.0 * gain + offset), TABLE)
-    np.testing.assert_allclose(second.alpha_rad, first.alpha_rad, atol=5e-4)
+    np.testing.assert_allclose(second.lines.alpha_rad, first.lines.alpha_rad, atol=5e-4)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -159,9 +159,11 @@ def test_mirrored_image_and_camera_give_mirrored_rows(seed: int) -> None:
         np.ascontiguousarray(image[:, ::-1]), build_vertical_table(mirrored(CAMERA))
     )
     assert len(found) == len(EDGES)
-    np.testing.assert_allclose(-other.alpha_rad[::-1], found.alpha_rad, atol=2e-5)
-    np.testing.assert_allclose(other.sigma_rad[::-1], found.sigma_rad, rtol=2e-2)
-    np.testing.assert_allclose(other.ends[::-1], found.ends * [-1.0, 1.0, -1.0, 1.0], atol=2e-4)
+    np.testing.assert_allclose(-other.lines.alpha_rad[::-1], found.lines.alpha_rad, atol=2e-5)
+    np.testing.assert_allclose(other.lines.sigma_rad[::-1], found.lines.sigma_rad, rtol=2e-2)
+    np.testing.assert_allclose(
+        other.lines.ends[::-1], found.lines.ends * [-1.0, 1.0, -1.0, 1.0], atol=2e-4
+    )
     assert found.tilt is not None
     assert other.tilt is not None
     assert other.tilt.pitch_rad == pytest.approx(found.tilt.pitch_rad, abs=1e-4)
@@ -181,7 +183,7 @@ def test_no_row_outside_the_view(pitch: float, roll: float, seed: int) -> None:
     image = np.asarray(cv2.GaussianBlur(image, (5, 1), 1.0), np.uint8)
     table = build_vertical_table(camera)
     found = detect_lines(image, table)
-    pixels = camera.distort(found.ends.reshape(-1, 2, 2))
+    pixels = camera.distort(found.lines.ends.reshape(-1, 2, 2))
     assert np.all((pixels >= -0.5) & (pixels <= [119.5, 89.5]))
     assert all(np.isfinite(row.sigma) and row.sigma > 0.0 for row in found.landmarks())
     if not table.usable.any():
@@ -192,7 +194,7 @@ def test_no_row_outside_the_view(pitch: float, roll: float, seed: int) -> None:
 def test_two_lines_are_rows_without_a_tilt() -> None:
     found = detect_lines(scene(CAMERA, EDGES[:2]), TABLE)
     assert found.tilt is None
-    np.testing.assert_allclose(found.alpha_rad, truth(EDGES[:2]), atol=4e-4)
+    np.testing.assert_allclose(found.lines.alpha_rad, truth(EDGES[:2]), atol=4e-4)
 
 
 def test_leaning_edges_are_no_verticals() -> None:
@@ -202,7 +204,7 @@ def test_leaning_edges_are_no_verticals() -> None:
     columns, rows = np.meshgrid(np.arange(240), np.arange(160))
     image += np.where(columns > 165 + 0.12 * (rows - 80), -60.0, 0.0)
     found = detect_lines(np.clip(image, 0, 255).astype(np.uint8), table)
-    np.testing.assert_allclose(found.alpha_rad, truth(), atol=5e-4)
+    np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=5e-4)
     assert found.tilt is not None
     assert abs(found.tilt.roll_rad) < np.radians(0.1)
 
@@ -216,14 +218,14 @@ def test_close_edges_are_joined_to_one_row() -> None:
     assert (len(apart), len(joined)) == (2, 1)
     assert len(joined.members[0]) == 2
     assert sorted(joined.fate[t] for t in joined.members[0]) == [ACCEPTED, JOINED]
-    share = joined.evidence[list(joined.members[0])]
+    share = joined.judged.evidence[list(joined.members[0])]
     share = share / share.sum()
-    order = np.argsort(-joined.evidence[list(joined.members[0])])
-    sides = apart.alpha_rad[np.argsort(-apart.evidence[[m[0] for m in apart.members]])]
+    order = np.argsort(-joined.judged.evidence[list(joined.members[0])])
+    sides = apart.lines.alpha_rad[np.argsort(-apart.judged.evidence[[m[0] for m in apart.members]])]
     mean = share[order] @ sides
-    assert joined.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
-    spread = share[order] @ (apart.sigma_rad**2 + (sides - mean) ** 2)
-    assert joined.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
+    assert joined.lines.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
+    spread = share[order] @ (apart.lines.sigma_rad**2 + (sides - mean) ** 2)
+    assert joined.lines.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
 
 
 def test_rows_of_the_published_preset_join_lines_as_equals() -> None:
@@ -237,15 +239,15 @@ def test_rows_of_the_published_preset_join_lines_as_equals() -> None:
     apart = detect_lines(image, table, replace(preset, join_px=1.0))
     joined = detect_lines(image, table, preset)
     assert (len(apart), len(joined)) == (2, 1)
-    rows = camera.distort(apart.ends.reshape(-1, 2, 2))[..., 1]
+    rows = camera.distort(apart.lines.ends.reshape(-1, 2, 2))[..., 1]
     assert rows[0, 1] > rows[1, 1] + 10.0
-    np.testing.assert_allclose(joined.ends[0], apart.ends.mean(axis=0), atol=1e-9)
-    assert joined.beta_rad[0] == pytest.approx(apart.beta_rad.mean(), abs=1e-9)
-    assert joined.alpha_rad[0] == pytest.approx(apart.alpha_rad.mean(), abs=1e-9)
-    variance = np.mean(apart.sigma_rad**2) + 0.25 * np.ptp(apart.alpha_rad) ** 2
-    assert joined.sigma_rad[0] == pytest.approx(np.sqrt(variance), rel=1e-9)
+    np.testing.assert_allclose(joined.lines.ends[0], apart.lines.ends.mean(axis=0), atol=1e-9)
+    assert joined.lines.beta_rad[0] == pytest.approx(apart.lines.beta_rad.mean(), abs=1e-9)
+    assert joined.lines.alpha_rad[0] == pytest.approx(apart.lines.alpha_rad.mean(), abs=1e-9)
+    variance = np.mean(apart.lines.sigma_rad**2) + 0.25 * np.ptp(apart.lines.alpha_rad) ** 2
+    assert joined.lines.sigma_rad[0] == pytest.approx(np.sqrt(variance), rel=1e-9)
     # A single line is known to the root of two pixels.
-    assert apart.sigma_rad[0] == pytest.approx(np.sqrt(2.0) / 200.0, rel=0.02)
+    assert apart.lines.sigma_rad[0] == pytest.approx(np.sqrt(2.0) / 200.0, rel=0.02)
 
 
 def test_the_rows_that_the_report_prints(shared_data: Path) -> None:
@@ -299,9 +301,11 @@ def test_one_call_goes_the_path_of_the_steps() -> None:
             judged = judge_tracks(image, tracks, TABLE, preset, before=judged)
         for name in tracks._fields:
             np.testing.assert_array_equal(getattr(found.tracks, name), getattr(tracks, name))
-        for name in found.fits._fields:
-            np.testing.assert_array_equal(getattr(found.fits, name), getattr(judged.fits, name))
-        np.testing.assert_array_equal(found.evidence, judged.evidence)
+        for name in found.judged.fits._fields:
+            np.testing.assert_array_equal(
+                getattr(found.judged.fits, name), getattr(judged.fits, name)
+            )
+        np.testing.assert_array_equal(found.judged.evidence, judged.evidence)
         assert found.tilt is not None
         assert judged.tilt is not None
         assert found.tilt.pitch_rad == judged.tilt.pitch_rad
@@ -420,10 +424,10 @@ def test_photographs_of_buildings(shared_data: Path, monkeypatch: pytest.MonkeyP
         camera = read_camera(folder / "dev" / name / f"{name}.cam")
         image = read_image(folder / "dev" / name / "images" / f"{name}.jpg")
         found = detect_lines(image, build_vertical_table(camera))
-        bearings[name] = found.alpha_rad
+        bearings[name] = found.lines.alpha_rad
         lines = np.array([line["alpha"] for line in real["york"] if line["length"] >= 30])
-        for k, _, error_deg in score.match(found.alpha_rad, lines, 0.5):
-            covered.append(abs(np.radians(error_deg)) < 2.0 * found.sigma_rad[k])
+        for k, _, error_deg in score.match(found.lines.alpha_rad, lines, 0.5):
+            covered.append(abs(np.radians(error_deg)) < 2.0 * found.lines.sigma_rad[k])
     limits = type("Limits", (), {"min_gt_len": 30.0, "gt_gap": 10.0})
     result = score.score(bearings, annotated, limits)
     assert result["recall_york@0.25"] > 0.90
@@ -443,7 +447,7 @@ def test_rendered_office(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for frame in real["frames"]:
         image = read_image(folder / "r1" / "images" / f"{frame['prefix']}.jpg")
         found = detect_lines(image, table)
-        bearings = zip(found.alpha_rad, found.beta_rad, found.sigma_rad)
+        bearings = zip(found.lines.alpha_rad, found.lines.beta_rad, found.lines.sigma_rad)
         rows[frame["prefix"]] = {"L": [[0, 0, 0, 0, a, b, 0, s] for a, b, s in bearings]}
         if found.tilt is not None and found.tilt.lines >= 5:
             error = np.array([found.tilt.pitch_rad, found.tilt.roll_rad]) - frame["tilt"]

@@ -94,14 +94,6 @@ def test_errors_are_distances_of_matched_rows() -> None:
     assert found.error_95_m == pytest.approx(np.quantile(errors, 0.95))
 
 
-def test_qualities_are_medians_of_their_rows() -> None:
-    found = compare(REFERENCE, DETECTED)
-    assert found.reference_quality_matched == pytest.approx(np.median([0.98, 0.8, 0.96, 0.84]))
-    assert found.reference_quality_missed == pytest.approx(0.92)
-    assert found.detected_quality_matched == pytest.approx(np.median([0.97, 0.7, 0.95, 0.83]))
-    assert found.detected_quality_extra == pytest.approx(0.6)
-
-
 def test_distance_bins_hold_each_row_once() -> None:
     found = compare(REFERENCE, DETECTED)
     by_start = {part.from_m: part for part in found.bins}

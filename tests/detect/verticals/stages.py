@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import LineNumbers, LineSettings
+from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals import starts
 from detect.verticals.judgement import Judgement, fit_and_judge
 from detect.verticals.refinement import step_filters
 from detect.verticals.response import line_filter, strip_of
 from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
-from detect.verticals.tilt import with_error
-from detect.verticals.tracking import LineTracks, follow_again, follow_edges
+from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, with_error
+from detect.verticals.tracking import LineTracks, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -47,7 +47,7 @@ def tracks_again(
     """Some of the tracks followed again along the verticals of a tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect).tracking
     window, strip = line_filter(settings), strip_of(table)
-    return follow_again(image, strip, window, starts, numbers, tracks, again, tilt_rad)
+    return follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
 
 
 def judge_tracks(
@@ -66,3 +66,19 @@ def judge_tracks(
         return judged
     tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
     return judged._replace(tilt=tilt)
+
+
+def consensus(
+    lines: Verticals, settings: LineSettings = DEFAULT
+) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
+    """The tilt by lines that are edges of their own, with its error, and which agree with it."""
+    numbers = LineNumbers.of(settings).tilt
+    tilt, consistent = agree_on_tilt(lines, numbers)
+    if tilt.lines == 0:
+        return None, consistent
+    return with_error(tilt, lines, np.arange(len(lines.weight)), numbers), consistent
+
+
+def last_rows(tracks: LineTracks) -> NDArray[np.int32]:
+    """(T,) the last row of each track."""
+    return tracks.row[tracks.bounds[1:] - 1]

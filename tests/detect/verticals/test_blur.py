@@ -91,16 +91,16 @@ def test_blurred_edges_are_where_sharp_ones_are(turned_px: int, blur_px: float) 
     image = seen(turned_px, blur_px)
     found = detect_lines(image, TABLE)
     assert len(found) == len(EDGES)
-    error = found.alpha_rad - BEARINGS
+    error = found.lines.alpha_rad - BEARINGS
     np.testing.assert_allclose(error, 0.0, atol=1.5e-3)
-    assert np.mean((error / found.sigma_rad) ** 2) < 1.5
+    assert np.mean((error / found.lines.sigma_rad) ** 2) < 1.5
     assert found.tilt is not None
     off = np.array([found.tilt.pitch_rad - 0.01, found.tilt.roll_rad + 0.006])
     assert np.abs(off).max() < np.radians(0.3)
     assert off @ np.linalg.solve(found.tilt.covariance, off) < 13.8
     # As narrow as it is set, the filter finds less of them, or finds them elsewhere.
     before = detect_lines(image, TABLE, NEVER_WIDER)
-    worst = np.abs(before.alpha_rad[:, None] - BEARINGS).min(axis=1).max(initial=0.0)
+    worst = np.abs(before.lines.alpha_rad[:, None] - BEARINGS).min(axis=1).max(initial=0.0)
     assert len(before) < len(EDGES) or worst > 2.0 * np.abs(error).max()
 
 
@@ -110,7 +110,7 @@ def test_sharp_images_are_looked_at_once() -> None:
     assert len(found) == len(EDGES)
     assert found.sharpness > DEFAULT.blurred_sharpness
     again = detect_lines(image, TABLE, NEVER_WIDER)
-    np.testing.assert_array_equal(found.line_numbers, again.line_numbers)
+    np.testing.assert_equal(found.lines, again.lines)
     np.testing.assert_array_equal(found.tracks.column, again.tracks.column)
 
 

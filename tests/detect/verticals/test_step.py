@@ -24,8 +24,8 @@ def only_line(
     """Detection, its error and its predicted standard deviation due to noise, in pixels."""
     found = detect_lines(image, table, SETTINGS)
     assert len(found) == 1
-    pixel = found.fits.pixel_rad[found.members[0][0]]
-    return found, (found.alpha_rad[0] - bearing_rad) / pixel, found.noise_rad[0] / pixel
+    pixel = found.judged.fits.pixel_rad[found.members[0][0]]
+    return found, (found.lines.alpha_rad[0] - bearing_rad) / pixel, found.lines.noise_rad[0] / pixel
 
 
 def bearing_at(camera: Camera, table: VerticalTable, offset_px: float) -> float:
@@ -91,7 +91,9 @@ def test_scatter_under_noise_is_the_predicted_one(
         errors.append(error)
         predicted.append(sigma)
         track = found.members[0][0]
-        leans.append(found.fits.line[track, 1] / np.sqrt(found.fits.covariance[track, 1, 1]))
+        leans.append(
+            found.judged.fits.line[track, 1] / np.sqrt(found.judged.fits.covariance[track, 1, 1])
+        )
     # 120 draws know a standard deviation to 6.5 %.
     assert np.std(errors) == pytest.approx(np.sqrt(np.mean(np.square(predicted))), rel=0.2)
     assert abs(np.mean(errors)) < 0.02
@@ -102,10 +104,10 @@ def test_uncertainty_of_a_row_has_a_floor_of_sigma_px() -> None:
     camera = pinhole(120, 90)
     table = build_vertical_table(camera)
     found, _, _ = only_line(render(camera, [Edge(0.01, 150.0)]), table, 0.01)
-    pixel = found.fits.pixel_rad[found.members[0][0]]
-    expected = np.hypot(found.noise_rad[0], DEFAULT.sigma_px * pixel)
-    assert found.sigma_rad[0] == pytest.approx(expected)
-    assert found.noise_rad[0] < 0.05 * pixel
+    pixel = found.judged.fits.pixel_rad[found.members[0][0]]
+    expected = np.hypot(found.lines.noise_rad[0], DEFAULT.sigma_px * pixel)
+    assert found.lines.sigma_rad[0] == pytest.approx(expected)
+    assert found.lines.noise_rad[0] < 0.05 * pixel
 
 
 def test_neighbouring_edges_do_not_push_each_other() -> None:
@@ -115,4 +117,6 @@ def test_neighbouring_edges_do_not_push_each_other() -> None:
     left, right = bearing_at(camera, table, 0.3), bearing_at(camera, table, 5.3)
     image = render(camera, [Edge(left, 100.0), Edge(right, -100.0)], grey=80.0)
     found = detect_lines(image, table)
-    np.testing.assert_allclose(found.alpha_rad, [left, right], atol=0.1 * found.fits.pixel_rad[0])
+    np.testing.assert_allclose(
+        found.lines.alpha_rad, [left, right], atol=0.1 * found.judged.fits.pixel_rad[0]
+    )

@@ -17,12 +17,12 @@ from detect.verticals.tilt import (
     TiltEstimate,
     Verticals,
     agree_on_tilt,
-    consensus,
     gather,
     level_matrix,
 )
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.verticals.stages import consensus
 
 SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
 #: The covariance is that of least squares: lines err one by one.

@@ -15,11 +15,11 @@ from detect.verticals.tilt import (
     TOGETHER_RAD,
     TiltEstimate,
     Verticals,
-    consensus,
     gather,
     merge_lines,
     with_error,
 )
+from tests.detect.verticals.stages import consensus
 from tests.reference.verticals import tilt_error
 
 SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)

@@ -18,6 +18,7 @@ from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import (
+    last_rows,
     line_starts,
     line_tracks,
     start_response,
@@ -155,11 +156,11 @@ def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
     starts = line_starts(image, TABLE, replace(DEFAULT, start_band_rows=0))
     tracks = line_tracks(image, starts, TABLE, DEFAULT)
     assert len(tracks.polarity) == 1
-    assert tracks.top_row[0] == DEFAULT.border_rows
+    assert tracks.row[0] == DEFAULT.border_rows
     if gap == 5:
-        assert tracks.bottom_row[0] == 63 - DEFAULT.border_rows
+        assert last_rows(tracks)[0] == 63 - DEFAULT.border_rows
     else:
-        assert tracks.bottom_row[0] < below + 3
+        assert last_rows(tracks)[0] < below + 3
 
 
 def test_tracks_know_polarity_and_follow_subpixel() -> None:
@@ -187,8 +188,8 @@ def test_tracks_of_lines_leave_edges_that_bend() -> None:
         line_tracks(image, starts, TABLE, replace(DEFAULT, guided=guided))
         for guided in (True, False)
     )
-    assert 40 <= straight.bottom_row[0] <= 52
-    assert curved.bottom_row[0] >= 58
+    assert 40 <= last_rows(straight)[0] <= 52
+    assert last_rows(curved)[0] >= 58
 
 
 def test_tracks_are_followed_again_along_verticals() -> None:
@@ -199,11 +200,11 @@ def test_tracks_are_followed_again_along_verticals() -> None:
     starts = line_starts(image, TABLE, DEFAULT)
     tracks = line_tracks(image, starts, TABLE, DEFAULT)
     np.testing.assert_array_equal(np.sort(tracks.polarity), [-1.0, 1.0])
-    np.testing.assert_array_equal(tracks.bottom_row, 61)
+    np.testing.assert_array_equal(last_rows(tracks), 61)
     leaning = tracks.polarity < 0.0
     found = tracks_again(image, starts, tracks, leaning, (0.0, 0.0), TABLE, DEFAULT)
     np.testing.assert_array_equal(found.polarity, [1.0, -1.0])
-    assert 45 <= found.bottom_row[1] <= 57
+    assert 45 <= last_rows(found)[1] <= 57
     below = slice(found.bounds[1], found.bounds[2])
     straight = found.row[below] <= 38
     np.testing.assert_allclose(found.column[below][straight], 59.5, atol=0.1)
@@ -226,7 +227,7 @@ def test_edges_that_come_in_at_the_side_are_followed() -> None:
     again = np.ones(len(tracks.polarity), np.bool_)
     found = tracks_again(image, starts, tracks, again, (0.0, 0.0), table, DEFAULT)
     assert len(found.polarity) == 2
-    assert found.points.min() > 90
+    assert np.diff(found.bounds).min() > 90
 
 
 def test_no_horizon_no_tracks() -> None:
@@ -251,7 +252,7 @@ def test_tracks_see_nearly_the_response_of_the_whole_strip(
     image = render(seen, edges, noise=4.0, rng=np.random.default_rng(1))
     response = line_response(image, table, preset)
     tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
-    assert tracks.points.sum() > 100
+    assert len(tracks.row) > 100
     off = np.abs(highest_near(tracks, response) - tracks.score)
     # Along the edge instead of the vertical a leaning edge is seen a little better.
     assert np.quantile(off, 0.9) <= (0.1 if tilt_deg == 0.0 else 0.12)
@@ -259,7 +260,7 @@ def test_tracks_see_nearly_the_response_of_the_whole_strip(
 
 def highest_near(tracks: LineTracks, response: np.ndarray) -> np.ndarray:
     """Of the three columns round each point the highest response of its sign."""
-    polarity = np.repeat(tracks.polarity, tracks.points)
+    polarity = np.repeat(tracks.polarity, np.diff(tracks.bounds))
     column = np.rint(tracks.column).astype(int)
     around = response[tracks.row[:, None], column[:, None] + [-1, 0, 1]]
     return np.asarray((polarity[:, None] * around).max(axis=1))
@@ -276,7 +277,7 @@ def test_tracks_see_nearly_the_same_response_at_the_borders() -> None:
         preset = replace(preset, border_rows=0, threshold=0.1)
         response = line_response(image, table, preset)
         tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
-        assert tracks.points.sum() > 300
+        assert len(tracks.row) > 300
         off = np.abs(highest_near(tracks, response) - tracks.score)
         assert np.quantile(off, 0.9) <= 0.1
 
