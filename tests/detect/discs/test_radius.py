@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from functools import cache
 from pathlib import Path
@@ -74,19 +75,28 @@ def run(published_camera: Camera, published_cam_text: str, tmp_path: Path) -> Pa
     return folder
 
 
+def number_in(text: str, words: str) -> float:
+    found = re.search(rf"{words} ?([0-9.]+)", text)
+    assert found is not None, text
+    return float(found[1])
+
+
 def test_a_run_is_detected_at_the_radius_found(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["circles", str(run), "--radius-m", "auto"]) == 0
     said = capsys.readouterr()
-    assert "discs have a radius of 0.06" in said.err
+    radius = number_in(said.err, "discs have a radius of")
+    assert radius == pytest.approx(0.06, rel=0.02)
     assert "48 discs in 12 frames" in said.out
-    assert "radius_m=0.06" in (run / "detected.circles").read_text()
+    used = number_in((run / "detected.circles").read_text(), "radius_m=")
+    assert used == pytest.approx(radius, abs=1e-4)
 
 
 def test_another_radius_is_offered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["circles", str(run)]) == 0
-    assert "looks as if their radius were 0.06" in capsys.readouterr().err
+    offered = number_in(capsys.readouterr().err, "looks as if their radius were")
+    assert offered == pytest.approx(0.06, rel=0.02)
 
 
 def test_where_there_are_no_discs_it_is_said_what_to_look_at(
