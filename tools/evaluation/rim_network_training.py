@@ -7,7 +7,6 @@ Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -225,33 +224,9 @@ def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> ND
     return np.asarray(odds, np.float64)
 
 
-def cross_validation(glances: Looks, looks: Looks, seed: int) -> Iterable[str]:
-    """What networks find in each building that was left out of training them, line by line."""
-    buildings, glanced = (
-        np.array([source.split()[0] for source in of.source]) for of in (looks, glances)
-    )
-    for left_out in np.unique(buildings[looks.source == buildings]):
-        own, seen = looks.source == left_out, glances.source == left_out
-        if not looks.is_disc[own].any():
-            continue
-        network = train_glance(glances, glanced != left_out, seed)
-        odds = log_odds(network, glances, seen)
-        passed = [(odds[glances.is_disc[seen] == disc] >= 0.0).mean() for disc in (True, False)]
-        odds = log_odds(train(looks, buildings != left_out, SHAPES["look"], seed), looks, own)
-        discs, others = odds[looks.is_disc[own]], odds[~looks.is_disc[own]]
-        text = ", ".join(
-            f">= {t:g}: {(discs >= t).sum()}/{len(discs)} discs, {(others >= t).sum()} others"
-            for t in np.arange(-1.0, 2.01, 0.5)
-        )
-        yield (
-            f"left out {left_out}: glances keep {passed[0]:.3f} of discs, {passed[1]:.3f} else;"
-            f" {text}"
-        )
-
-
 @dataclass(frozen=True)
 class TrainRimNetwork:
-    """Train the networks that judge candidates, and print their finds in unseen buildings."""
+    """Train the networks that judge candidates of discs."""
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
     every: int = 4  # Every n-th frame of the recorded run is used.
@@ -265,8 +240,6 @@ class TrainRimNetwork:
         glances, looks = gather(self.data, self.every, self.scenes, self.seed)
         for kind, of in (("glances", glances), ("looks", looks)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
-        for line in cross_validation(glances, looks, self.seed):
-            print(line)
         networks = train_all(glances, looks, self.seed)
         self.output.parent.mkdir(parents=True, exist_ok=True)
         weights: dict[str, Any] = {
