@@ -17,7 +17,9 @@ from camera.calibration.calibrate import _ASPECT_SIGMA
 from camera.calibration.choice import _POLYNOMIAL_WORTH, _TANGENTIAL_WORTH
 from camera.calibration.start import _FOCAL_WIDTHS
 from camera.formats.conversion import _NEAR_PX
-from detect.discs.rim import STEPS
+from detect.discs.hough import _MOST_DOUBTFUL
+from detect.discs.judgement import GLANCED, GLANCED_AT
+from detect.discs.rim import DIRECTIONS
 from detect.line_settings import LineSettings
 from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
 from redetect.cli import PROGRAMS
@@ -33,13 +35,7 @@ DISCS, MARKERS, LINES = CircleSettings(), MarkerSettings(), LineSettings()
 #: What documents say without naming a flag: the page, the sentence with its numbers, and these.
 SENTENCES: list[tuple[str, str, list[float]]] = [
     ("README.md", r"for unknown within #°", [DISCS.tilt_sigma_deg]),
-    ("docs/discs.md", r"of radius # and # m, are projected",
-     [DISCS.inner_radius_m, DISCS.outer_radius_m]),
-    ("docs/discs.md", r"a disc of # m has the one", [DISCS.radius_m]),
     ("docs/discs.md", r"# grey values are taken from each", [DISCS.samples]),
-    # A disc's best centres are half a separation apart.
-    ("docs/discs.md", r"less than # m apart on the floor the best stays",
-     [0.5 * DISCS.separation_m]),
     ("docs/discs.md", r"# pairs of samples at # and # radii; .*?; # must;",
      [PUBLISHED.samples, PUBLISHED.inner_ring, PUBLISHED.outer_ring, PUBLISHED.least_pairs]),
     ("docs/discs.md", r"quality above # and contrast above # grey levels",
@@ -49,10 +45,10 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
     ("docs/discs.md", r"# of # pairs at # and # radii, quality > #, contrast > #",
      [PUBLISHED.least_pairs, PUBLISHED.samples, PUBLISHED.inner_ring, PUBLISHED.outer_ring,
       PUBLISHED.threshold, PUBLISHED.least_contrast]),
-    ("docs/discs.md", r"quality ≥ # between # and # radii",
-     [DISCS.threshold, DISCS.inner_ring, DISCS.outer_ring]),
-    ("docs/discs.md", r"suppression within # radii", [DISCS.separation]),
-    ("docs/discs.md", r"its rim is followed in # directions", [STEPS]),
+    ("docs/discs.md", r"the best within # radii on the floor", [DISCS.separation]),
+    ("docs/discs.md", r"the rim is followed in # directions", [DIRECTIONS]),
+    ("docs/discs.md", r"at # directions times # pixels", [GLANCED, len(GLANCED_AT)]),
+    ("docs/discs.md", r"The best # centres of either polarity", [_MOST_DOUBTFUL]),
     ("docs/discs.md", r"and a tilt of #°", [DISCS.tilt_sigma_deg]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),
     ("docs/markers.md", r"takes #, #, #, # and #", list(MARKERS.thresholds)),
