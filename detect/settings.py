@@ -69,7 +69,7 @@ class CircleSettings:
     #: highest quality, as published.
     refine: bool = True
     #: Least evidence of a disc that is found by its rim, log-odds (`detect.discs.judgement`).
-    evidence: Annotated[float, FINITE] = 0.0
+    evidence: Annotated[float, FINITE] = -0.25
     #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
     #: Error of a calibration that does not state its covariance, pixels: added to a refined

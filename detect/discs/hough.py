@@ -31,7 +31,7 @@ from redetect.compiled import kernel
 FloatArray = NDArray[np.float64]
 
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
-_BACKGROUND = 0.45
+_BACKGROUND = 0.3
 #: Least score of a candidate; of those below a clear one, how many an image may have; and how many
 #: of all before suppression.
 _LEAST_SCORE, _CLEAR_SCORE, _MOST_DOUBTFUL, _MOST_PEAKS = 1.7, 3.0, 80, 4000
