@@ -35,7 +35,7 @@ from detect.comparison.result import (
     quantile,
 )
 from detect.errors import CompareError
-from detect.seen import Sight
+from detect.seen import LEAST_GATE_PX, Sight
 from detect.sources.image_files import image_name
 from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
@@ -125,7 +125,14 @@ def compare_frames(
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    common = match_runs("circles", wanted, found, options, names, sight, unlisted)
+    match = partial(match_runs, "circles", wanted, found, options, names, unlisted=unlisted)
+    common = match(sight)
+    if sight is not None and not sight.reference_level:
+        # A file need not say that its rows are level: then they are in the images where these are.
+        level_sight = replace(sight, reference_level=True)
+        as_level = match(level_sight)
+        if _image_cost(as_level["frames"]) < _image_cost(common["frames"]):
+            common, sight = as_level, level_sight
     matches: Sequence[FrameMatch] = common["frames"]
     first, second, _, extra = sides = (
         circle_arrays([row for m in matches for row in m.paired[0]]),
@@ -154,8 +161,17 @@ def compare_frames(
         image_95_px=quantile(image_px, 0.95),
         reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
+        reference_level=sight is not None and sight.reference_level,
         pairs=pairs,
     )
+
+
+def _image_cost(matches: Iterable[FrameMatch]) -> float:
+    """Squared distances of matched discs in the images, in gates, and what was not matched."""
+    costs = [
+        len(m.missed) + np.fmin((apart_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
+    ]
+    return float(np.sum(costs))
 
 
 def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:

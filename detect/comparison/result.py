@@ -248,6 +248,7 @@ class DiscComparison(Comparison):
     image_95_px: float | None
     reference_levelled: int  # frames whose rows are levelled by a tilt
     detected_levelled: int
+    reference_level: bool  # its other rows are level, too: it says so, or they fit the images so
     pairs: DiscPairs = field(repr=False)
 
     def _beyond(self) -> str:
