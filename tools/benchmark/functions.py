@@ -12,7 +12,7 @@ import numpy as np
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
 from detect.cli import carry_out
-from detect.discs.quality import quality_of_centres
+from detect.discs.quality import Limits, centres_of, quality_of_centres
 from detect.grey_values import estimate_noise
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
@@ -20,12 +20,13 @@ from detect.lines import detect_lines
 from detect.options import All, Circles, Lines
 from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings
+from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import BenchmarkError, Picture
 
 #: What everything else is compared with.
 DECODING = "decoding"
-KERNEL = "quality map (report)"
+KERNEL, RESPONSE = "quality map (report)", "response (dense)"
 CIRCLES, LINES, ALL = "circles (default)", "lines (default)", "lines, tilt and discs"
 
 #: Radii of circles for the Hough transforms, pixels: those of the demo run's discs along u.
@@ -64,7 +65,9 @@ def all_detectors(camera: Camera) -> dict[str, Function]:
 
     return {
         KERNEL: lambda p: quality_of_centres(p.grey, report),
+        "good centres (report)": lambda p: centres_of(p.grey, report, Limits(REPORT.threshold)),
         "noise estimate": lambda p: estimate_noise(p.grey),
+        RESPONSE: lambda p: line_response(p.grey, verticals, LINES_DEFAULT),
         **whole_detectors(camera),
         ALL: everything,
     }

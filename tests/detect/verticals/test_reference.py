@@ -17,11 +17,11 @@ from detect.verticals.refinement import (
     newton_step,
     step_filters,
 )
+from detect.verticals.response import line_response
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable, build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.dense_response import line_response
 from tests.detect.verticals.stages import judge_tracks, line_tracks, start_response
 from tests.reference import verticals as reference
 

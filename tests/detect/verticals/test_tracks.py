@@ -12,12 +12,11 @@ from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.verticals import starts
-from detect.verticals.response import weights_across
+from detect.verticals.response import line_response, weights_across
 from detect.verticals.starts import LineStarts, start_band
 from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.dense_response import line_response
 from tests.detect.verticals.stages import (
     last_rows,
     line_starts,

@@ -16,6 +16,7 @@ from tools.benchmark.functions import (
     DECODING,
     KERNEL,
     LINES,
+    RESPONSE,
     commands,
     perform,
 )
@@ -92,7 +93,7 @@ def test_the_command_measures_everything(
     assert kinds[0] == ["", "demo", "noise", "photographs"]
     names = {row[0] for row in kinds[2:]}
     assert len(names) == len(kinds) - 2
-    assert {DECODING, KERNEL, CIRCLES, LINES, ALL} <= names
+    assert {DECODING, KERNEL, CIRCLES, RESPONSE, LINES, ALL} <= names
     assert {"cv2.HoughCircles", "cv2.SimpleBlobDetector", "skimage hough_circle"} <= names
     assert all(cell.endswith(" ms") for row in kinds[2:] for cell in row[1:])
     assert [float(size) for size in sizes[0][1:]] == pytest.approx(
