@@ -12,7 +12,7 @@ import numpy as np
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
 from detect.cli import carry_out
-from detect.discs.quality import Limits, centres_of, quality_of_centres
+from detect.discs.quality import quality_of_centres
 from detect.grey_values import estimate_noise
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
@@ -65,7 +65,6 @@ def all_detectors(camera: Camera) -> dict[str, Function]:
 
     return {
         KERNEL: lambda p: quality_of_centres(p.grey, report),
-        "good centres (report)": lambda p: centres_of(p.grey, report, Limits(REPORT.threshold)),
         "noise estimate": lambda p: estimate_noise(p.grey),
         RESPONSE: lambda p: line_response(p.grey, verticals, LINES_DEFAULT),
         **whole_detectors(camera),

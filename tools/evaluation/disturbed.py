@@ -247,7 +247,7 @@ def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
     )
     blurred = ((kind, _cell(by_kind[kind][0.0])) for kind in BLURRED)
     lines += ["", *markdown_table(("family", "found, error, normalised"), blurred)]
-    others = ((kind, _digits(by_kind[kind][0.0].recall, 3)) for kind in LOOK_ALIKES)
+    others = ((kind, f"{by_kind[kind][0.0].recall:.3f}") for kind in LOOK_ALIKES)
     lines += ["", *markdown_table(("look-alike", "rows for each"), others)]
     elsewhere = sum(tally.elsewhere for _, _, tally in results)
     scenes = sum(tally.shown for _, _, tally in results) / _PER_SCENE
@@ -256,12 +256,7 @@ def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
 
 
 def _cell(tally: Tally) -> str:
-    rms, normalised = _digits(tally.rms_px, 2), f"{tally.normalised_error:.2f}"
-    return f"{_digits(tally.recall, 3)}, {rms} px, {normalised}"
-
-
-def _digits(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}".removeprefix("0") if value < 1.0 else f"{value:.{digits}f}"
+    return f"{tally.recall:.3f}, {tally.rms_px:.2f} px, {tally.normalised_error:.2f}"
 
 
 def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> ByteArray:
@@ -273,9 +268,8 @@ def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> Byte
         image, places = render_scene(stage, kind, share, rng)
         place = min(places, key=lambda at: abs(float(np.hypot(*at)) - 1.8))
         panels.append(_panel(image, stage.outline(place, 2.5), kind))
-    blank = np.full_like(panels[0], 255)
     columns = 6
-    panels += [blank] * (-len(panels) % columns)
+    panels += [np.full_like(panels[0], 255)] * (-len(panels) % columns)
     rows = [np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)]
     return np.vstack(rows)
 
@@ -286,9 +280,8 @@ def _panel(image: ByteArray, outline: FloatArray, name: str) -> ByteArray:
     rows = np.linspace(middle[1] - half / 2.0, middle[1] + half / 2.0, 160)
     columns = np.linspace(middle[0] - half, middle[0] + half, 160)
     u, v = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-    crop = cv2.remap(image, u, v, cv2.INTER_NEAREST, borderValue=255)
     panel = np.full((190, 168), 255, np.uint8)
-    panel[26:186, 4:164] = crop
+    panel[26:186, 4:164] = cv2.remap(image, u, v, cv2.INTER_NEAREST, borderValue=255)
     cv2.putText(panel, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
     return panel
 

@@ -82,17 +82,19 @@ class Looks(NamedTuple):
     source: NDArray[np.str_]  # (N,)
 
 
+_NOWHERE = np.zeros((0, 4))
+
+
 class Truth(NamedTuple):
     """What is known of an image; places are (N, 4) pixels u, v, half width and height."""
 
-    light: FloatArray  # discs that are lighter than the floor,
-    dark: FloatArray  # and darker
-    unsure: FloatArray
+    light: FloatArray = _NOWHERE  # discs that are lighter than the floor,
+    dark: FloatArray = _NOWHERE  # and darker
+    unsure: FloatArray = _NOWHERE
     others: FloatArray | None = None  # where nothing is a disc; None: wherever else
 
 
 _Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
-_NOWHERE = np.zeros((0, 4))
 
 
 class _Gathering:
@@ -115,11 +117,10 @@ class _Gathering:
                 discs = truth.light if sign[k] > 0.0 else truth.dark
                 other = any(signs) and not signs[0 if sign[k] > 0.0 else 1]
                 is_disc = _nearest(uv, discs) < 0.6
+                elsewhere = min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
                 if truth.others is not None:
-                    counts = is_disc or _nearest(uv, truth.others) < 0.6
-                else:
-                    counts = is_disc or min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
-                if counts:
+                    elsewhere = _nearest(uv, truth.others) < 0.6
+                if is_disc or elsewhere:
                     counted = weight[0 if is_disc else 1] * (other_sign if other else 1.0)
                     yield k, is_disc, counted, source
 
@@ -223,11 +224,11 @@ def _scenes(
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
         at = _images(stage.camera, np.array(places))
         if kind in LOOK_ALIKES:
-            truth = Truth(_NOWHERE, _NOWHERE, _NOWHERE, at)
+            truth = Truth(others=at)
         else:
             heights = np.array([np.ptp(stage.outline(place)[:, 1]) for place in places])
             clear = heights >= 2.0 * _LEAST_HALF_PX
-            truth = Truth(at[clear], _NOWHERE, at[~clear])
+            truth = Truth(at[clear], unsure=at[~clear])
         gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN)
 
 
@@ -239,9 +240,9 @@ def _boards(
         path = photographs[rng.integers(len(photographs))]
         image, camera, places = render_board(_read(path), rng)
         at = _images(camera, places)
-        truth = Truth(_NOWHERE, at, _NOWHERE)
+        truth = Truth(dark=at)
         if k % 2:
-            image, truth = np.asarray(255 - image, np.uint8), Truth(at, _NOWHERE, _NOWHERE)
+            image, truth = np.asarray(255 - image, np.uint8), Truth(light=at)
         gathering.add(image, camera, truth, _BOARD, "boards")
 
 
@@ -253,7 +254,7 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
         # The building's camera tilts: what counts is where discs are in the image.
         seen = camera.floor_from_pixel(np.array([[c["u"], c["v"]] for c in frame["circles"]]))
         sure = np.array([c["mandatory"] for c in frame["circles"]], np.bool_)
-        truth = Truth(_images(camera, seen[sure]), _NOWHERE, _images(camera, seen[~sure]))
+        truth = Truth(_images(camera, seen[sure]), unsure=_images(camera, seen[~sure]))
         gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
         _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
 
@@ -265,7 +266,8 @@ def _real(
     """Look at frames of the recorded run, and at some of them with their discs disturbed."""
     for number, (path, mapped, rows_xy) in enumerate(frames):
         image = _read(path)
-        shipped = np.array([xy for xy in rows_xy if _is_mapped(camera, xy, mapped)]).reshape(-1, 2)
+        is_mapped = [_nearest(uv, mapped) < 1.0 for uv in camera.project_floor(rows_xy)]
+        shipped = rows_xy[np.array(is_mapped, np.bool_)]
         light = np.array([_is_light(image, camera, xy) for xy in shipped], np.bool_)
         of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
         gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
@@ -357,15 +359,13 @@ def _add_disturbed(
         place = _images(camera, at)
         kind = str(rng.choice(list(DISTURBANCES)))
         changed = disturbed(image, floor_xy, at, _RADIUS, kind, rng)
-        disc = Truth(place, _NOWHERE, _NOWHERE, others=_NOWHERE)
+        disc = Truth(place, others=_NOWHERE)
         gathering.add(changed, camera, disc, _DISTURBED, source)
         other = replaced(image, floor_xy, at, _RADIUS, str(rng.choice(LOOK_ALIKES)), rng)
         if rng.random() < 0.5:
             kind = str(rng.choice(list(DISTURBANCES)))
             other = disturbed(other, floor_xy, at, _RADIUS, kind, rng)
-        gathering.add(
-            other, camera, Truth(_NOWHERE, _NOWHERE, _NOWHERE, others=place), _DISTURBED, source
-        )
+        gathering.add(other, camera, Truth(others=place), _DISTURBED, source)
 
 
 def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatArray]]:
@@ -388,10 +388,6 @@ def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatA
         places = (discs - [x, y]) @ [[cos, -sin], [sin, cos]]
         near = places[np.hypot(*places.T) < 9.5]
         yield pose["prefix"], _images(seen, near, 4.0), shipped[pose["prefix"]]
-
-
-def _is_mapped(camera: Camera, floor_xy: FloatArray, mapped: FloatArray) -> bool:
-    return _nearest(camera.project_floor(floor_xy[None])[0], mapped) < 1.0
 
 
 def _is_light(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> bool:
