@@ -59,8 +59,8 @@ class CircleSettings:
     polarity: Polarity = "any"  #: Which discs to detect: lighter than the floor, darker, or both.
     #: Without a fit: the mean grey values of the outlines differ by more than this.
     least_contrast: NotNegative = 0.0
-    #: Least contrast between the outlines, in standard deviations of the image's noise (or in grey
-    #: levels, where the noise is less than one).
+    #: Least contrast of a disc, in standard deviations of the image's noise (or in grey levels,
+    #: where the noise is less than one).
     noise_floor: NotNegative = 3.0
     #: Of detections closer than this on the floor, in radii, only the best is reported; 0 reports
     #: all.

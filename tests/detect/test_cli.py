@@ -406,6 +406,6 @@ def test_help_needs_nothing_heavy(command: list[str]) -> None:
     )
     assert done.stderr == ""
     assert done.stdout.splitlines()[-1] == "exit 0 heavy []"
-    wanted = {"": ["circles", "compare"], "circles": ["--preset", "--radius-m", "--threshold"]}
+    wanted = {"": ["circles", "compare"], "circles": ["--preset", "--radius-m", "--evidence"]}
     for word in wanted.get(" ".join(command), ["--min-recall", "--reference"]):
         assert word in done.stdout

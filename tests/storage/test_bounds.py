@@ -26,6 +26,7 @@ NO_SETTINGS = frozenset(
 ENDLESS = {
     "CircleSettings": {"far_limit"},
     "DiscShape": {"far_limit_m_per_px"},
+    "VoteShape": {"far_limit_m_per_px"},
     "LineSettings": {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
         "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",

@@ -85,7 +85,7 @@ def test_one_of_them_makes_the_tables(
     capfd.readouterr()
     assert main([*arguments, str(tmp_path / "two"), "--jobs", "2"]) == 0
     said = capfd.readouterr().err
-    assert said.count("computing the table of discs") == 1
+    assert said.count("computing the table of votes") == 1
     assert said.count("computing the table of verticals") == 1
     for kind in ("circles", "lines", "tilt"):
         one, two = (tmp_path / name / f"detected.{kind}" for name in ("one", "two"))
