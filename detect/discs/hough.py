@@ -32,9 +32,10 @@ FloatArray = NDArray[np.float64]
 
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.3
-#: Least score of a candidate; of those below a clear one, how many an image may have; and how many
-#: of all before suppression.
-_LEAST_SCORE, _CLEAR_SCORE, _MOST_DOUBTFUL, _MOST_PEAKS = 1.7, 3.0, 80, 4000
+#: Least score of a candidate; of those below a clear one, how many an image may have, and how many
+#: are compared with their neighbours; and how many peaks there may be in all.
+_LEAST_SCORE, _CLEAR_SCORE = 1.7, 3.0
+_MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 80, 400, 4000
 #: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
 _APART = 0.6
 #: Sobel's kernel multiplies a step per pixel by this.
@@ -71,7 +72,9 @@ def hough_candidates(
     places, scores = [], []
     for votes in count_votes(image, table, radius * signs, least_step):
         place, score = _peaks(votes, table)
-        best = apart(place, np.argsort(-score, kind="stable"), _APART * radius)
+        best = np.argsort(-score, kind="stable")
+        best = best[: max(_MOST_COMPARED, np.count_nonzero(score >= _CLEAR_SCORE))]
+        best = apart(place, best, _APART * radius)
         best = best[: max(_MOST_DOUBTFUL, np.count_nonzero(score[best] >= _CLEAR_SCORE))]
         places.append(place[best] @ table.turn + table.foot)
         scores.append(score[best])

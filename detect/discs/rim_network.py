@@ -11,8 +11,8 @@ the greatest and the least of each channel, and weighs these together with some 
     log-odds = w4 [c, features] + b4
 
 A turn of the disc turns a and b and changes nothing else. Networks that were trained from several
-seeds are averaged; where the first sees no disc at all, the others are not asked. There are two
-sorts of them: one glances at every candidate, the other decides about those whose rim was followed.
+seeds are averaged; where the first is certain, the others are not asked. There are two sorts of
+them: one glances at every candidate, the other decides about those whose rim was followed.
 `python -m tools.evaluation train-rim-network` trains both.
 """
 
@@ -34,8 +34,8 @@ WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 OTHERS, SCALES = 2, 2
 #: Of the grey values' deviations, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-#: Log-odds by one network below which the others are not asked.
-HOPELESS = -4.0
+#: Log-odds by one network below and above which the others are not asked.
+HOPELESS, CERTAIN = -4.0, 5.0
 
 _Weights = NDArray[np.float32]
 
@@ -169,6 +169,6 @@ def network_log_odds(
             odds += max(unit, np.float32(0.0)) * network.out[n, d]
         for f in range(len(features)):
             odds += features[f] * network.out[n, units + f]
-        if n == 0 and odds < HOPELESS:
+        if n == 0 and not HOPELESS <= odds <= CERTAIN:
             return float(odds)
     return float(odds / members)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.rim_network import HOPELESS, RimNetwork
+from detect.discs.rim_network import CERTAIN, HOPELESS, RimNetwork
 
 FloatArray = NDArray[np.floating]
 
@@ -35,7 +35,7 @@ def log_odds_of(
         pooled = np.concatenate([b.mean(axis=0), b.max(axis=0), b.min(axis=0), scales])
         c = _relu(pooled @ w.dense + w.dense_bias)
         odds.append(w.out @ np.concatenate([c, features]) + w.out_bias)
-    return float(odds[0] if odds[0] < HOPELESS else np.mean(odds))
+    return float(np.mean(odds) if HOPELESS <= odds[0] <= CERTAIN else odds[0])
 
 
 def _convolved(values: FloatArray, weights: FloatArray) -> FloatArray:

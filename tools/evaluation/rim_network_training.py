@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
-from detect.discs.rim_network import HOPELESS, OTHERS, SCALES, Networks, RimNetwork
+from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
 from redetect.storage import write_whole
 from tools.evaluation.rim_data import Looks, gather
 
@@ -220,8 +220,8 @@ def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> ND
             w.dense, w.dense_bias, w.out[:, None], np.atleast_1d(w.out_bias),
         ]  # fmt: skip
         members.append(_Member(weights).log_odds(batch))
-    odds = np.where(members[0] < HOPELESS, members[0], np.mean(members, axis=0))
-    return np.asarray(odds, np.float64)
+    first, mean = members[0], np.mean(members, axis=0)
+    return np.where((first >= HOPELESS) & (first <= CERTAIN), mean, first).astype(np.float64)
 
 
 @dataclass(frozen=True)
