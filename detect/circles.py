@@ -30,7 +30,7 @@ from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
-from detect.errors import FrameError
+from detect.errors import DetectError, FrameError
 from detect.grey_values import blank_margins, estimate_noise, steep_gradient
 from detect.settings import CircleSettings, Polarity
 from lut import (
@@ -114,7 +114,12 @@ def detect_circles(
     ------
     FrameError
         If the image has not the camera's size.
+    DetectError
+        If the table is of the other detector.
     """
+    if isinstance(table, DiscTable) == settings.refine:
+        whose = "the published detector" if settings.refine else "the detector by rims"
+        raise DetectError(f"the table is of {whose}: expected disc_table(camera, settings)")
     if image.shape != (camera.height, camera.width):
         raise FrameError(
             f"the image is {image.shape[1]}x{image.shape[0]} px: "

@@ -24,7 +24,7 @@ from detect.circles import (
     quality_of_centres,
     tilt_jacobian,
 )
-from detect.errors import FrameError
+from detect.errors import DetectError, FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscTable, VoteTable, cached_disc_table, ring
 from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor, mirrored_camera
@@ -469,3 +469,13 @@ def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera
     assert result.failed <= 2  # four rows high, and alone in their images
     assert result.rms_px <= 0.02
     assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5
+
+
+def test_a_table_of_the_other_detector_is_refused(published_camera: Camera) -> None:
+    image = np.zeros((published_camera.height, published_camera.width), np.uint8)
+    for asked, other, whose in (
+        (DEFAULT, REPORT, "the published detector"),
+        (REPORT, DEFAULT, "the detector by rims"),
+    ):
+        with pytest.raises(DetectError, match=whose):
+            detect_circles(image, published_camera, table_of(published_camera, other), asked)
