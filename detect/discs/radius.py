@@ -48,7 +48,7 @@ def find_radius(
     evidence, discs = np.zeros(len(radii)), np.zeros(len(radii), np.int64)
 
     def try_radius(k: int) -> None:
-        tried = replace(settings, radius_m=float(radii[k]))
+        tried = replace(settings, radius_m=float(radii[k]), refine=True)
         table = build_vote_table(camera, vote_shape(tried))
         for image in images:
             found = detect_circles(image, camera, table, tried)

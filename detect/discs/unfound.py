@@ -26,7 +26,7 @@ from detect.circles import (
     judged,
     vote_shape,
 )
-from detect.discs.judgement import FATES, LEAST_RIM, RIM_RADIUS, Judgement
+from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, Judgement
 from detect.discs.radius import FACTOR, find_radius
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
@@ -119,11 +119,12 @@ def explain_discs(
     image : (H, W) uint8
     camera : Camera
     settings : CircleSettings
-        With `refine`: the published detector drops what is of a low quality, and nothing else.
+        Always with `refine`: the published detector drops what is of a low quality, and nothing
+        else.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found: candidates near it alone.
     """
-    scene = _Scene(image, camera, settings)
+    scene = _Scene(image, camera, replace(settings, refine=True))
     candidates = list(_candidates(scene))
     place = ""
     if at is not None:
@@ -137,6 +138,7 @@ def explain_discs(
 
 def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings) -> str:
     """A sentence on the candidates for discs in images (H, W) without any, and what they fail."""
+    settings = replace(settings, refine=True)
     scenes = (_Scene(image, camera, settings) for image in images)
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
@@ -266,7 +268,8 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
         yield f"--radius-m {radius_m:.3f} finds a disc {'there' if at is not None else 'here'}."
     rims = scene.judgement[1]
-    sizes = rims.radius[rims.log_odds > settings.evidence] / (RIM_RADIUS * settings.radius_m)
+    discs = (rims.fate == JUDGED) & (rims.log_odds > settings.evidence)
+    sizes = rims.radius[discs] / (RIM_RADIUS * settings.radius_m)
     if len(sizes) >= _FEWEST_RIMS:
         off = float(np.median(sizes)) - 1.0
         if abs(off) > _OTHER_RADIUS:

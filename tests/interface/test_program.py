@@ -151,6 +151,7 @@ def test_explain(demo_image: Path, demo: Path, tmp_path: Path, capsys: Captured)
     assert main(words) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "it is of the other polarity" in shown
+    assert "camera level" not in shown  # discs have the right size
     assert "Try: --polarity any finds 1 there." in shown
     content = json.loads((tmp_path / "why.json").read_text())
     assert [row["stage"] for row in content["candidates"]] == ["polarity"]

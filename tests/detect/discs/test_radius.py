@@ -93,6 +93,13 @@ def test_a_run_is_detected_at_the_radius_found(
     assert used == pytest.approx(radius, abs=1e-4)
 
 
+def test_the_published_detector_takes_the_radius_found(run: Path) -> None:
+    words = ["circles", str(run), "--preset", "published", "--radius-m", "auto"]
+    assert main(words) == 0
+    used = number_in((run / "detected.circles").read_text(), "radius_m=")
+    assert used == pytest.approx(0.06, rel=0.02)
+
+
 def test_another_radius_is_offered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["circles", str(run)]) == 0
     offered = number_in(capsys.readouterr().err, "looks as if their radius were")
