@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
+from redetect.landmarks.axes import covariance_from_dataset, from_dataset
 from redetect.landmarks.columns import TableName
 
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -33,8 +34,6 @@ Types = Mapping[str, Any]
 #: The values of a row's columns behind those of its frame.
 Values = Sequence[Any]
 
-# Forward and left, from left and backward.
-_FROM_DATASET = np.array([[0.0, -1.0], [1.0, 0.0]])
 _DELETE_ALL = 3  # Action of a `Marker`: those shown before go.
 # Kind of a `Marker` and its size (m), as a symbol of a disc, and of the bearing of a vertical.
 _CYLINDER_OR_ARROW = {"circles": (3, (0.2, 0.2, 0.01)), "lines": (0, (5.0, 0.02, 0.02))}
@@ -93,8 +92,8 @@ def _pose(types: Types, table: TableName, row: Values) -> Any:
     else:
         x, y, xx, xy, yy = *row[:2], *(row[3:6] if table == "circles" else row[2:5])
         part = slice(0, 2) if table == "circles" else slice(3, 5)
-        mean[part] = _FROM_DATASET @ [x, y]
-        covariance[part, part] = _FROM_DATASET @ [[xx, xy], [xy, yy]] @ _FROM_DATASET.T
+        mean[part] = from_dataset([x, y])
+        covariance[part, part] = covariance_from_dataset([[xx, xy], [xy, yy]])
     point = types["geometry_msgs/msg/Point"](*mean[:3])
     pose = types["geometry_msgs/msg/Pose"](point, _quaternion(types, mean[3:]))
     return types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())

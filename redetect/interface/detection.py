@@ -27,7 +27,7 @@ from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
-from redetect.slam.formats.text import MEANING, Axes, covariance_from_dataset, from_dataset
+from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]

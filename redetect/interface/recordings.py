@@ -27,7 +27,7 @@ from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
 from redetect.landmarks import Step
-from redetect.slam.formats.text import Axes
+from redetect.landmarks.axes import Axes
 
 PathLike = str | os.PathLike[str]
 

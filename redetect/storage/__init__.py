@@ -8,6 +8,7 @@ from redetect.storage.parts import demand_free as demand_free
 from redetect.storage.parts import demand_place as demand_place
 from redetect.storage.parts import demand_writable as demand_writable
 from redetect.storage.parts import write_bytes as write_bytes
+from redetect.storage.parts import write_text as write_text
 from redetect.storage.parts import write_whole as write_whole
 
 #: The version of this project, defined only here.

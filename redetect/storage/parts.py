@@ -190,6 +190,12 @@ def write_bytes(path: str | os.PathLike[str], content: bytes, *, overwrite: bool
         stream.write(content)
 
 
+def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
+    """Write rows of text, whole or not at all."""
+    content = "".join(f"{row}\n" for row in rows).encode("utf-8", "surrogateescape")
+    write_bytes(path, content, overwrite=overwrite)
+
+
 @contextmanager
 def folder_locked(folder: Path) -> Iterator[None]:
     """Lock a folder for the duration of a block; waits for other processes that hold the lock."""

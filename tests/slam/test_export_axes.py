@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.slam.formats.text import covariance_from_dataset, from_dataset, to_dataset
+from redetect.landmarks.axes import covariance_from_dataset, from_dataset, to_dataset
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, move
 
 

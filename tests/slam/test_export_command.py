@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import Path2D, read_path, write_path
 from redetect.slam.cli import main
-from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 

@@ -12,10 +12,10 @@ import pytest
 from camera import read_camera
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
+from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between, rotation
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
-from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 

@@ -12,10 +12,10 @@ import pytest
 
 from detect.cli import main as detect
 from redetect.array_types import FloatArray
+from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import read_path
 from redetect.plane import between
 from redetect.slam.cli import main as slam
-from redetect.slam.formats.text import from_dataset
 from redetect.slam.models import OdometryNoise, chain_steps
 from tests.detect.recordings import Ros, Said
 

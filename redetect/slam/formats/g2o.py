@@ -26,16 +26,16 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import is_positive_definite
-from redetect.plane import rotation
-from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import (
+from redetect.landmarks.axes import (
     covariance_from_dataset,
     from_dataset,
     to_dataset,
-    write_text,
 )
+from redetect.plane import rotation
+from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.storage import write_text
 from redetect.storage.bounded import read_text
 
 #: The largest number of a vertex: other tools keep it in 31 bits.

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from redetect.landmarks.axes import covariance_from_dataset, from_dataset
 from redetect.slam.formats.g2o import in_turned_axes
-from redetect.slam.formats.text import covariance_from_dataset, from_dataset
 from redetect.slam.recording import Recording
 
 _TRIANGLE_3 = ("cxx_m2", "cxy_m2", "cxphi_m_rad", "cyy_m2", "cyphi_m_rad", "cphiphi_rad2")

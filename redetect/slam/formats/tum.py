@@ -12,9 +12,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from redetect.landmarks import wrap_angle
+from redetect.landmarks.axes import from_dataset, to_dataset
 from redetect.landmarks.map_file import Path2D
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.text import from_dataset, to_dataset, write_text
+from redetect.storage import write_text
 from redetect.storage.bounded import rows_of_numbers
 
 _COLUMNS = "t x y z qx qy qz qw"

@@ -1,4 +1,4 @@
-"""Common parts of other tools' formats: axes, and text that is written.
+"""Axes of the data set's robot, and those of other tools.
 
 The data set's robot has X left and Y backward; other tools expect X forward and Y left. One
 rotation about Z by a quarter turn, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, leads
@@ -13,15 +13,12 @@ bits.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.storage import write_bytes
 
 Axes = Literal["robotics", "dataset"]
 
@@ -68,9 +65,3 @@ def covariance_from_dataset(
 def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
     order = _ORDER[:size]
     return order, (_SIGNS[order] if back else _SIGNS[:size])
-
-
-def write_text(path: str | os.PathLike[str], rows: Iterable[str], *, overwrite: bool) -> None:
-    """Write rows of text, whole or not at all."""
-    content = "".join(f"{row}\n" for row in rows).encode("utf-8", "surrogateescape")
-    write_bytes(path, content, overwrite=overwrite)
