@@ -30,7 +30,13 @@ from detect.discs.rim import (
     median,
     profiles,
 )
-from detect.discs.rim_network import Networks, RimNetwork, network_inputs, network_log_odds
+from detect.discs.rim_network import (
+    HOPELESS,
+    Networks,
+    RimNetwork,
+    network_inputs,
+    network_log_odds,
+)
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
@@ -49,8 +55,9 @@ _LEAST_GLANCE = 0.0
 LEAST_RIM = 0.3
 #: Radius of a rim that fits best, relative to the nominal one.
 RIM_RADIUS = 0.98
-#: A rim that looks worse or better than this by the log-odds is not followed from its own middle.
-_HOPELESS, _CERTAIN = -4.0, 2.5
+#: A rim that is hopeless or looks better than this by the log-odds is not followed from its own
+#: middle.
+_CERTAIN = 2.5
 #: Followed again it may lose this share and is still the better one.
 _SLACK = 0.07
 #: Nearer to another rim than this share of the radius it is the same.
@@ -175,7 +182,7 @@ def judge(
             continue
         seen = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
         odds, noted = _look(seen, rim, score[0], sign, networks.look)
-        if _HOPELESS <= odds < _CERTAIN:
+        if HOPELESS <= odds < _CERTAIN:
             # From its own middle a rim is seen best, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, seen, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
