@@ -21,9 +21,10 @@ A sector counts less if the model does not explain it, and if it shows the edge 
 others do: something else's edge. These weights are Tukey's biweights, found anew in every step
 (A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
 
-The errors of neighbouring pixels are not independent where the model does not fit; those of sectors
-apart from each other nearly are. So the covariance is that of the noise, and that of the jackknife,
-leaving out neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989).
+The errors of neighbouring pixels are not independent where the model does not fit. For the whole
+disc the correlation of its residuals says how much fewer they count. By parts, those of sectors
+apart from each other nearly are independent: the covariance is that of the noise and that of the
+jackknife, leaving out neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989).
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import project_floor_point
 from detect.discs.model import (
-    BY_BLUR,
+    BY_BLUR_1,
+    BY_BLUR_2,
     BY_RADIUS,
     BY_X,
     BY_Y,
     F32,
     FASTMATH,
-    PIXEL_VARIANCE,
     SHARE,
     Blur,
     Disc,
@@ -144,7 +145,7 @@ class Fit(NamedTuple):
     """A fitted disc; lengths in metres."""
 
     arrived: bool
-    """If not, the rest means nothing."""
+    """If not, the covariance is infinite and the rest means nothing."""
     x: float
     y: float
     radius: float
@@ -153,15 +154,15 @@ class Fit(NamedTuple):
     blur_bound: float
     """The most blur that the patch allowed."""
     contrast: float
-    """Grey level inside minus outside."""
+    """Grey level inside minus outside (by parts: of the first sector)."""
     explained: float
-    """Share of the variance about the background that the disc explains."""
+    """Share of the variance about the background that the disc explains (of the first sector)."""
     cov_xx: float
     cov_xy: float
     cov_yy: float
 
 
-NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf)
 
 
 class Edge(NamedTuple):
@@ -223,7 +224,7 @@ def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
         scene.image, scene.floor_xy, candidate, scene.blur_ratio, manner.reach, begin, patch
     )
     if ends[SECTORS] == 0:
-        return NO_FIT
+        return _NO_FIT
     per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
     level = float(scene.image[candidate.v, candidate.u])
     most_blur = _MOST_BLUR
@@ -248,25 +249,26 @@ def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
         grouped = products if by_parts else _sum_of(products)
         _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
         if by_parts and _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
-            return NO_FIT
+            return _NO_FIT
         if not abs(levels.contrast[0]) > 0.0 and not by_parts:
-            return NO_FIT
+            return _NO_FIT
         _scale(grouped, levels)
         _add_up(grouped, edge, usual, manner.radius_sigma, normal)
-        _solve(normal.copy(), movement)
-        is_short = math.hypot(movement[_X], movement[_Y]) < _ARRIVED
-        if step == _STEPS - 1 or (step > _EARLY and is_short):
+        _solve(normal.copy(), _BLUR_1, movement)
+        moves = math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS])
+        is_short = max(moves[0], moves[1]) < _ARRIVED
+        if is_short and step > _EARLY:
             break
-        edge = _moved(edge, movement, most_blur)
+        if step < _STEPS - 1:
+            edge = _moved(edge, movement, most_blur)
     last = _moved(edge, movement, most_blur)
     if by_parts:
-        left_out = _without_neighbours(normal, products)
+        xx, xy, yy = _covariance_by_parts(products, levels, normal)
     else:
-        left_out = _refitted(products, levels, normal, edge, usual, manner.radius_sigma)
-    xx, xy, yy = _covariance(left_out, normal, levels, by_parts)
+        xx, xy, yy = _covariance_of_whole(patch, rows, ends[SECTORS], products, normal)
     near = math.hypot(last.x - begin.x, last.y - begin.y) <= _MOST_OFF or not by_parts
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
-        return NO_FIT
+        return _NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
     area = manner.radius**2
     return Fit(
@@ -305,8 +307,6 @@ def _write_rows(
 ) -> None:
     """The derivatives by all unknowns, and the grey values (above `level`), for n pixels."""
     shares = patch.shares
-    variance_1 = F32(edge.blur.first**2 + PIXEL_VARIANCE)
-    variance_2 = F32(edge.blur.second**2 + PIXEL_VARIANCE)
     x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
     for i in range(n):
         x, y = patch.x[i] - x0, patch.y[i] - y0
@@ -319,13 +319,8 @@ def _write_rows(
         ramp = (math.sqrt(x * x + y * y) - r0) * (grey - black)
         rows[_SLOPE, i] = weight * (ramp if by_parts else x)
         rows[_CONTRAST, i] = weight * shares[SHARE, i]
-        # Which part of the blur across the edge is along the first axis.
-        g_1 = patch.x1[i] * x + patch.y1[i] * y
-        g_2 = patch.x2[i] * x + patch.y2[i] * y
-        by_1, by_2 = variance_1 * g_1 * g_1, variance_2 * g_2 * g_2
-        part = by_1 / (by_1 + by_2 + F32(1e-12))
-        rows[_BLUR_1, i] = weight * part * shares[BY_BLUR, i]
-        rows[_BLUR_2, i] = weight * (F32(1.0) - part) * shares[BY_BLUR, i]
+        rows[_BLUR_1, i] = weight * shares[BY_BLUR_1, i]
+        rows[_BLUR_2, i] = weight * shares[BY_BLUR_2, i]
         rows[_RADIUS, i] = weight * shares[BY_RADIUS, i]
         rows[_X, i] = weight * shares[BY_X, i]
         rows[_Y, i] = weight * shares[BY_Y, i]
@@ -451,12 +446,11 @@ def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
 @kernel()
 def _scale(grouped: FloatArray, levels: Levels) -> None:
     """Weigh what groups say of the disc: derivatives are by the shares, so times the contrast."""
-    groups = len(levels.weight)
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
             for s in range(grouped.shape[2]):
-                contrast = levels.contrast[s % groups]
-                scale = levels.weight[s % groups] * contrast * (1.0 if a == _GREY else contrast)
+                contrast = levels.contrast[s]
+                scale = levels.weight[s] * contrast * (1.0 if a == _GREY else contrast)
                 grouped[a, b, s] *= scale
 
 
@@ -468,32 +462,25 @@ def _add_up(
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
             normal[a, b, 0] = np.sum(grouped[a, b])
-    _expect(normal, edge, usual, radius_sigma)
-
-
-@kernel()
-def _expect(normal: FloatArray, edge: Edge, usual: Edge, radius_sigma: float) -> None:
-    """Add what is expected of radius and blur to normal equations."""
     for k, sigma, off in (
         (_RADIUS, radius_sigma, usual.radius - edge.radius),
         (_BLUR_1, _BLUR_SIGMA, math.log(usual.blur.first / edge.blur.first)),
         (_BLUR_2, _BLUR_SIGMA, math.log(usual.blur.second / edge.blur.second)),
     ):
-        for s in range(normal.shape[2]):
-            normal[k, k, s] += 1.0 / sigma**2
-            normal[_GREY, k, s] += off / sigma**2
+        normal[k, k, 0] += 1.0 / sigma**2
+        normal[_GREY, k, 0] += off / sigma**2
 
 
 @kernel()
-def _solve(normal: FloatArray, movement: FloatArray) -> None:
-    """Solve the normal equations of the disc (T, T, 1), which are overwritten."""
-    for k in range(_BLUR_1, _GREY):
+def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
+    """Solve normal equations (T, T, 1), which are overwritten, for all unknowns from the first."""
+    for k in range(first, _GREY):
         eliminate(normal, k)
-    for k in range(_Y, _BLUR_1 - 1, -1):
+    for k in range(_Y, first - 1, -1):
         rest = normal[_GREY, k, 0]
         for i in range(k + 1, _GREY):
-            rest -= normal[i, k, 0] * movement[i]
-        movement[k] = rest / normal[k, k, 0]
+            rest -= normal[i, k, 0] * unknowns[i]
+        unknowns[k] = rest / normal[k, k, 0] if normal[k, k, 0] > 0.0 else 0.0
 
 
 @kernel()
@@ -521,33 +508,6 @@ def _scaled(blur: float, step: float, most: float) -> float:
     return min(max(blur * math.exp(_within(step, _LONGEST_BLUR)), _LEAST_BLUR), most)
 
 
-@kernel()
-def _without_neighbours(total: FloatArray, products: FloatArray) -> FloatArray:
-    """(T, T, SECTORS) a total without that of each sector and the next ones."""
-    left_out = np.empty((_TERMS, _TERMS, SECTORS))
-    for a in range(_TERMS):
-        for b in range(a + 1):
-            for s in range(SECTORS):
-                left_out[a, b, s] = total[a, b, 0]
-                for k in range(_STRETCH):
-                    left_out[a, b, s] -= products[a, b, (s + k) % SECTORS]
-    return left_out
-
-
-@kernel()
-def _refitted(
-    products: FloatArray, levels: Levels, normal: FloatArray, edge: Edge, usual: Edge,
-    radius_sigma: float,
-) -> FloatArray:  # fmt: skip
-    """As `_without_neighbours`, with levels of the whole disc that are found anew."""
-    left_out = _without_neighbours(_sum_of(products), products)
-    for k in range(_BLUR_1):
-        eliminate(left_out, k)
-    _scale(left_out, levels)
-    _expect(left_out, edge, usual, radius_sigma)
-    return left_out
-
-
 @kernel(forceinline=True)
 def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
     """Covariance (xx, xy, yy) of the centre where everything else is eliminated."""
@@ -557,37 +517,78 @@ def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
 
 
 @kernel()
-def _covariance(
-    left_out: FloatArray, normal: FloatArray, levels: Levels, by_parts: bool
+def _covariance_of_whole(
+    patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray, normal: FloatArray
+) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre, by residuals that are as correlated as they are."""
+    unknowns = np.zeros(_TERMS)
+    _solve(_sum_of(products), 0, unknowns)
+    area = _correlated_area(patch, rows, n, unknowns)
+    for k in range(_BLUR_1, _X):
+        eliminate(normal, k)
+    xx, xy, yy = _inverse(normal, 0)
+    return area * xx, area * xy, area * yy
+
+
+@kernel(fastmath=FASTMATH)
+def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: FloatArray) -> float:
+    """How many pixels go with one independent residual, from the correlation of neighbours.
+
+    White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
+    the residuals are correlated, and their number overstates their information: for a first-order
+    process of correlation c by (1 + c) / (1 - c) in either direction.
+    """
+    residual = rows[_GREY, :n].copy()
+    for k in range(_GREY):
+        value = F32(unknowns[k])
+        for i in range(n):
+            residual[i] -= value * rows[k, i]
+    product = square = pairs = F32(0.0)
+    for i in range(1, n):
+        linked = F32(1.0) if patch.pixel[i] == patch.pixel[i - 1] + np.uint32(1) else F32(0.0)
+        here, before = residual[i], residual[i - 1]
+        product += linked * here * before
+        square += linked * (here * here + before * before)
+        pairs += linked
+    if not square > 0.0:
+        return 1.0
+    # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
+    correlation = min(max(2.0 * product / square - 1.5 / math.sqrt(pairs), 0.0), 0.8)
+    area: float = ((1.0 + correlation) / (1.0 - correlation)) ** 2
+    return area
+
+
+@kernel()
+def _covariance_by_parts(
+    products: FloatArray, levels: Levels, normal: FloatArray
 ) -> tuple[float, float, float]:
     """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors."""
+    left_out = np.empty((_TERMS, _TERMS, SECTORS))
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            for s in range(SECTORS):
+                left_out[a, b, s] = normal[a, b, 0]
+                for k in range(_STRETCH):
+                    left_out[a, b, s] -= products[a, b, (s + k) % SECTORS]
     for k in range(_BLUR_1, _X):
         eliminate(left_out, k)
         eliminate(normal, k)
     centres = np.empty((SECTORS, 2))
     mean_x = mean_y = 0.0
-    count = 0 if by_parts else SECTORS
+    count = 0
     for s in range(SECTORS):
         xx, xy, yy = _inverse(left_out, s)
         x, y = left_out[_GREY, _X, s], left_out[_GREY, _Y, s]
         centres[s, 0], centres[s, 1] = xx * x + xy * y, xy * x + yy * y
         mean_x, mean_y = mean_x + centres[s, 0] / SECTORS, mean_y + centres[s, 1] / SECTORS
-        if by_parts:
-            count += levels.weight[s] > 0.0
+        count += levels.weight[s] > 0.0
     xx = xy = yy = 0.0
     for s in range(SECTORS):
         x, y = centres[s, 0] - mean_x, centres[s, 1] - mean_y
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
     noise_xx, noise_xy, noise_yy = _inverse(normal, 0)
-    scale = (count - _STRETCH) / (count * _STRETCH)
-    if by_parts:
-        scale *= _INFLATION
-        return scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy
-    # by how much sectors differ more than noise lets them
-    area = noise_xx * noise_yy - noise_xy * noise_xy
-    more = scale * (xx * noise_yy - 2.0 * xy * noise_xy + yy * noise_xx) / (2.0 * area)
-    more = max(more, 1.0)
-    return more * noise_xx, more * noise_xy, more * noise_yy
+    scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
+    return scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy
 
 
 #: Memory that is new for every image has to be fetched first.

@@ -5,7 +5,7 @@ There are two formulas for it, `edge_shares` and `chord_shares`.
 Both see the floor as it is around each pixel: where it is, and by which steps it moves from pixel
 to pixel (`detect.discs.patch.PATCH`), in nominal radii. The blur is a Gaussian along the image's
 axes, of the optics' variance plus that of a pixel (1/12). The shares W and their derivatives by
-log blur, radius, x and y go into the five rows of the patch's `shares`.
+log blur along either axis, radius, x and y go into the six rows of the patch's `shares`.
 
 `edge_shares` is for discs that are large against the blur. Across its edge such a disc is a blurred
 step, moved and bent a little by the edge's curvature. With z the distance from the edge and t the
@@ -45,8 +45,8 @@ F32: Callable[[Any], Any] = np.float32
 #: that nothing is NaN or infinite.
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
-#: Rows of a patch's `shares`: of the disc, and the derivatives.
-SHARE, BY_BLUR, BY_RADIUS, BY_X, BY_Y = range(5)
+#: Rows of a patch's `shares`: of the disc, and the derivatives, by log blur along either axis first.
+SHARE, BY_BLUR_1, BY_BLUR_2, BY_RADIUS, BY_X, BY_Y = range(6)
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -162,7 +162,8 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         g1 = g1 * g1 * variance_1
         g2 = g2 * g2 * variance_2
         per_g = _1 / math.sqrt(g1 + g2 + _TINY)
-        optics = (g1 * optics_1 + g2 * optics_2) * per_g * per_g
+        by_1 = g1 * optics_1 * per_g * per_g
+        by_2 = g2 * optics_2 * per_g * per_g
         steps = patch.x1[i] * patch.y2[i] - patch.x2[i] * patch.y1[i]
         t = min(steps * steps * area * per_g * per_g * per_g * per_r0, _T_LIMIT)
         z_all = (r - r0) * per_g
@@ -182,9 +183,11 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         by_z = -density * (_1 + t * t * q_z)
         by_z = by_z if z == z_all else _0
         by_t = -density * (_HALF + t * (_2 * q + t * q_t))
+        by_t = by_t if t < _T_LIMIT else _0
         per_radius = by_z * per_g
         shares[SHARE, i] = _1 - outside
-        shares[BY_BLUR, i] = (by_t * t - by_z * z) * optics
+        shares[BY_BLUR_1, i] = by_t * t * (_2 * optics_1 - _3 * by_1) - by_z * z * by_1
+        shares[BY_BLUR_2, i] = by_t * t * (_2 * optics_2 - _3 * by_2) - by_z * z * by_2
         shares[BY_RADIUS, i] = -per_radius - by_t * t * per_r0
         shares[BY_X, i] = -per_radius * nx
         shares[BY_Y, i] = -per_radius * ny
@@ -287,9 +290,9 @@ def chord_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         total = _KERNEL_HEIGHT * half * r0 / reach
         by_along = total * per_sigma * (a[3] + b[3] + c[3] + d[3])
         by_across = total * per_sigma * per_length * (a[4] + b[4] + c[4] + d[4])
-        by_blur = optics_1 * (a[1] + b[1] + c[1] + d[1]) + optics_2 * (a[2] + b[2] + c[2] + d[2])
         shares[SHARE, i] = total * (a[0] + b[0] + c[0] + d[0])
-        shares[BY_BLUR, i] = total * by_blur
+        shares[BY_BLUR_1, i] = total * optics_1 * (a[1] + b[1] + c[1] + d[1])
+        shares[BY_BLUR_2, i] = total * optics_2 * (a[2] + b[2] + c[2] + d[2])
         shares[BY_RADIUS, i] = total * per_sigma * per_length * (a[5] + b[5] + c[5] + d[5])
         shares[BY_X, i] = by_along * along_x + by_across * across_x
         shares[BY_Y, i] = by_along * along_y + by_across * across_y

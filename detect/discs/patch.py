@@ -23,8 +23,8 @@ from detect.discs.model import (
 )
 from redetect.compiled import kernel
 
-#: Most pixels of a patch.
-CAPACITY = 4096
+#: Most pixels of a patch. No power of two: arrays that far apart would share lines of the cache.
+CAPACITY = 4000
 
 _VALUES = (np.float32, CAPACITY)
 #: A patch. A structure, so that the compiler knows that its arrays do not overlap.
@@ -43,7 +43,7 @@ PATCH = np.dtype(
         # By what share steps along the first axis grow from each to the next.
         ("growth", np.float32),
         # See `detect.discs.model`.
-        ("shares", np.float32, (5, CAPACITY)),
+        ("shares", np.float32, (6, CAPACITY)),
         ("sector", np.int32, CAPACITY),
         # Working space, of one row of the image: how it is taken, and places on the floor.
         ("taken", np.int32, CAPACITY),

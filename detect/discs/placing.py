@@ -10,7 +10,7 @@ circle: the squared distance of another one that is nearly as likely is in the c
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 #: Pixels of a whole disc, and of its edge.
-_WHOLE = Reach(radii=1.7, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
-_EDGE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
+WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
+EDGE_ALONE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
 #: Standard deviation of the radius, relative: about the nominal one, and about that which discs of
 #: the image seem to have. Of a short arc, place and radius trade off.
-_RADIUS_SIGMA, _APPARENT_SIGMA = 0.08, 0.02
+RADIUS_SIGMA, _APPARENT_SIGMA = 0.08, 0.02
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
 _WELL_EXPLAINED = 0.97
 #: From this share of the variance on that it explains, the fit of the whole disc gives the place:
@@ -46,6 +46,16 @@ _BLUR_PX = 1.0
 _DISAGREEMENT = 0.5
 #: Least number of whole discs that give the apparent radius.
 _LEAST_WHOLE = 3
+
+
+class Place(NamedTuple):
+    """Where a disc is, metres, and the covariance of that."""
+
+    x: float
+    y: float
+    cov_xx: float
+    cov_xy: float
+    cov_yy: float
 
 
 @kernel()
@@ -75,34 +85,50 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
         if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
             radii[clear] = fit.radius
             clear += 1
-    by_parts = Manner(True, apparent_radius(scene.radius, radii[:clear]), _APPARENT_SIGMA, _EDGE)
-    for k in range(count):
-        fit = whole[k]
+    by_parts = Manner(
+        True, apparent_radius(scene.radius, radii[:clear]), _APPARENT_SIGMA, EDGE_ALONE
+    )
+    for k, fit in enumerate(whole):
         if _explains(fit, discs, k):
-            place = fit.x, fit.y, fit.cov_xx, fit.cov_xy, fit.cov_yy
+            place = _place_of(fit)
             if fit.explained < _EXPLAINS_ALL:
-                parts = fit_disc(
-                    scene, Start(fit.x, fit.y, fit.radius, fit.blur), by_parts, work
-                )
-                if parts.arrived and _area(parts) < _area(fit):
-                    place = parts.x, parts.y, parts.cov_xx, parts.cov_xy, parts.cov_yy
+                start = Start(fit.x, fit.y, fit.radius, fit.blur)
+                place = _more_certain(_place_of(fit_disc(scene, start, by_parts, work)), place)
         else:
             place = _place_by_rim(scene, discs, k, by_parts, work)
-        floor_xy[k, 0], floor_xy[k, 1] = place[0], place[1]
-        covariance[k, 0, 0], covariance[k, 1, 1] = place[2], place[4]
-        covariance[k, 0, 1] = covariance[k, 1, 0] = place[3]
+        floor_xy[k, 0], floor_xy[k, 1] = place.x, place.y
+        covariance[k, 0, 0], covariance[k, 1, 1] = place.cov_xx, place.cov_yy
+        covariance[k, 0, 1] = covariance[k, 1, 0] = place.cov_xy
     return floor_xy, covariance
 
 
 @kernel()
-def _area(fit: Fit) -> float:
-    return fit.cov_xx * fit.cov_yy - fit.cov_xy**2
+def _place_of(fit: Fit) -> Place:
+    return Place(fit.x, fit.y, fit.cov_xx, fit.cov_xy, fit.cov_yy)
+
+
+@kernel()
+def _more_certain(one: Place, other: Place) -> Place:
+    area = one.cov_xx * one.cov_yy - one.cov_xy**2
+    return one if area < other.cov_xx * other.cov_yy - other.cov_xy**2 else other
+
+
+@kernel()
+def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
+    """Add a share of the square of (x, y), metres, to the covariance of a place."""
+    return Place(
+        place.x,
+        place.y,
+        place.cov_xx + share * x * x,
+        place.cov_xy + share * x * y,
+        place.cov_yy + share * y * y,
+    )
 
 
 @kernel()
 def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
     """Fit the whole disc of a rim."""
-    manner = Manner(False, scene.radius, _RADIUS_SIGMA, _WHOLE)
+    manner = Manner(False, scene.radius, RADIUS_SIGMA, WHOLE)
     start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX)
     fit = fit_disc(scene, start, manner, work)
     for _ in range(_MOST_REFITS):
@@ -123,19 +149,16 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 
 
 @kernel()
-def _place_by_rim(
-    scene: Scene, discs: Judgement, k: int, by_parts: Manner, work: Any
-) -> tuple[float, float, float, float, float]:
-    """Place and covariance of a disc by its sectors, or where they differ by its rim's points."""
+def _place_by_rim(scene: Scene, discs: Judgement, k: int, by_parts: Manner, work: Any) -> Place:
+    """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, by_parts.radius)
     fit = fit_disc(scene, Start(rim.x, rim.y, rim.radius, _BLUR_PX), by_parts, work)
-    doubt_x, doubt_y = math.sqrt(_DISAGREEMENT) * discs.doubt[k, 0], math.sqrt(_DISAGREEMENT) * discs.doubt[k, 1]
-    x, y, xx, xy, yy = rim.x, rim.y, rim.cov_xx, rim.cov_xy, rim.cov_yy
-    xx, xy, yy = xx + doubt_x**2, xy + doubt_x * doubt_y, yy + doubt_y**2
     if fit.arrived:
-        x, y, xx, xy, yy = fit.x, fit.y, fit.cov_xx, fit.cov_xy, fit.cov_yy
-    xx, xy, yy = xx + rim.doubt_x**2, xy + rim.doubt_x * rim.doubt_y, yy + rim.doubt_y**2
-    return x, y, xx, xy, yy
+        place = _place_of(fit)
+    else:
+        place = Place(rim.x, rim.y, rim.cov_xx, rim.cov_xy, rim.cov_yy)
+        place = _plus_square(place, _DISAGREEMENT, discs.doubt[k, 0], discs.doubt[k, 1])
+    return _plus_square(place, 1.0, rim.doubt_x, rim.doubt_y)
 
 
 @kernel()

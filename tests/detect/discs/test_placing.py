@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import detect_circles, vote_shape
-from detect.discs.placing import apparent_radius, eliminate
+from detect.discs.fit import eliminate
+from detect.discs.placing import apparent_radius
 from detect.discs.rim import DIRECTIONS, best_circle
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table
