@@ -284,7 +284,7 @@ def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
     )  # fmt: skip
 
 
-@kernel()
+@kernel(inline="always")
 def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate, Disc]:
     """The pixel nearest to a start, and the disc relative to it."""
     pixel_u, pixel_v = project_floor_point(scene.camera_numbers, start.x, start.y)
@@ -359,7 +359,7 @@ def _sum_of(products: FloatArray) -> FloatArray:
     return total
 
 
-@kernel()
+@kernel(inline="always")
 def _eliminate_levels(
     grouped: FloatArray, levels: Levels, by_parts: bool,
     per_pixel: tuple[float, float, float, float], noise: float,
@@ -397,7 +397,7 @@ def _eliminate_levels(
             levels.weight[s] = 1.0 / levels.variance[s]
 
 
-@kernel()
+@kernel(inline="always")
 def _weigh(levels: Levels, early: bool, noise: float) -> int:
     """Weigh the sectors; returns how many count."""
     contrast, variance, off_px = levels.contrast, levels.variance, levels.off_px
@@ -443,7 +443,7 @@ def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
     return median(some[:count]) if count > 0 else 0.0
 
 
-@kernel()
+@kernel(inline="always")
 def _scale(grouped: FloatArray, levels: Levels) -> None:
     """Weigh what groups say of the disc: derivatives are by the shares, so times the contrast."""
     for a in range(_BLUR_1, _TERMS):
@@ -454,7 +454,7 @@ def _scale(grouped: FloatArray, levels: Levels) -> None:
                 grouped[a, b, s] *= scale
 
 
-@kernel()
+@kernel(inline="always")
 def _add_up(
     grouped: FloatArray, edge: Edge, usual: Edge, radius_sigma: float, normal: FloatArray
 ) -> None:
@@ -483,7 +483,7 @@ def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
         unknowns[k] = rest / normal[k, k, 0] if normal[k, k, 0] > 0.0 else 0.0
 
 
-@kernel()
+@kernel(inline="always")
 def _moved(edge: Edge, step: FloatArray, most_blur: float) -> Edge:
     """The edge after a step, within limits."""
     radius = edge.radius + _within(step[_RADIUS], _LONGEST)
@@ -498,17 +498,17 @@ def _moved(edge: Edge, step: FloatArray, most_blur: float) -> Edge:
     )
 
 
-@kernel()
+@kernel(inline="always")
 def _within(step: float, longest: float) -> float:
     return min(max(step, -longest), longest)
 
 
-@kernel()
+@kernel(inline="always")
 def _scaled(blur: float, step: float, most: float) -> float:
     return min(max(blur * math.exp(_within(step, _LONGEST_BLUR)), _LEAST_BLUR), most)
 
 
-@kernel(forceinline=True)
+@kernel(inline="always")
 def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
     """Covariance (xx, xy, yy) of the centre where everything else is eliminated."""
     xx, xy, yy = normal[_X, _X, s], normal[_Y, _X, s], normal[_Y, _Y, s]
@@ -516,7 +516,7 @@ def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
     return per_area * yy, -per_area * xy, per_area * xx
 
 
-@kernel()
+@kernel(inline="always")
 def _covariance_of_whole(
     patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray, normal: FloatArray
 ) -> tuple[float, float, float]:
@@ -558,7 +558,7 @@ def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: Fl
     return area
 
 
-@kernel()
+@kernel(inline="always")
 def _covariance_by_parts(
     products: FloatArray, levels: Levels, normal: FloatArray
 ) -> tuple[float, float, float]:

@@ -102,18 +102,18 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
     return floor_xy, covariance
 
 
-@kernel()
+@kernel(inline="always")
 def _place_of(fit: Fit) -> Place:
     return Place(fit.x, fit.y, fit.cov_xx, fit.cov_xy, fit.cov_yy)
 
 
-@kernel()
+@kernel(inline="always")
 def _more_certain(one: Place, other: Place) -> Place:
     area = one.cov_xx * one.cov_yy - one.cov_xy**2
     return one if area < other.cov_xx * other.cov_yy - other.cov_xy**2 else other
 
 
-@kernel()
+@kernel(inline="always")
 def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
     """Add a share of the square of (x, y), metres, to the covariance of a place."""
     return Place(
@@ -125,7 +125,7 @@ def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
     )
 
 
-@kernel()
+@kernel(inline="always")
 def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
     """Fit the whole disc of a rim."""
     manner = Manner(False, scene.radius, RADIUS_SIGMA, WHOLE)
@@ -140,7 +140,7 @@ def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
     return fit
 
 
-@kernel()
+@kernel(inline="always")
 def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
     """Whether the fit of a whole disc explains what is seen."""
     least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
@@ -148,7 +148,7 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
     return bool(fit.arrived and fit.explained >= least and same_sign)
 
 
-@kernel()
+@kernel(inline="always")
 def _place_by_rim(scene: Scene, discs: Judgement, k: int, by_parts: Manner, work: Any) -> Place:
     """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, by_parts.radius)
@@ -161,7 +161,7 @@ def _place_by_rim(scene: Scene, discs: Judgement, k: int, by_parts: Manner, work
     return _plus_square(place, 1.0, rim.doubt_x, rim.doubt_y)
 
 
-@kernel()
+@kernel(inline="always")
 def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
     x, y = discs.seen_from[k, 0], discs.seen_from[k, 1]
     seen = profiles(scene.image, scene.camera_numbers, x, y, radius)
