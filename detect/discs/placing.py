@@ -35,9 +35,9 @@ RADIUS_SIGMA, _APPARENT_SIGMA = 0.08, 0.02
 _WELL_EXPLAINED = 0.97
 #: From this share of the variance on that it explains, the fit of the whole disc gives the place:
 #: where this share of the rim is in view, and where less is.
-_WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.93
+_WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.97
 #: A whole disc's fit is final if it explains this much of the variance.
-_EXPLAINS_ALL = 0.985
+_EXPLAINS_ALL = 0.99
 #: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
 _AT_BOUND, _MOST_REFITS = 0.98, 2
 #: Blur where nothing is known of it, pixels.
