@@ -97,7 +97,7 @@ def test_light_that_falls_off_across_a_disc_does_not_move_it(
         floor.grey *= np.exp(-np.square(np.arange(published_camera.width) - u - 20.0) / 3000.0)
         floors.append((floor, place))
     error_px, normalised = errors_of(published_camera, table, floors)
-    assert error_px < 0.05
+    assert error_px < 0.06
     assert 0.1 < normalised < 2.0
 
 
