@@ -2,9 +2,8 @@
 
 Discs, verticals and tilts are `geometry_msgs/PoseWithCovarianceStamped`, a message for each, and
 discs and verticals a `visualization_msgs/MarkerArray` for each image besides, in the same order,
-with their identifiers as text. Square markers are `visualization_msgs/ImageMarker`, odometry is
-the transform from `odom` to `base_link` (REP 105), and the camera's mounting that from `base_link`
-to the frame of its images. RViz and Foxglove show these as they are.
+with their identifiers as text. Square markers are `visualization_msgs/ImageMarker`, and odometry is
+the transform from `odom` to `base_link` (REP 105). RViz and Foxglove show these as they are.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from camera import Camera
 from redetect.landmarks.axes import covariance_from_dataset, from_dataset
 from redetect.landmarks.columns import TableName
 
@@ -68,7 +66,7 @@ def ros_messages(
     place, heading = 0j, 0.0  # The robot in the frame `odom`: x + iy (m), rad
     for time_ns, tables in frames:
         in_robot, in_odom, level = (
-            _header(make, time_ns, frame_prefix + name)
+            header_of(make, time_ns, frame_prefix + name)
             for name in ("base_link", "odom", "base_footprint")
         )
         for dx, dy, dphi, *_ in tables.get("steps", ()):
@@ -76,7 +74,7 @@ def ros_messages(
             heading += dphi
             turn = Rotation.from_rotvec([0.0, 0.0, heading])
             to = [place.real, place.imag, 0.0]
-            yield time_ns, "/tf", _transforms(make, in_odom, f"{frame_prefix}base_link", to, turn)
+            yield time_ns, "/tf", transform_of(make, in_odom, f"{frame_prefix}base_link", to, turn)
         for table in ("circles", "lines"):
             if table in tables:
                 poses = [_pose(make, table, row) for row in tables[table]]
@@ -93,20 +91,8 @@ def ros_messages(
             yield time_ns, "/redetect/markers", _outline(make, in_robot, row)
 
 
-def camera_transform(
-    make: Make, camera: Camera, time_ns: int, image_frame: str, frame_prefix: str = ""
-) -> Any:
-    """Where the camera is on the robot, as `tf2_msgs/TFMessage`.
-
-    The camera's frame has x to the right, y down and z forward: REP 103's suffix `_optical`.
-    """
-    return _transforms(
-        make, _header(make, time_ns, f"{frame_prefix}base_link"), image_frame,
-        from_dataset(camera.centre), Rotation.from_matrix(from_dataset(camera.rotation.T).T),
-    )  # fmt: skip
-
-
-def _header(make: Make, time_ns: int, frame_id: str) -> Any:
+def header_of(make: Make, time_ns: int, frame_id: str) -> Any:
+    """A `std_msgs/Header`."""
     seconds, nanoseconds = divmod(time_ns, 10**9)
     stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
@@ -141,7 +127,8 @@ def _quaternion(make: Make, turn: Rotation) -> Any:
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _transforms(make: Make, header: Any, child: str, place: ArrayLike, turn: Rotation) -> Any:
+def transform_of(make: Make, header: Any, child: str, place: ArrayLike, turn: Rotation) -> Any:
+    """A `tf2_msgs/TFMessage`: a frame's place and rotation in the frame of the header."""
     transform = make(
         "geometry_msgs/msg/Transform",
         translation=_xyz(make, "Vector3", place),

@@ -17,12 +17,14 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosidl_runtime_py.utilities import get_message
+from scipy.spatial.transform import Rotation
 
 import redetect as rd
-from detect.ros_messages import TOPICS, Values, camera_transform, ros_messages
+from detect.ros_messages import TOPICS, Values, header_of, ros_messages, transform_of
 from detect.settings_files import SettingsFile, read_settings
 from detect.sources.bag import content_of_message
 from detect.sources.interface import RunFrame, read_image, still
+from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.columns import TableName, values_of
 
 #: The parameters with their defaults; README.md says what they mean.
@@ -57,6 +59,15 @@ def tables_of(found: rd.Detection) -> dict[TableName, list[Values]]:
         tilt, upper = found.tilt, np.triu_indices(2)
         tables["tilts"] = [(tilt.pitch_rad, tilt.roll_rad, *tilt.covariance[upper], tilt.lines)]
     return tables
+
+
+def camera_transform(camera: rd.Camera, header: Any, image_frame: str) -> Any:
+    """Where the camera is on the robot, which the header names, as `tf2_msgs/TFMessage`.
+
+    The camera's frame has x to the right, y down and z forward: REP 103's suffix `_optical`.
+    """
+    turn = Rotation.from_matrix(from_dataset(camera.rotation.T).T)
+    return transform_of(make, header, image_frame, from_dataset(camera.centre), turn)
 
 
 class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
@@ -118,10 +129,9 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
         stamp = message.header.stamp
         time_ns = stamp.sec * 10**9 + stamp.nanosec
         if self._mounting is not None:
+            robot = header_of(make, time_ns, f"{self._frame_prefix}base_link")
             image_frame = message.header.frame_id
-            self._mounting.publish(
-                camera_transform(make, self._camera, time_ns, image_frame, self._frame_prefix)
-            )
+            self._mounting.publish(camera_transform(self._camera, robot, image_frame))
             self._mounting = None  # it stays, for those who come later, too
         frames = [(time_ns, tables_of(found))]
         for _, topic, made in ros_messages(make, frames, self._frame_prefix):
