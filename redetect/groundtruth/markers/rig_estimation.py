@@ -231,15 +231,13 @@ def _reasons(
     seen: Sequence[Sequence[View]],
     settings: RigSettings,
 ) -> dict[int, str]:
-    reasons = {}
-    for index, marker in enumerate(ids):
-        alone = sum(any(v.rig_index == index for v in views) for views in seen)
-        if index not in kept:
-            reasons[marker] = (
-                f"seen at {alone} times, but not {settings.least_support} times in agreement with "
-                "a marker of the rig"
-            )
-    return reasons
+    """Why markers are left out."""
+    times = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]
+    return {
+        ids[k]: f"seen at {times[k]} times, but not {settings.least_support} times in agreement "
+        "with a marker of the rig"
+        for k in np.setdiff1d(np.arange(len(ids)), kept).tolist()
+    }
 
 
 def _bundle(

@@ -31,13 +31,6 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
     return matrix
 
 
-def transform_from_quaternion(quaternion_xyzw: ArrayLike, translation: ArrayLike) -> FloatArray:
-    """(..., 4, 4) transforms of (..., 4) quaternions x, y, z, w and (..., 3) translations (m)."""
-    q = np.asarray(quaternion_xyzw, dtype=np.float64)
-    rotation = Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
-    return transform(rotation, translation)
-
-
 def quaternion_xyzw(transforms: ArrayLike) -> FloatArray:
     """(..., 4) unit quaternions x, y, z, w >= 0 of the rotations of (..., 4, 4) transforms."""
     t = np.asarray(transforms, dtype=np.float64)
@@ -94,13 +87,6 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
     block[:3, 3:6] = -v
     block[:6, 6:] = np.eye(6)
     return np.asarray(expm(block)[:6, 6:])
-
-
-def rotation_angle(transforms: ArrayLike) -> FloatArray:
-    """(...) angles in [0, pi] (rad) of the rotations of (..., 4, 4) transforms."""
-    t = np.asarray(transforms, dtype=np.float64)
-    magnitude = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).magnitude()
-    return np.asarray(magnitude.reshape(t.shape[:-2]))
 
 
 def heading(transforms: ArrayLike) -> FloatArray:
