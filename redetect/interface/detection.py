@@ -153,6 +153,8 @@ class Detection(Table):
     settings : CircleSettings
     frame : redetect.landmarks.Frame
         The same as rows of files, in the data set's axes: for `redetect.landmarks.write_frames`.
+    frame_tilt : redetect.landmarks.FrameTilt or None
+        The tilt likewise, as the row of a `.tilt` file.
     """
 
     discs: Discs
@@ -164,6 +166,7 @@ class Detection(Table):
     camera: Camera
     settings: CircleSettings
     frame: Frame
+    frame_tilt: FrameTilt | None
 
     def columns(self) -> dict[str, Any]:
         """Discs, then verticals, one row each; what a kind does not have is NaN."""
@@ -191,7 +194,7 @@ class Detection(Table):
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
-        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
+        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
         sight = Sight(self.camera, self.settings.radius_m)
         return draw_rows(self.image, sight, rows, self.settings, self.name)
 
@@ -358,6 +361,7 @@ def _detection(
         camera=camera,
         settings=settings,
         frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
+        frame_tilt=found.tilt,
     )
 
 
@@ -370,21 +374,13 @@ def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
 
 
-def _as_row(tilt: Tilt | None, axes: Axes) -> FrameTilt | None:
-    if tilt is None:
-        return None
-    sign = 1.0 if axes == "dataset" else -1.0
-    (cpp, cpr), (_, crr) = tilt.covariance.tolist()
-    return FrameTilt("", tilt.pitch_rad, sign * tilt.roll_rad, cpp, sign * cpr, crr, tilt.lines)
-
-
 def _records(table: Table) -> list[dict[str, Any]]:
     columns = plain(table.columns())
     return [dict(zip(columns, values)) for values in zip(*columns.values())]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Explanation(Table):
+class Explanation(DiscExplanation, Table):
     """Candidates of an image with the stage and the number that dropped them, and what to try.
 
     Attributes
@@ -397,9 +393,6 @@ class Explanation(Table):
         Flags or settings to try, and what they would find.
     """
 
-    candidates: tuple[Candidate, ...]
-    place: str
-    suggestions: tuple[str, ...]
     image: NDArray[np.uint8]
     camera: Camera
     settings: CircleSettings
@@ -414,10 +407,6 @@ class Explanation(Table):
             **{name: [getattr(row, name) for row in rows] for name in fields},
             "reason": [row.reason() for row in rows],
         }
-
-    def to_json(self) -> str:
-        """An object with `candidates` (a list of records), `place` and `suggestions`."""
-        return DiscExplanation(self.candidates, self.place, self.suggestions).to_json()
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
@@ -474,4 +463,4 @@ def explain(
     chosen = settings_of(settings, radius_m, polarity)
     pixels = read_image(frame, camera)
     found = explain_discs(pixels, camera, chosen, at)
-    return Explanation(found.candidates, found.place, found.suggestions, pixels, camera, chosen, at)
+    return Explanation(**vars(found), image=pixels, camera=camera, settings=chosen, at=at)

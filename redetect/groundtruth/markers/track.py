@@ -44,15 +44,7 @@ class TrackedTime:
     estimate: PoseEstimate | None = None
     choice: Choice | None = None
     reason: str = ""  # Why there is no pose, or a remark on it
-
-    @property
-    def pose(self) -> RefinedPose | None:
-        """The robot's pose; None if there is no reliable one."""
-        if self.status in ("clear", "resolved") and self.estimate is not None:
-            assert self.choice is not None
-            assert self.choice.candidate is not None
-            return self.estimate.candidates[self.choice.candidate]
-        return None
+    pose: RefinedPose | None = None  # The robot's; None if there is no reliable one
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +179,13 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
         "resolved": "planar ambiguity, decided by the neighbours",
         "unresolved": "planar ambiguity, not decided by the neighbours",
     }
+    pose = None
+    if choice.status in ("clear", "resolved"):
+        assert tracked.estimate is not None
+        assert choice.candidate is not None
+        pose = tracked.estimate.candidates[choice.candidate]
     reason = reasons.get(choice.status, "")
-    return replace(tracked, status=choice.status, choice=choice, reason=reason)
+    return replace(tracked, status=choice.status, choice=choice, reason=reason, pose=pose)
 
 
 # In units of negative log-likelihood: leaving a frame out is cheaper than two jumps round it, and a

@@ -55,9 +55,8 @@ def tables_of(found: rd.Detection) -> dict[TableName, list[Values]]:
         "circles": [values_of(row) for row in found.frame.circles],
         "lines": [values_of(row) for row in found.frame.lines],
     }
-    if found.tilt is not None:
-        tilt, upper = found.tilt, np.triu_indices(2)
-        tables["tilts"] = [(tilt.pitch_rad, tilt.roll_rad, *tilt.covariance[upper], tilt.lines)]
+    if found.frame_tilt is not None:
+        tables["tilts"] = [values_of(found.frame_tilt)]
     return tables
 
 
