@@ -171,6 +171,11 @@ class Camera:
         """Share of the image that sees anything: less than 1 where the distortion folds in it."""
         return seen_share(self)
 
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """Scales and principal point: fx, fy, cx, cy as others call them."""
+        return self.scale_x, self.scale_y, self.offset_x, self.offset_y
+
     @cached_property
     def decentred(self) -> bool:
         """Whether there are tangential terms."""
@@ -186,8 +191,8 @@ class Camera:
     def content_hash(self) -> str:
         """Hexadecimal digest of the parameters of projection and pose; the key of cached tables."""
         numbers = (
-            self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
-            *self.coef, *(x for row in self.robot_from_camera for x in row),
+            self.width, self.height, *self.pinhole, *self.coef,
+            *(x for row in self.robot_from_camera for x in row),
             *(self.tangential if self.decentred else ()),
             *(self.polynomial if any(self.polynomial) else ()),
         )  # fmt: skip

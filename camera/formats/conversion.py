@@ -11,7 +11,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from camera.calibration.model import free_span, is_possible, project_points
-from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import CameraError, ConversionError
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
@@ -184,10 +183,10 @@ def convert_to_foreign(
         fy, cy = held.fy * factor, held.cy * factor
         return _measured(replace(held, width=width, height=height, fy=fy, cy=cy), check)
     pixels, rays = _grid(source, rows, _FIT_GRID)
-    fx, fy, cx, cy = _pinhole(source)
+    fx, fy, cx, cy = source.pinhole
     start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * COEFFICIENTS[model]])
     if model != "fisheye":
-        start[4 + P1 : 4 + P1 + 2] = _tangential(source)
+        start[4 + P1 : 4 + P1 + 2] = source.tangential
 
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         return projected(model, parameters, rays)[:2]
@@ -245,8 +244,8 @@ def convert_to_camera(
         camera = with_intrinsics(pose, intrinsics, **size, unknown=unknown, covariance=None)
         return _measured(camera, check)
 
-    fx, fy, cx, cy = _pinhole(source)
-    tangential = _tangential(source)
+    fx, fy, cx, cy = source.pinhole
+    tangential = source.tangential
     start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5, *tangential, *[0.0] * 3])
     if isinstance(source, Camera):
         start[4:9], start[11:14] = source.coef, source.polynomial
@@ -287,7 +286,7 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if isinstance(source, Camera):
         if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None
-        fx, fy, cx, cy = _pinhole(source)
+        fx, fy, cx, cy = source.pinhole
         distortion = np.zeros(COEFFICIENTS[model])
         distortion[: len(source.brown)] = source.brown
         found = tuple(distortion.tolist())
@@ -299,21 +298,6 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if any(source.distortion[count:]) or any(padded[number:]):
         return None
     return replace(source, model=model, distortion=padded)
-
-
-def _tangential(source: AnyCamera) -> Tangential:
-    """p1 and p2, which mean the same in all models that have them."""
-    if isinstance(source, Camera):
-        return source.tangential
-    if source.model == "fisheye":
-        return NOT_TANGENTIAL
-    return source.distortion[P1], source.distortion[P1 + 1]
-
-
-def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:
-    if isinstance(source, Camera):
-        return source.scale_x, source.scale_y, source.offset_x, source.offset_y
-    return source.fx, source.fy, source.cx, source.cy
 
 
 def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
