@@ -218,16 +218,21 @@ class Camera:
 
         Both NaN past the distortion's fold.
         """
-        xy = np.asarray(normalised, dtype=np.float64)
-        radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = (radius <= self.r_max) & np.isfinite(radius)
-        factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
+        xy, radius = self._before_fold(normalised)
+        factor = radial_factor(radius, self.coef)
         u = self.scale_x * xy[..., 0] * factor
         v = self.scale_y * xy[..., 1] * factor
         if any(self.brown):
-            shift = brown_shift(np.where(defined[..., None], xy, np.nan), self.brown)
+            shift = brown_shift(xy, self.brown)
             u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
         return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
+
+    def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(..., 2) coordinates and their (...) radii, NaN past the fold."""
+        xy = np.asarray(normalised, dtype=np.float64)
+        radius = np.hypot(xy[..., 0], xy[..., 1])
+        defined = (radius <= self.r_max) & np.isfinite(radius)
+        return np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
@@ -249,11 +254,7 @@ class Camera:
 
         Both NaN for points not in front of the camera or past the distortion's fold.
         """
-        p = np.asarray(points_camera, dtype=np.float64)
-        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        with np.errstate(over="ignore"):  # a point all but beside the camera
-            normalised = p[..., :2] / depth[..., None]
-        return self.distort(normalised)
+        return self.distort(_normalised(points_camera)[0])
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
@@ -298,12 +299,8 @@ class Camera:
 
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
-        xy = np.asarray(normalised, dtype=np.float64)
-        radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = (radius <= self.r_max) & np.isfinite(radius)
-        jacobian = distorted_jacobian(
-            np.where(defined[..., None], xy, np.nan), self.coef, self.brown
-        )
+        xy, _ = self._before_fold(normalised)
+        jacobian = distorted_jacobian(xy, self.coef, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
@@ -311,11 +308,8 @@ class Camera:
 
         Pixels per metre; NaN where the projection is undefined.
         """
-        p = np.asarray(points_camera, dtype=np.float64)
-        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        with np.errstate(over="ignore"):
-            xy = p[..., :2] / depth[..., None]
-        perspective = np.zeros((*p.shape[:-1], 2, 3))
+        xy, depth = _normalised(points_camera)
+        perspective = np.zeros((*depth.shape, 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
         perspective[..., :, 2] = -xy
         perspective /= depth[..., None, None]
@@ -341,6 +335,17 @@ class Camera:
         in_camera = (point - self.centre) @ camera_from_robot.T
         pixels_per_metre = self.project_jacobian(in_camera) @ camera_from_robot[:, :2]
         return inverse_2x2(pixels_per_metre)
+
+
+def _normalised(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """(..., 2) normalised coordinates of points in the camera frame, and (...) depths (m).
+
+    NaN for points not in front of the camera.
+    """
+    p = np.asarray(points_camera, dtype=np.float64)
+    depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
+    with np.errstate(over="ignore"):  # a point all but beside the camera
+        return p[..., :2] / depth[..., None], depth
 
 
 def _read_only(array: FloatArray) -> FloatArray:

@@ -214,23 +214,9 @@ def convert_to_camera(
     fitted beside the source's tangential terms and, where it comes not near, all of them and a
     polynomial together.
 
-    Parameters
-    ----------
-    source : Camera or ForeignCamera
-    rows : str
-        `same`, `halve` or `double`.
-    pose : Camera, optional
-        Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
-        of the source if it has them, else the identity.
-
-    Returns
-    -------
-    Converted
-
-    Raises
-    ------
-    ConversionError
-        If the source does not see all of its image, or the fit fails.
+    Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
+    ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of `pose`; by default those of the source if
+    it has them, else the identity.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)

@@ -62,12 +62,8 @@ class EkfSlam(Filter):
 
     Parameters
     ----------
-    start : (3,) array_like
-        Pose at the start (m, m, rad).
-    start_covariance : (3, 3) array_like
-        Its covariance; none by default, as the start defines the map.
-    camera_xy : (2,) array_like
-        The camera's centre in the robot frame (m); only lines need it.
+    start, start_covariance, camera_xy : array_like
+        As of `Filter`.
     tilt_sigma_rad : float
         Standard deviation of the robot's sway about both axes of the floor, beyond what the rows'
         covariances say.
