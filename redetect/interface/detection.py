@@ -7,6 +7,7 @@ import html
 import json
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -261,33 +262,67 @@ def detect(
     camera.CameraError
         If the calibration cannot be read.
     """
-    frame = frame_of_image(image)
-    return detect_frame(
-        frame, camera_of(camera), settings_of(settings, radius_m, polarity), line_settings,
-        level=level, axes=axes,
-    )  # fmt: skip
-
-
-def detect_frame(
-    frame: RunFrame,
-    camera: Camera,
-    settings: CircleSettings,
-    line_settings: LineSettings | None,
-    *,
-    level: bool,
-    axes: Axes,
-) -> Detection:
-    """As `detect`, of a frame of a run."""
-    plan = FramePlan(
-        camera,
-        lines=line_settings or LineSettings(),
-        circles=settings,
-        levelling="frame" if level else "none",
+    return RecordedFrame(frame_of_image(image), camera_of(camera)).detect(
+        radius_m, polarity, level=level, axes=axes, settings=settings, line_settings=line_settings
     )
-    (found,) = detect_batch([FrameTask(frame)], plan)
-    if found.error is not None:
-        raise FrameError(found.error)
-    return _detection(found, frame.step, camera, settings, axes)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One frame of a recording.
+
+    Attributes
+    ----------
+    frame : detect.sources.interface.RunFrame
+        Its odometry step, and where its image comes from.
+    camera : Camera
+    """
+
+    frame: RunFrame
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """The image's name."""
+        return self.frame.step.prefix
+
+    @property
+    def time_s(self) -> float | None:
+        """When it was taken, if that is known."""
+        return self.frame.time_s
+
+    @property
+    def step(self) -> Step:
+        """The robot's movement since the frame before."""
+        return self.frame.step
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
+        return read_image(self.frame, self.camera)
+
+    def detect(
+        self,
+        radius_m: float | None = None,
+        polarity: Polarity | None = None,
+        *,
+        level: bool = True,
+        axes: Axes = "dataset",
+        settings: CircleSettings | None = None,
+        line_settings: LineSettings | None = None,
+    ) -> Detection:
+        """Find discs, verticals and tilt: see `detect`."""
+        chosen = settings_of(settings, radius_m, polarity)
+        plan = FramePlan(
+            self.camera,
+            lines=line_settings or LineSettings(),
+            circles=chosen,
+            levelling="frame" if level else "none",
+        )
+        (found,) = detect_batch([FrameTask(self.frame)], plan)
+        if found.error is not None:
+            raise FrameError(found.error)
+        return _detection(found, self.step, self.camera, chosen, axes)
 
 
 def settings_of(

@@ -23,6 +23,7 @@ from redetect.groundtruth.markers.refinement import (
     RefinedPose,
     predicted_errors,
     refine_pose,
+    refined_poses,
 )
 from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
@@ -292,13 +293,7 @@ def _mirrored(problem: PoseProblem) -> list[FloatArray]:
 
 def _refined(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
     """Distinct minima below the starts, the best first."""
-    minima = []
-    for start in starts:
-        try:
-            minima.append(refine_pose(problem, start))
-        except GeometryError:
-            continue
-    return _distinct(minima)
+    return _distinct(refined_poses(problem, starts))
 
 
 def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:

@@ -14,6 +14,7 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -156,6 +157,15 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
         _view_errors(problem, here),
         np.sqrt(np.bincount(problem.view, squares, problem.views) / (2 * count)),
     )
+
+
+def refined_poses(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
+    """The minima below the starts that have one, the best first."""
+    minima = []
+    for start in starts:
+        with suppress(GeometryError):
+            minima.append(refine_pose(problem, start))
+    return sorted(minima, key=lambda pose: pose.cost)
 
 
 class _Linearised(NamedTuple):

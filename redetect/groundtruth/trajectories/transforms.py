@@ -122,10 +122,7 @@ def composed_covariance(
     a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
 ) -> FloatArray:
     """(..., 6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
-    moved = adjoint(inverse(b_from_c))
-    return np.asarray(
-        moved @ a_covariance @ np.swapaxes(moved, -1, -2) + b_covariance, dtype=np.float64
-    )
+    return inverse_covariance(inverse(b_from_c), a_covariance) + b_covariance
 
 
 def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:
