@@ -239,15 +239,12 @@ class Camera:
 
         Pixels need not be inside the image; both are NaN where nothing is seen (past the fold).
         """
-        uv = np.asarray(pixels, dtype=np.float64)
-        x = (uv[..., 0] - self.offset_x) / self.scale_x
-        y = (uv[..., 1] - self.offset_y) / self.scale_y
+        seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            seen = np.stack([x, y], axis=-1)
             return straightened(seen, self.coef, self.brown, self.r_max)
-        radius = undistorted_radius(np.hypot(x, y), self.coef, self.polynomial)
-        factor = radial_factor(radius, self.coef, self.polynomial)
-        return np.stack([x / factor, y / factor], axis=-1)
+        distorted = np.hypot(seen[..., 0], seen[..., 1])
+        radius = undistorted_radius(distorted, self.coef, self.polynomial)
+        return np.asarray(seen / radial_factor(radius, self.coef, self.polynomial)[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 3) points in the camera frame (m).
@@ -355,12 +352,6 @@ def _read_only(array: FloatArray) -> FloatArray:
 
 def inverse_2x2(m: FloatArray) -> FloatArray:
     """Inverse over the last two axes; NaN passes through (np.linalg.inv may raise on it)."""
-    determinant = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
-    adjugate = np.stack(
-        [
-            np.stack([m[..., 1, 1], -m[..., 0, 1]], axis=-1),
-            np.stack([-m[..., 1, 0], m[..., 0, 0]], axis=-1),
-        ],
-        axis=-2,
-    )
-    return np.asarray(adjugate / determinant[..., None, None])
+    a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
+    adjugate = np.stack([d, -b, -c, a], axis=-1).reshape(m.shape)
+    return np.asarray(adjugate / (a * d - b * c)[..., None, None])

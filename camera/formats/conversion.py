@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from camera.calibration.model import free_span, is_possible, project_points
+from camera.calibration.model import FreeLens, is_possible, project_points
 from camera.errors import CameraError, ConversionError
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
@@ -254,16 +254,16 @@ def convert_to_camera(
     if not possible(start):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     decentred = any(tangential)
-    spans = [free_span(count, None) for count in range(6)]
+    spans = [FreeLens(count).span(None) for count in range(6)]
     if decentred:
         # Finally, the copied terms may compensate for what the radial part cannot follow.
-        spans.append(free_span(5, None, tangential=True))
+        spans.append(FreeLens(5, tangential=True).span(None))
     fit = CameraFit(pixels, project, possible, measured)
     best = _nearest(fit, start, spans)
     if best.deviation_px <= _NEAR_PX:
         return best
     assert isinstance(best.camera, Camera)
-    together = free_span(5, None, tangential=decentred, polynomial=3)
+    together = FreeLens(5, decentred, 3).span(None)
     return nearer(best, _nearest(fit, intrinsics_of(best.camera), [together]))
 
 
