@@ -14,5 +14,5 @@ setup(
         ("share/redetect_ros/launch", ["launch/redetect.launch.xml"]),
     ],
     install_requires=["redetect", "setuptools"],
-    entry_points={"console_scripts": ["redetect = redetect_ros.node:main"]},
+    entry_points={"console_scripts": ["redetect_node = redetect_ros.node:main"]},
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
@@ -73,12 +74,17 @@ def test_the_manifest_names_what_is_imported(
     assert imported | messages | {"launch_xml", "launch_ros"} == named
 
 
-def test_the_launch_file_starts_the_node(package: Path, setup: dict[str, Any]) -> None:
+def test_the_launch_file_starts_the_node(
+    package: Path, project_root: Path, setup: dict[str, Any]
+) -> None:
     launch = ElementTree.parse(package / "launch" / "redetect.launch.xml").getroot()
     (node,) = launch.findall("node")
     (script,) = setup["entry_points"]["console_scripts"]
     assert node.get("pkg") == setup["name"]
     assert script == f"{node.get('exec')} = redetect_ros.node:main"
+    # Else pip would put it in the place of the project's own command.
+    project = tomllib.loads((project_root / "pyproject.toml").read_text())["project"]
+    assert node.get("exec") not in project["scripts"]
     arguments = {element.get("name") for element in launch.findall("arg")}
     parameters = {element.get("name") for element in node.findall("param")}
     assert parameters <= constants(package)["PARAMETERS"].keys()
