@@ -46,22 +46,11 @@ def ros_messages(
     frames: Iterable[tuple[int, Mapping[TableName, Sequence[Values]]]],
     frame_prefix: str = "",
 ) -> Iterator[tuple[int, str, Any]]:
-    """Messages of the rows of frames.
+    """Time (ns), topic and content of the messages of the rows of frames.
 
-    Parameters
-    ----------
-    make : callable
-        `make(type, **fields)` is a message.
-    frames : iterable of (int, mapping)
-        The time of each frame (ns) and its rows by table, in the order of
-        `redetect.landmarks.columns`.
-    frame_prefix : str
-        Before the names of all coordinate frames, as `robot_state_publisher` has it.
-
-    Yields
-    ------
-    tuple of (int, str, message)
-        Time (ns), topic, message.
+    `make(type, **fields)` is a message; `frames` the time of each frame (ns) and its rows by table,
+    their values in the order of `redetect.landmarks.columns`; `frame_prefix` stands before the
+    names of all coordinate frames, as `robot_state_publisher` has it.
     """
     place, heading = 0j, 0.0  # The robot in the frame `odom`: x + iy (m), rad
     for time_ns, tables in frames:
