@@ -1,19 +1,18 @@
 """Where a disc is exactly: the fit of a disc through the camera to the grey values.
 
-A blurred disc is fitted to the pixels about it, in one of two manners. That of the whole disc,
-which has grey levels, gradients and saddles (x^2 - y^2 and x y) of its own inside and outside, the
-same for all pixels:
+A blurred disc is fitted to the pixels about it in one of two ways. As a whole, on a background with
+a slope and saddle terms (x^2 - y^2 and x y), which let light fall off without imitating a disc:
 
-    grey = outside + slopes . (x, y) + saddles + contrast * W(x, y, radius, blur)
+    grey = outside + slope . (x, y) + saddle + contrast * W(x, y, radius, blur)
 
-And that by parts: what hides, stains or lights a disc in part pulls at the fit of the whole, so in
-each of 16 sectors s the pixels about the edge have levels of their own,
+Or by parts, for what hides, stains or lights a disc in part pulls at the fit of the whole: in each of
+16 sectors s the pixels about the edge have grey levels of their own,
 
     grey = outside_s + contrast_s * W(x, y, radius, blur) + ramp_s * (r - radius) * grey
 
 and light may change round the disc as it likes, and rise or fall across the edge. W is the share of
 the disc that a pixel sees (`detect.discs.model`). Everything but W is linear and eliminated in
-every step of Gauss and Newton (Golub and Pereyra 1973). What remains are the normal equations of
+every Gauss-Newton step (G. H. Golub and V. Pereyra, SIAM J. Numerical Analysis 10, 1973). What remains are the normal equations of
 centre, radius, and the blur along either axis of the image, for movement blurs along one. Radius
 and logarithms of the blur are normally distributed beforehand.
 
@@ -132,7 +131,7 @@ class Start(NamedTuple):
     blur_px: float
 
 
-class Manner(NamedTuple):
+class FitSettings(NamedTuple):
     """How a disc is fitted."""
 
     by_parts: bool
@@ -207,21 +206,21 @@ def eliminate(matrices: FloatArray, k: int) -> None:
 
 
 @kernel()
-def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
+def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
     """Fit a disc.
 
     Parameters
     ----------
     scene : Scene
     start : Start
-    manner : Manner
+    settings : FitSettings
     work : WORK
         Working space.
     """
-    patch, rows, by_parts = work.patch, work.rows, manner.by_parts
-    candidate, begin = _candidate_at(scene, manner.radius, start)
+    patch, rows, by_parts = work.patch, work.rows, settings.by_parts
+    candidate, begin = _candidate_at(scene, settings.radius, start)
     shape, ends = gather(
-        scene.image, scene.floor_xy, candidate, scene.blur_ratio, manner.reach, begin, patch
+        scene.image, scene.floor_xy, candidate, scene.blur_ratio, settings.reach, begin, patch
     )
     if ends[SECTORS] == 0:
         return _NO_FIT
@@ -253,7 +252,7 @@ def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
         if not abs(levels.contrast[0]) > 0.0 and not by_parts:
             return _NO_FIT
         _scale(grouped, levels)
-        _add_up(grouped, edge, usual, manner.radius_sigma, normal)
+        _add_up(grouped, edge, usual, settings.radius_sigma, normal)
         _solve(normal.copy(), _BLUR_1, movement)
         moves = math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS])
         is_short = max(moves[0], moves[1]) < _ARRIVED
@@ -270,12 +269,12 @@ def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
         return _NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
-    area = manner.radius**2
+    area = settings.radius**2
     return Fit(
         True,
-        floor_xy[0] + manner.radius * last.x,
-        floor_xy[1] + manner.radius * last.y,
-        manner.radius * last.radius,
+        floor_xy[0] + settings.radius * last.x,
+        floor_xy[1] + settings.radius * last.y,
+        settings.radius * last.radius,
         last.blur.second if shape == CHORDS_ALONG_V else last.blur.first,
         most_blur,
         levels.contrast[0],

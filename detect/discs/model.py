@@ -45,7 +45,7 @@ F32: Callable[[Any], Any] = np.float32
 #: that nothing is NaN or infinite.
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
-#: Rows of a patch's `shares`: of the disc, and the derivatives, by log blur along either axis first.
+#: Rows of a patch's `shares`: of the disc, and derivatives (of the blur, by its logarithm).
 SHARE, BY_BLUR_1, BY_BLUR_2, BY_RADIUS, BY_X, BY_Y = range(6)
 
 PIXEL_VARIANCE = 1.0 / 12.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.fit import Fit, Manner, Scene, Start, fit_disc
+from detect.discs.fit import Fit, FitSettings, Scene, Start, fit_disc
 from detect.discs.patch import Reach
 from detect.discs.rim import Rim, follow_rim, median, profiles
 from redetect.compiled import kernel
@@ -85,7 +85,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
         if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
             radii[clear] = fit.radius
             clear += 1
-    by_parts = Manner(
+    by_parts = FitSettings(
         True, apparent_radius(scene.radius, radii[:clear]), _APPARENT_SIGMA, EDGE_ALONE
     )
     for k, fit in enumerate(whole):
@@ -128,15 +128,15 @@ def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
 @kernel(inline="always")
 def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
     """Fit the whole disc of a rim."""
-    manner = Manner(False, scene.radius, RADIUS_SIGMA, WHOLE)
+    settings = FitSettings(False, scene.radius, RADIUS_SIGMA, WHOLE)
     start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX)
-    fit = fit_disc(scene, start, manner, work)
+    fit = fit_disc(scene, start, settings, work)
     for _ in range(_MOST_REFITS):
         if not fit.arrived or fit.blur <= _AT_BOUND * fit.blur_bound:
             break
         # Too blurred for its patch: once more, in a wider one.
         start = Start(fit.x, fit.y, fit.radius, fit.blur_bound)
-        fit = fit_disc(scene, start, manner, work)
+        fit = fit_disc(scene, start, settings, work)
     return fit
 
 
@@ -149,7 +149,9 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 
 
 @kernel(inline="always")
-def _place_by_rim(scene: Scene, discs: Judgement, k: int, by_parts: Manner, work: Any) -> Place:
+def _place_by_rim(
+    scene: Scene, discs: Judgement, k: int, by_parts: FitSettings, work: Any
+) -> Place:
     """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, by_parts.radius)
     fit = fit_disc(scene, Start(rim.x, rim.y, rim.radius, _BLUR_PX), by_parts, work)

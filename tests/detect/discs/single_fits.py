@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.fit import Fit, Manner, Scene, Start, fit_disc, working_space
+from detect.discs.fit import Fit, FitSettings, Scene, Start, fit_disc, working_space
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
 from redetect.array_types import BoolArray, ByteArray, FloatArray
 
@@ -29,12 +29,12 @@ def fit_discs(
 ) -> DiscFits:  # fmt: skip
     """Fits of whole discs that start at (N, 2) pixels."""
     scene = Scene(image, floor_xy, radius_m, noise, blur_ratio, camera_numbers(camera))
-    manner = Manner(False, radius_m, RADIUS_SIGMA, WHOLE)
+    settings = FitSettings(False, radius_m, RADIUS_SIGMA, WHOLE)
     fits = []
     for u, v in pixels:
         x, y = floor_xy[v, u].astype(float)
         # A field of a structured array, as kernels are given it.
-        fits.append(_fit(scene, Start(x, y, radius_m, blur_px), manner))
+        fits.append(_fit(scene, Start(x, y, radius_m, blur_px), settings))
     return DiscFits(
         np.array([fit.arrived for fit in fits]),
         np.array([(fit.x, fit.y) for fit in fits]),
@@ -43,5 +43,5 @@ def fit_discs(
     )
 
 
-def _fit(scene: Scene, start: Start, manner: Manner) -> Fit:
-    return Fit(*fit_disc(scene, start, manner, working_space()[0]))
+def _fit(scene: Scene, start: Start, settings: FitSettings) -> Fit:
+    return Fit(*fit_disc(scene, start, settings, working_space()[0]))
