@@ -5,16 +5,16 @@ a slope and saddle terms (x^2 - y^2 and x y), which let light fall off without i
 
     grey = outside + slope . (x, y) + saddle + contrast * W(x, y, radius, blur)
 
-Or by parts, for what hides, stains or lights a disc in part pulls at the fit of the whole: in each of
-16 sectors s the pixels about the edge have grey levels of their own,
+Or by parts, for what hides, stains or lights a disc in part pulls at the fit of the whole: in each
+of 16 sectors s the pixels about the edge have grey levels of their own,
 
     grey = outside_s + contrast_s * W(x, y, radius, blur) + ramp_s * (r - radius) * grey
 
 and light may change round the disc as it likes, and rise or fall across the edge. W is the share of
 the disc that a pixel sees (`detect.discs.model`). Everything but W is linear and eliminated in
-every Gauss-Newton step (G. H. Golub and V. Pereyra, SIAM J. Numerical Analysis 10, 1973). What remains are the normal equations of
-centre, radius, and the blur along either axis of the image, for movement blurs along one. Radius
-and logarithms of the blur are normally distributed beforehand.
+every Gauss-Newton step (G. H. Golub and V. Pereyra, SIAM J. Numerical Analysis 10, 1973). What
+remains are the normal equations of centre, radius, and the blur along either axis of the image, for
+movement blurs along one. Radius and logarithms of the blur are normally distributed beforehand.
 
 A sector counts less if the model does not explain it, and if it shows the edge elsewhere than the
 others do: something else's edge. These weights are Tukey's biweights, found anew in every step
