@@ -50,26 +50,15 @@ class LineTracks(NamedTuple):
     """Edges followed through the strip image.
 
     Track t's points are ``bounds[t] : bounds[t + 1]`` of the point arrays, from top to bottom.
-
-    Attributes
-    ----------
-    polarity : (T,) float64
-        1 where the image is brighter on the right of the edge, -1 on the left.
-    bounds : (T + 1,) int64
-        See above.
-    row : (P,) int32
-        Image row of each point.
-    column : (P,) float64
-        Column in the strip: of the horizon, where the vertical through the point crosses it.
-    score : (P,) float32
-        Absolute response at the point.
     """
 
+    #: (T,) 1 where the image is brighter on the right of the edge, -1 on the left
     polarity: FloatArray
-    bounds: NDArray[np.int64]
-    row: NDArray[np.int32]
+    bounds: NDArray[np.int64]  # (T + 1,)
+    row: NDArray[np.int32]  # (P,) image row of each point
+    #: (P,) column in the strip: of the horizon, where the vertical through the point crosses it
     column: FloatArray
-    score: SingleArray
+    score: SingleArray  # (P,) absolute response at the point
 
 
 _NO_TRACKS = LineTracks(
@@ -112,23 +101,9 @@ def follow_edges(
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    strip, window
-        The table, the filter.
-    starts : LineStarts
-        Where to start, in this order.
-    numbers : TrackingNumbers
-        Threshold, gaps, border, and how a track is guided.
-    tracks : LineTracks
-        Those that were followed before.
-    again : (T,) bool
-        Which of these are followed again; the others come first in the result.
-    tilt : float, float
-        Pitch and roll (rad) along whose verticals edges are followed; NaN if their leans are to be
-        found along the way.
+    Of T tracks that were followed before, some (T,) are followed `again`; the others come first in
+    the result. Edges are followed along the verticals of a tilt (pitch and roll, rad); without one,
+    their leans are found along the way.
     """
     return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt)
 
