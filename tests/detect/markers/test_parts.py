@@ -17,7 +17,6 @@ from detect.markers import pattern_model as model
 from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
 from detect.markers.dictionaries import templates_of
-from detect.markers.edges import robust_sigma
 from detect.markers.geometry import (
     corners_by_homography,
     corners_of,
@@ -29,6 +28,7 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
+from detect.markers.pattern_fit import robust_sigma
 from detect.positive_definite import invert_positive, solve_positive
 from detect.settings import MarkerSettings
 
