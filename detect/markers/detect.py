@@ -347,11 +347,11 @@ def verified_quality(
 ) -> float | str:
     """The quality of a fitted template, or the cause of its rejection by its cells."""
     weakness = templates.weakness
-    if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
+    if fit.blur_cells > _between(weakness, *_LARGEST_BLUR_CELLS):
         return TOO_SMALL
     strict = (fit.blur_cells - _STRICT_FROM) / (_STRICT_AT - _STRICT_FROM)
-    misfit = _between((_CLEAR_MISFIT, _between(_BLURRED_MISFIT, weakness)), strict)
-    agreement = _between((_CLEAR_AGREEMENT, _between(_BLURRED_AGREEMENT, weakness)), strict)
+    misfit = _between(strict, _CLEAR_MISFIT, _between(weakness, *_BLURRED_MISFIT))
+    agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
     allowed = settings.largest_cell_error
     if templates.plain[template]:
         misfit = min(misfit, _PLAIN_LARGEST_MISFIT)
@@ -375,10 +375,9 @@ def verified_quality(
     return max(0.0, 1.0 - distance)
 
 
-def _between(pair: tuple[float, float], share: float) -> float:
+def _between(share: float, first: float, second: float) -> float:
     """From the first number to the second as the share goes from 0 to 1."""
-    share = min(max(share, 0.0), 1.0)
-    return (1.0 - share) * pair[0] + share * pair[1]
+    return float(np.interp(share, (0.0, 1.0), (first, second)))
 
 
 def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, float]:

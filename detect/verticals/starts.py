@@ -197,18 +197,13 @@ def _interpolate(
         square[c] = left[c] * (a * a) + right[c] * (b * b)
 
 
+@kernel()
 def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
     """Chains of maxima of the response (K, W) of at least a threshold on the rows of the band.
 
     Where each line crosses several of these, a chain has at least two maxima.
     """
-    return _chains(response, band.row, threshold, _LEAST if band.chained else 1)
-
-
-@kernel()
-def _chains(
-    response: SingleArray, rows: NDArray[np.int32], threshold: float, least: int
-) -> LineStarts:
+    rows, least = band.row, _LEAST if band.chained else 1
     levels, width = response.shape
     size = response.size
     row, column, value = np.empty(size, np.int64), np.empty(size), np.empty(size, np.float32)

@@ -61,11 +61,19 @@ class LineTracks(NamedTuple):
     score: SingleArray  # (P,) absolute response at the point
 
 
+class Before(NamedTuple):
+    """Tracks that were followed before, and what is known of them."""
+
+    tracks: LineTracks
+    again: NDArray[np.bool_]  # (T,) which of them are followed again
+    #: Pitch and roll (rad) along whose verticals these are followed; NaN: leans are to be found
+    tilt: tuple[float, float]
+
+
 _NO_TRACKS = LineTracks(
     np.empty(0), np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32)
 )
-_NONE = np.empty(0, np.bool_)
-_NO_TILT = math.nan, math.nan
+NOTHING_BEFORE = Before(_NO_TRACKS, np.empty(0, np.bool_), (math.nan, math.nan))
 
 
 class _Path(NamedTuple):
@@ -94,26 +102,16 @@ class _Edge(NamedTuple):
     vertical: bool
 
 
+@kernel()
 def follow_edges(
     image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, tracks: LineTracks = _NO_TRACKS,
-    again: NDArray[np.bool_] = _NONE, tilt: tuple[float, float] = _NO_TILT,
+    numbers: TrackingNumbers, before: Before,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
-    Of T tracks that were followed before, some (T,) are followed `again`; the others come first in
-    the result. Edges are followed along the verticals of a tilt (pitch and roll, rad); without one,
-    their leans are found along the way.
+    Tracks that were followed before, and are not again, come first in the result.
     """
-    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt)
-
-
-@kernel()
-def _follow_edges(
-    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
-    tilt: tuple[float, float],
-) -> LineTracks:  # fmt: skip
+    tracks, again, tilt = before
     height, width = image.shape
     lowest, highest = height, -1
     for v in starts.row:

@@ -86,7 +86,7 @@ def test_the_quadrangle_is_the_largest(seed: int) -> None:
         for four in itertools.combinations(range(len(points)), 4)
     ]
     best = max(areas)
-    found = abs(signed_area(points[largest_quadrangle(points)]))
+    found = abs(signed_area(points[list(largest_quadrangle(points))]))
     assert found == pytest.approx(best, rel=1e-9)
 
 
