@@ -43,20 +43,10 @@ _POLYGON = 3
 def ros_messages(
     types: Types, frames: Iterable[tuple[int, Mapping[TableName, Sequence[Values]]]]
 ) -> Iterator[tuple[int, str, Any]]:
-    """Messages of the rows of frames.
+    """Time (ns), topic and content of the messages of the rows of frames.
 
-    Parameters
-    ----------
-    types : mapping of str to type
-        The messages' classes, such as those of a `rosbags` store.
-    frames : iterable of (int, mapping)
-        The time of each frame (ns) and its rows by table, in the order of
-        `redetect.landmarks.columns`.
-
-    Yields
-    ------
-    tuple of (int, str, message)
-        Time (ns), topic, message.
+    `types` has the messages' classes, as a store of `rosbags` does; `frames` the time of each frame
+    (ns) and its rows by table, their values in the order of `redetect.landmarks.columns`.
     """
     place, heading = 0j, 0.0  # The robot in the frame `odom`: x + iy (m), rad
     for time_ns, tables in frames:
