@@ -55,7 +55,7 @@ _HOPELESS_BLUR_CELLS = 0.75
 _FIRST_LOOK_SLACK = 0.1
 #: Where the edges of a marker and its fit disagree by more than this (mean normalised squared
 #: difference; the edges' systematic error included), the marker is not flat, or bent by an
-#: uncalibrated lens. Its edges, in so many parts, are then where they are seen.
+#: uncalibrated lens. Its edges are then where they are seen, in this number of parts.
 _MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX, _PARTS = 6.0, 0.02, 8
 #: Smaller markers are flat. What is white within the border, or round the quiet zone, shines into
 #: edges that are softer than this part of the border: these are not used.

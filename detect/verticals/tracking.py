@@ -62,7 +62,7 @@ class LineTracks(NamedTuple):
 
 
 class Before(NamedTuple):
-    """Tracks that were followed before, and what is known of them."""
+    """Tracks that were followed before, and how some of them are followed again."""
 
     tracks: LineTracks
     again: NDArray[np.bool_]  # (T,) which of them are followed again
