@@ -96,9 +96,9 @@ def _edges_near(
     margin = np.minimum(np.maximum(0.7 * outside / length, 0.1), 0.2)
     used = 1.0 - 2.0 * margin
     along = margin + used * (np.arange(parts * _ROWS)[:, None] / (parts * _ROWS - 1.0))
-    across = (inside + outside) * _ACROSS - inside
-    places = corners + along[:, None, :, None] * side + across[:, :, None] * outwards
-    grey = _sampled(picture, places)
+    on_edge = corners + along[..., None] * side
+    ends = on_edge - inside[:, None] * outwards, on_edge + outside[:, None] * outwards
+    grey = _sampled(picture, *ends)
     if grey is None:
         return NO_EDGE
     grey = grey.reshape(parts, _ROWS, _SAMPLES, 4)
@@ -112,30 +112,33 @@ def _edges_near(
         return NO_WHITE
     apart_px = (inside + outside) / (_SAMPLES - 1)
     slope = (rows[:, 2:] - rows[:, :-2]).max(axis=1) / (2.0 * apart_px)
-    blur_px = float(np.median((light - dark) / slope)) / math.sqrt(2.0 * math.pi)
+    blur_px = np.sort(((light - dark) / slope).ravel())[2 * parts] / math.sqrt(2.0 * math.pi)
 
     # The line through the steps in the middles of all parts: normal @ place = distance.
     off = apart_px * place - inside
     middle = np.mean(off, axis=0)
     lever = ((np.arange(parts) + 0.5) / parts - 0.5)[:, None] * used * length
-    turn = (lever * off).sum(axis=0) / (lever**2).sum(axis=0)
-    variance = np.mean((off - middle - turn * lever) ** 2) * parts / max(parts - 2, 1)
-    at_end = variance * (1.0 / parts + (0.5 * length) ** 2 / (lever**2).sum(axis=0))
+    squares = (lever**2).sum(axis=0)
+    turn = (lever * off).sum(axis=0) / squares
     normal = outwards - (turn / length)[:, None] * side
     distance = (normal * (corners + 0.5 * side)).sum(axis=1) + middle
-    # A line that moves takes the corner along the other line.
-    (ax, ay), (bx, by) = normal[_LAST].T, normal.T
+    (ax, ay), (bx, by), before = normal[_LAST].T, normal.T, distance[_LAST]
     with np.errstate(divide="ignore", invalid="ignore"):
-        by_before, by_own = (
-            np.stack([[by, -bx], [-ay, ax]]).swapaxes(1, 2) / (ax * by - ay * bx)[:, None]
-        )
-        found = by_before * distance[_LAST][:, None] + by_own * distance[:, None]
+        meet = np.array([by * before - ay * distance, ax * distance - bx * before])
+        found = np.ascontiguousarray((meet / (ax * by - ay * bx)).T)
     if not is_convex(found):
         return NO_EDGE
+    covariance = np.zeros((4, 2, 2))
+    if parts > 2:
+        variance = np.mean((off - middle - turn * lever) ** 2) * parts / (parts - 2)
+        at_end = variance * (1.0 / parts + (0.5 * length) ** 2 / squares)
+        # A line that moves takes the corner along the other line.
+        for spread, moved in ((at_end[_LAST], (by, -bx)), (at_end, (-ay, ax))):
+            to = np.array(moved) / (ax * by - ay * bx)
+            covariance += (spread * to * to[:, None]).T
     return RefinedQuadrangle(
         found,
-        at_end[_LAST][:, None, None] * by_before[:, :, None] * by_before[:, None]
-        + at_end[:, None, None] * by_own[:, :, None] * by_own[:, None],
+        covariance,
         dark=dark.mean(axis=0),
         light=light.mean(axis=0),
         blur_px=min(max(blur_px, _LEAST_BLUR_PX), _LARGEST_BLUR_PX),
@@ -143,14 +146,20 @@ def _edges_near(
     )
 
 
-def _sampled(picture: Picture, places: FloatArray) -> NDArray[np.uint8] | None:
-    """Grey values at straight places (..., 2); None if some are outside the image."""
-    u, v = np.array(picture.bend(places.reshape(-1, 2)).T, np.float32, order="C")
+def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> NDArray[np.uint8] | None:
+    """(R, S, 4) grey values from some straight places (R, 4, 2) to others; None outside the image.
+
+    They are so near to each other that the lens bends nothing between them.
+    """
+    ends = picture.bend(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
     height, width = picture.grey.shape
-    if not np.all((u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)):
+    inside = (ends >= -0.5) & (ends <= np.array([width, height])[:, None, None, None, None] - 0.5)
+    if not inside.all():
         return None
+    begin, end = ends[:, 0], ends[:, 1]
+    u, v = (begin + _ACROSS * (end - begin)).astype(np.float32).reshape(2, -1)
     grey = cv2.remap(picture.grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grey, np.uint8).reshape(places.shape[:-1])
+    return np.asarray(grey, np.uint8).reshape(-1, _SAMPLES, 4)
 
 
 def _steps(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -163,12 +172,13 @@ def _steps(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     total = np.cumsum(rows, axis=1)
     before, after = total[:, :-1], total[:, -1:] - total[:, :-1]
     between = np.maximum(after * _COUNT - before * _COUNT[::-1], 0.0) ** 2 / _PAIRS
-    split = 3 + np.argmax(between[:, 2:-2], axis=1)[:, None]
+    split = 3 + np.argmax(between[:, 2:-2], axis=1)
     inner, outer = split // 2, (split + _SAMPLES) // 2
-    dark = np.take_along_axis(total, inner, axis=1) / (inner + 1)
-    light = (total[:, -1:] - np.take_along_axis(total, outer - 1, axis=1)) / (_SAMPLES - outer)
+    part, edge = np.arange(len(rows))[:, None], np.arange(4)
+    dark = total[part, inner, edge] / (inner + 1)
+    light = (total[:, -1] - total[part, outer - 1, edge]) / (_SAMPLES - outer)
     slope = rows[:, 2:] - rows[:, :-2]
     steeper = np.maximum(slope - _GENTLE_SLOPE * slope.max(axis=1, keepdims=True), 0.0)
     with np.errstate(invalid="ignore"):
         place = (steeper * _COUNT[:-1]).sum(axis=1) / steeper.sum(axis=1)
-    return place, dark[:, 0], light[:, 0]
+    return place, dark, light
