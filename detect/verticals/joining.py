@@ -42,9 +42,7 @@ class Lines(NamedTuple):
     #: (N,) bearings, and inclinations of the normals of their planes
     alpha_rad: FloatArray
     beta_rad: FloatArray
-    #: (N,) standard deviations of the bearings, and the part of them due to noise
-    sigma_rad: FloatArray
-    noise_rad: FloatArray
+    sigma_rad: FloatArray  # (N,) standard deviations of the bearings
     members: NDArray[np.int64]  # (M,) tracks, line by line; the strongest of each line first
     bounds: NDArray[np.int64]  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
 
@@ -101,10 +99,9 @@ def _join(
         if not numbers.joined_equally:
             weight[n] = evidence[t]
     joined, sigma = join_mixtures(bearing, deviation, weight, bounds)
-    ends, beta, own_noise = np.zeros((lines, 4)), np.zeros(lines), np.empty(lines)
+    ends, beta = np.zeros((lines, 4)), np.zeros(lines)
     for n in range(lines):
         first = bounds[n]
-        own_noise[n] = noise[members[first]]
         after = bounds[n + 1] if numbers.joined_equally else first + 1
         for k in range(first, after):
             t, share = members[k], 1.0 / (after - first)
@@ -113,7 +110,7 @@ def _join(
                 right, down = _end_of_line(strip, tracks, fits, t, end)
                 ends[n, 2 * end] += share * right
                 ends[n, 2 * end + 1] += share * down
-    return Lines(ends, joined, beta, sigma, own_noise, members, bounds)
+    return Lines(ends, joined, beta, sigma, members, bounds)
 
 
 @kernel()

@@ -65,7 +65,6 @@ class StartBand(NamedTuple):
     spacing: int
     #: Whether each line crosses several of these rows, so that starts must be on chains
     chained: bool
-    height_px: float  # from the first to the last of these rows, in widths of a pixel
 
 
 class LineStarts(NamedTuple):
@@ -119,7 +118,6 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         reach=r,
         spacing=spacing,
         chained=steps > 0 and long_enough,
-        height_px=2.0 * settings.start_band_rows * table.row_aspect,
     )
 
 
