@@ -27,10 +27,7 @@ def camera_numbers(camera: Camera) -> FloatArray:
     """
     return np.array(
         [
-            camera.scale_x,
-            camera.scale_y,
-            camera.offset_x,
-            camera.offset_y,
+            *camera.pinhole,
             *camera.coef,
             camera.r_max,
             *camera.camera_from_robot.ravel(),

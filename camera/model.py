@@ -171,6 +171,11 @@ class Camera:
         """Share of the image that sees anything: less than 1 where the distortion folds in it."""
         return seen_share(self)
 
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """Scales and principal point: fx, fy, cx, cy as others call them."""
+        return self.scale_x, self.scale_y, self.offset_x, self.offset_y
+
     @cached_property
     def decentred(self) -> bool:
         """Whether there are tangential terms."""
@@ -186,8 +191,8 @@ class Camera:
     def content_hash(self) -> str:
         """Hexadecimal digest of the parameters of projection and pose; the key of cached tables."""
         numbers = (
-            self.width, self.height, self.scale_x, self.scale_y, self.offset_x, self.offset_y,
-            *self.coef, *(x for row in self.robot_from_camera for x in row),
+            self.width, self.height, *self.pinhole, *self.coef,
+            *(x for row in self.robot_from_camera for x in row),
             *(self.tangential if self.decentred else ()),
             *(self.polynomial if any(self.polynomial) else ()),
         )  # fmt: skip
@@ -213,42 +218,40 @@ class Camera:
 
         Both NaN past the distortion's fold.
         """
-        xy = np.asarray(normalised, dtype=np.float64)
-        radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = (radius <= self.r_max) & np.isfinite(radius)
-        factor = np.where(defined, radial_factor(np.where(defined, radius, 0.0), self.coef), np.nan)
+        xy, radius = self._before_fold(normalised)
+        factor = radial_factor(radius, self.coef)
         u = self.scale_x * xy[..., 0] * factor
         v = self.scale_y * xy[..., 1] * factor
         if any(self.brown):
-            shift = brown_shift(np.where(defined[..., None], xy, np.nan), self.brown)
+            shift = brown_shift(xy, self.brown)
             u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
         return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
+
+    def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(..., 2) coordinates and their (...) radii, NaN past the fold."""
+        xy = np.asarray(normalised, dtype=np.float64)
+        radius = np.hypot(xy[..., 0], xy[..., 1])
+        defined = (radius <= self.r_max) & np.isfinite(radius)
+        return np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
 
         Pixels need not be inside the image; both are NaN where nothing is seen (past the fold).
         """
-        uv = np.asarray(pixels, dtype=np.float64)
-        x = (uv[..., 0] - self.offset_x) / self.scale_x
-        y = (uv[..., 1] - self.offset_y) / self.scale_y
+        seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            seen = np.stack([x, y], axis=-1)
             return straightened(seen, self.coef, self.brown, self.r_max)
-        radius = undistorted_radius(np.hypot(x, y), self.coef, self.polynomial)
-        factor = radial_factor(radius, self.coef, self.polynomial)
-        return np.stack([x / factor, y / factor], axis=-1)
+        distorted = np.hypot(seen[..., 0], seen[..., 1])
+        radius = undistorted_radius(distorted, self.coef, self.polynomial)
+        return np.asarray(seen / radial_factor(radius, self.coef, self.polynomial)[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 3) points in the camera frame (m).
 
         Both NaN for points not in front of the camera or past the distortion's fold.
         """
-        p = np.asarray(points_camera, dtype=np.float64)
-        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        with np.errstate(over="ignore"):  # a point all but beside the camera
-            normalised = p[..., :2] / depth[..., None]
-        return self.distort(normalised)
+        return self.distort(_normalised(points_camera)[0])
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
@@ -293,12 +296,8 @@ class Camera:
 
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
-        xy = np.asarray(normalised, dtype=np.float64)
-        radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = (radius <= self.r_max) & np.isfinite(radius)
-        jacobian = distorted_jacobian(
-            np.where(defined[..., None], xy, np.nan), self.coef, self.brown
-        )
+        xy, _ = self._before_fold(normalised)
+        jacobian = distorted_jacobian(xy, self.coef, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
@@ -306,11 +305,8 @@ class Camera:
 
         Pixels per metre; NaN where the projection is undefined.
         """
-        p = np.asarray(points_camera, dtype=np.float64)
-        depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
-        with np.errstate(over="ignore"):
-            xy = p[..., :2] / depth[..., None]
-        perspective = np.zeros((*p.shape[:-1], 2, 3))
+        xy, depth = _normalised(points_camera)
+        perspective = np.zeros((*depth.shape, 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
         perspective[..., :, 2] = -xy
         perspective /= depth[..., None, None]
@@ -338,6 +334,17 @@ class Camera:
         return inverse_2x2(pixels_per_metre)
 
 
+def _normalised(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """(..., 2) normalised coordinates of points in the camera frame, and (...) depths (m).
+
+    NaN for points not in front of the camera.
+    """
+    p = np.asarray(points_camera, dtype=np.float64)
+    depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
+    with np.errstate(over="ignore"):  # a point all but beside the camera
+        return p[..., :2] / depth[..., None], depth
+
+
 def _read_only(array: FloatArray) -> FloatArray:
     array.setflags(write=False)
     return array
@@ -345,12 +352,6 @@ def _read_only(array: FloatArray) -> FloatArray:
 
 def inverse_2x2(m: FloatArray) -> FloatArray:
     """Inverse over the last two axes; NaN passes through (np.linalg.inv may raise on it)."""
-    determinant = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
-    adjugate = np.stack(
-        [
-            np.stack([m[..., 1, 1], -m[..., 0, 1]], axis=-1),
-            np.stack([-m[..., 1, 0], m[..., 0, 0]], axis=-1),
-        ],
-        axis=-2,
-    )
-    return np.asarray(adjugate / determinant[..., None, None])
+    a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
+    adjugate = np.stack([d, -b, -c, a], axis=-1).reshape(m.shape)
+    return np.asarray(adjugate / (a * d - b * c)[..., None, None])

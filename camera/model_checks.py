@@ -30,12 +30,7 @@ def check_numbers(camera: Camera) -> None:
     for name, side in (("width", camera.width), ("height", camera.height)):
         if not 1 <= side <= _LARGEST_SIDE_PX:
             raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
-    numbers = {
-        "scaleX": camera.scale_x,
-        "scaleY": camera.scale_y,
-        "offsetX": camera.offset_x,
-        "offsetY": camera.offset_y,
-    }
+    numbers = dict(zip(("scaleX", "scaleY", "offsetX", "offsetY"), camera.pinhole))
     for name, symbols in (
         ("coef", "a2 a3 b1 b2 b3"), ("tangential", "p1 p2"), ("polynomial", "k1 k2 k3"),
     ):  # fmt: skip

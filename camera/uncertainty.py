@@ -34,8 +34,7 @@ def pixel_grid(width: int, height: int, columns: int = _COLUMNS, rows: int = _RO
 
 def intrinsics_of(camera: Camera) -> FloatArray:
     """(14,) numbers of a camera (`camera.calibration.model.INTRINSICS`)."""
-    pinhole = (camera.scale_x, camera.scale_y, camera.offset_x, camera.offset_y)
-    return np.array([*pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
+    return np.array([*camera.pinhole, *camera.coef, *camera.tangential, *camera.polynomial])
 
 
 def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> Camera:

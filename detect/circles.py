@@ -22,10 +22,10 @@ from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
 from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
-from detect.discs.fit import blur_ratio_of, fit_settings, fitted_positions, working_space
+from detect.discs.fit import Scene, blur_ratio_of, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JUDGED, Judgement, Sought, judge
-from detect.discs.placing import Scene, place_discs
+from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.quality import quality_of_centres as quality_of_centres
@@ -157,7 +157,7 @@ def _by_rims(
     best = best_discs(judgement, log_odds, settings)
     discs, log_odds = judgement.where(best), log_odds[best]
     scene = scene_of(image, camera, table, settings, noise)
-    floor_xy, fitted = fitted_positions(place_discs(scene, discs, working_space()[0]))
+    floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     seen_at = np.rint(project_floor_points(_kernel_camera(camera).numbers, floor_xy))
     # Of a disc whose centre is out of sight too little is seen to say where it is.
     in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
@@ -240,8 +240,10 @@ def scene_of(
 ) -> Scene:
     """An image, and how discs are placed in it; parameters as of `detect_circles`."""
     kernel = _kernel_camera(camera)
-    fit = fit_settings(noise, kernel.blur_ratio)
-    return Scene(image, table.floor_xy, settings.radius_m, fit, kernel.numbers)
+    return Scene(
+        image, table.floor_xy, settings.radius_m, least_noise(noise), kernel.blur_ratio,
+        kernel.numbers,
+    )  # fmt: skip
 
 
 def _by_quality(

@@ -12,9 +12,12 @@ import csv
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
 
 from detect.errors import DetectError
 from detect.ros_messages import TOPICS, ros_messages
@@ -24,6 +27,9 @@ from redetect.landmarks.columns import TABLES, TableName, Value, table_of, value
 from redetect.landmarks.tilts import numbered_tilts
 from redetect.landmarks.times import read_times
 from redetect.storage import demand_place, write_whole
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 # Which table a file of a kind has rows of, even where there are none.
 _TABLES: dict[str, TableName] = {
@@ -208,12 +214,29 @@ def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], sour
                 for table in tables
                 for topic, message_type in TOPICS[table].items()
             }
-            for time_ns, topic, message in ros_messages(store.types, timed):
+            for time_ns, topic, message in ros_messages(partial(_message, store), timed):
                 content = store.serialize_cdr(message, message.__msgtype__)
                 writer.write(connections[topic], time_ns, content)
                 written += 1
         stream.write((bag / "detections.mcap").read_bytes())
     return written
+
+
+def _message(store: Typestore, kind: str, **fields: Any) -> Any:
+    """A message of a store's type; the fields that are not given are zero or empty."""
+    _, descriptions = store.fielddefs[kind]
+    empty = {name: _empty(store, of) for name, (_, of) in descriptions if name not in fields}
+    return store.types[kind](**empty, **fields)
+
+
+def _empty(store: Typestore, kind: Any) -> Any:
+    """What a field holds of itself; its kind is a message's, a number's or text's, or elements'."""
+    if isinstance(kind, str):
+        return _message(store, kind)
+    element, _ = kind
+    if isinstance(element, str):
+        return "" if element == "string" else 0
+    return [] if isinstance(element[1], str) else np.zeros(0, np.uint8)
 
 
 def _nanoseconds(image: Value, time_s: Value, source: str) -> int:

@@ -9,28 +9,29 @@ the transform from `odom` to `base_link` (REP 105). RViz and Foxglove show these
 from __future__ import annotations
 
 import cmath
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from redetect.array_types import FloatArray
 from redetect.landmarks.axes import covariance_from_dataset, from_dataset
 from redetect.landmarks.columns import TableName
 
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-_SHAPES = "visualization_msgs/msg/MarkerArray"
+_SHAPE, _SHAPES = "visualization_msgs/msg/Marker", "visualization_msgs/msg/MarkerArray"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 #: The topics of a table, with the types of their messages.
 TOPICS: dict[TableName, dict[str, str]] = {
-    "steps": {"/tf": "tf2_msgs/msg/TFMessage"},
+    "steps": {"/tf": _TRANSFORMS},
     "circles": {"/redetect/circles": _SHAPES, "/redetect/circles/poses": _POSE},
     "lines": {"/redetect/lines": _SHAPES, "/redetect/lines/poses": _POSE},
     "markers": {"/redetect/markers": "visualization_msgs/msg/ImageMarker"},
     "tilts": {"/redetect/tilts/poses": _POSE},
 }
-#: Classes of messages, by their types.
-Types = Mapping[str, Any]
+#: Makes a message of a type from its fields; those that are not given are zero or empty.
+Make = Callable[..., Any]
 #: The values of a row's columns behind those of its frame.
 Values = Sequence[Any]
 
@@ -41,39 +42,52 @@ _POLYGON = 3
 
 
 def ros_messages(
-    types: Types, frames: Iterable[tuple[int, Mapping[TableName, Sequence[Values]]]]
+    make: Make,
+    frames: Iterable[tuple[int, Mapping[TableName, Sequence[Values]]]],
+    frame_prefix: str = "",
 ) -> Iterator[tuple[int, str, Any]]:
     """Time (ns), topic and content of the messages of the rows of frames.
 
-    `types` has the messages' classes, as a store of `rosbags` does; `frames` the time of each frame
-    (ns) and its rows by table, their values in the order of `redetect.landmarks.columns`.
+    `make(type, **fields)` is a message; `frames` the time of each frame (ns) and its rows by table,
+    their values in the order of `redetect.landmarks.columns`; `frame_prefix` stands before the
+    names of all coordinate frames, as `robot_state_publisher` has it.
     """
     place, heading = 0j, 0.0  # The robot in the frame `odom`: x + iy (m), rad
     for time_ns, tables in frames:
-        stamp = types["builtin_interfaces/msg/Time"](*divmod(time_ns, 10**9))
         in_robot, in_odom, level = (
-            types["std_msgs/msg/Header"](stamp, name)
+            header_of(make, time_ns, frame_prefix + name)
             for name in ("base_link", "odom", "base_footprint")
         )
         for dx, dy, dphi, *_ in tables.get("steps", ()):
             place += cmath.exp(1j * heading) * 1j * complex(dx, dy)
             heading += dphi
-            yield time_ns, "/tf", _transform(types, in_odom, place, heading)
+            turn = Rotation.from_rotvec([0.0, 0.0, heading])
+            to = [place.real, place.imag, 0.0]
+            yield time_ns, "/tf", transform_of(make, in_odom, f"{frame_prefix}base_link", to, turn)
         for table in ("circles", "lines"):
             if table in tables:
-                poses = [_pose(types, table, row) for row in tables[table]]
+                poses = [_pose(make, table, row) for row in tables[table]]
                 identifiers = [row[-1] for row in tables[table]]
-                shapes = _shapes(types, in_robot, table, poses, identifiers)
+                shapes = _shapes(make, in_robot, table, poses, identifiers)
                 yield time_ns, f"/redetect/{table}", shapes
                 for pose in poses:
-                    yield time_ns, f"/redetect/{table}/poses", types[_POSE](in_robot, pose)
+                    stamped = make(_POSE, header=in_robot, pose=pose)
+                    yield time_ns, f"/redetect/{table}/poses", stamped
         for row in tables.get("tilts", ()):
-            yield time_ns, "/redetect/tilts/poses", types[_POSE](level, _pose(types, "tilts", row))
+            stamped = make(_POSE, header=level, pose=_pose(make, "tilts", row))
+            yield time_ns, "/redetect/tilts/poses", stamped
         for row in tables.get("markers", ()):
-            yield time_ns, "/redetect/markers", _outline(types, in_robot, row)
+            yield time_ns, "/redetect/markers", _outline(make, in_robot, row)
 
 
-def _pose(types: Types, table: TableName, row: Values) -> Any:
+def header_of(make: Make, time_ns: int, frame_id: str) -> Any:
+    """A `std_msgs/Header`."""
+    seconds, nanoseconds = divmod(time_ns, 10**9)
+    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def _pose(make: Make, table: TableName, row: Values) -> Any:
     """A disc's place on the floor, a vertical's bearing, or the turn of the robot to the level."""
     mean, covariance = np.zeros(6), np.zeros((6, 6))  # Place, rotation vector
     if table == "lines":
@@ -84,79 +98,76 @@ def _pose(types: Types, table: TableName, row: Values) -> Any:
         part = slice(0, 2) if table == "circles" else slice(3, 5)
         mean[part] = from_dataset([x, y])
         covariance[part, part] = covariance_from_dataset([[xx, xy], [xy, yy]])
-    point = types["geometry_msgs/msg/Point"](*mean[:3])
-    pose = types["geometry_msgs/msg/Pose"](point, _quaternion(types, mean[3:]))
-    return types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())
+    pose = make(
+        "geometry_msgs/msg/Pose",
+        position=_xyz(make, "Point", mean[:3]),
+        orientation=_quaternion(make, Rotation.from_rotvec(mean[3:])),
+    )
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance.ravel())
 
 
-def _quaternion(types: Types, rotation_vector: FloatArray) -> Any:
-    return types["geometry_msgs/msg/Quaternion"](*Rotation.from_rotvec(rotation_vector).as_quat())
+def _xyz(make: Make, kind: str, values: ArrayLike) -> Any:
+    x, y, z = np.asarray(values, np.float64).tolist()
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
-def _transform(types: Types, header: Any, place: complex, heading: float) -> Any:
-    moved = types["geometry_msgs/msg/Vector3"](place.real, place.imag, 0.0)
-    turned = _quaternion(types, np.array([0.0, 0.0, heading]))
-    transform = types["geometry_msgs/msg/Transform"](moved, turned)
-    stamped = types["geometry_msgs/msg/TransformStamped"](header, "base_link", transform)
-    return types["tf2_msgs/msg/TFMessage"]([stamped])
+def _quaternion(make: Make, turn: Rotation) -> Any:
+    x, y, z, w = turn.as_quat().tolist()
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def transform_of(make: Make, header: Any, child: str, place: ArrayLike, turn: Rotation) -> Any:
+    """A `tf2_msgs/TFMessage`: a frame's place and rotation in the frame of the header."""
+    transform = make(
+        "geometry_msgs/msg/Transform",
+        translation=_xyz(make, "Vector3", place),
+        rotation=_quaternion(make, turn),
+    )
+    stamped = make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header, child_frame_id=child, transform=transform,
+    )  # fmt: skip
+    return make(_TRANSFORMS, transforms=[stamped])
+
+
+def _orange(make: Make, opacity: float) -> Any:
+    return make("std_msgs/msg/ColorRGBA", r=1.0, g=0.5, b=0.0, a=opacity)
 
 
 def _shapes(
-    types: Types, header: Any, table: TableName, poses: Sequence[Any], identifiers: Sequence[Any]
+    make: Make, header: Any, table: TableName, poses: Sequence[Any], identifiers: Sequence[Any]
 ) -> Any:
     """Symbols of the discs or verticals of an image, which replace those shown before."""
     kind, size = _CYLINDER_OR_ARROW[table]
-    zero = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
-    nowhere = types["geometry_msgs/msg/Pose"](zero, _quaternion(types, np.zeros(3)))
-    no_bytes = np.zeros(0, dtype=np.uint8)
-
-    def shape(number: int, action: int, pose: Any, text: str) -> Any:
-        return types["visualization_msgs/msg/Marker"](
-            header=header,
-            ns=table,
-            id=number,
-            type=kind,
-            action=action,
-            pose=pose,
-            scale=types["geometry_msgs/msg/Vector3"](*size),
-            color=types["std_msgs/msg/ColorRGBA"](1.0, 0.5, 0.0, 0.8),
-            lifetime=types["builtin_interfaces/msg/Duration"](0, 0),
-            frame_locked=False,
-            points=[],
-            colors=[],
-            texture_resource="",
-            texture=types["sensor_msgs/msg/CompressedImage"](header, "", no_bytes),
-            uv_coordinates=[],
-            text=text,
-            mesh_resource="",
-            mesh_file=types["visualization_msgs/msg/MeshFile"]("", no_bytes),
-            mesh_use_embedded_materials=False,
-        )
-
+    common = {
+        "header": header,
+        "ns": table,
+        "type": kind,
+        "scale": _xyz(make, "Vector3", size),
+        "color": _orange(make, 0.8),
+    }
+    upright = _quaternion(make, Rotation.identity())
+    nowhere = make("geometry_msgs/msg/Pose", orientation=upright)
+    clear = make(_SHAPE, action=_DELETE_ALL, pose=nowhere, **common)
     found = [
-        shape(number, 0, pose.pose, " ".join(map(str, ids)))
+        make(_SHAPE, id=number, pose=pose.pose, text=" ".join(map(str, ids)), **common)
         for number, (pose, ids) in enumerate(zip(poses, identifiers))
     ]
-    return types[_SHAPES]([shape(0, _DELETE_ALL, nowhere, ""), *found])
+    return make(_SHAPES, markers=[clear, *found])
 
 
-def _outline(types: Types, header: Any, row: Values) -> Any:
+def _outline(make: Make, header: Any, row: Values) -> Any:
     """A square marker in the image: its dictionary as namespace, number and corners (px)."""
     dictionary, number, _, *corners = row
-    point = types["geometry_msgs/msg/Point"]
-    colour = types["std_msgs/msg/ColorRGBA"](1.0, 0.5, 0.0, 1.0)
-    return types["visualization_msgs/msg/ImageMarker"](
+    colour = _orange(make, 1.0)
+    return make(
+        "visualization_msgs/msg/ImageMarker",
         header=header,
         ns=dictionary,
         id=number,
         type=_POLYGON,
-        action=0,
-        position=point(0.0, 0.0, 0.0),
         scale=1.0,
         outline_color=colour,
-        filled=0,
         fill_color=colour,
-        lifetime=types["builtin_interfaces/msg/Duration"](0, 0),
-        points=[point(u, v, 0.0) for u, v in zip(corners[::5], corners[1::5])],
-        outline_colors=[],
+        points=[_xyz(make, "Point", (u, v, 0.0)) for u, v in zip(corners[::5], corners[1::5])],
     )

@@ -125,8 +125,8 @@ def board_of(flags: BoardFlags) -> Board:
     )  # fmt: skip
 
 
-def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """The dictionary that a ChArUco board's markers are of."""
+def charuco_of(board: Board) -> cv2.aruco.CharucoBoard:
+    """A ChArUco board as OpenCV has it."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         raise CalibrationError(
@@ -140,7 +140,8 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
             f"dictionary {board.dictionary} has {most} markers, and a {board} {markers}: expected "
             "the dictionary that the board was printed with"
         )
-    return dictionary
+    size = board.columns, board.rows
+    return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
 
 
 #: Left blank by printers, and for the line of text at the bottom (m).
@@ -205,10 +206,8 @@ def sheet_of_board(board: Board) -> Sheet:
 
 def _markers(board: Board, left: float, top: float) -> tuple[list[Rectangle], set[tuple[int, int]]]:
     """A ChArUco board's markers, and the rows and columns of the squares that they are in."""
-    dictionary = dictionary_of(board)
-    pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_m, board.marker_m, dictionary
-    )
+    pattern = charuco_of(board)
+    dictionary = pattern.getDictionary()
     side, cells = board.square_m, dictionary.markerSize + 2
     cell = board.marker_m / cells
     shapes = []

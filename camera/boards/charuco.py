@@ -8,11 +8,13 @@ by the image's border) are searched at positions predicted from their neighbours
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import cv2
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from camera.boards.board import Board, dictionary_of
+from camera.boards.board import Board, charuco_of
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
@@ -51,17 +53,10 @@ def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
 
 
 def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    """Corners between the markers that OpenCV reads, in the image or in one of twice the height.
-
-    Half-height images flatten the markers, until their cells are less than a pixel high.
-    """
-    pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_m, board.marker_m, dictionary_of(board)
-    )
-    detector = cv2.aruco.CharucoDetector(pattern)
+    """Corners between the markers that OpenCV reads, in the image or in one of twice the height."""
+    detector = cv2.aruco.CharucoDetector(charuco_of(board))
     best = np.empty(0, dtype=np.int64), np.empty((0, 2))
-    for taller in (False, True):
-        picture = twice_as_high(image) if taller else image
+    for picture, in_image in both_heights(image):
         try:
             corners, identities, _, _ = detector.detectBoard(picture)
         except cv2.error as error:
@@ -69,24 +64,27 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
         if identities is None or len(identities) <= len(best[0]):
             continue
         found = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        found = of_half_height(found) if taller else found
-        best = np.asarray(identities, dtype=np.int64).ravel(), found
+        best = np.asarray(identities, dtype=np.int64).ravel(), in_image(found)
         if len(best[0]) == (board.columns - 1) * (board.rows - 1):
             break
     return best
 
 
-def twice_as_high(image: GreyImage) -> GreyImage:
-    """The image stretched: half-height ones flatten what is square or round."""
+def both_heights(
+    image: GreyImage,
+) -> Iterator[tuple[GreyImage, Callable[[FloatArray], FloatArray]]]:
+    """The image, and stretched to twice its height, each with what takes (N, 2) pixels back.
+
+    Half-height images flatten what is square or round. Row v of these is at 2 v + 0.5 when
+    stretched.
+    """
+    yield image, lambda pixels: pixels
     height, width = image.shape
-    return np.asarray(
-        cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+    taller = cv2.resize(image, (width, 2 * height), interpolation=cv2.INTER_LINEAR)
+    yield (
+        np.asarray(taller, dtype=np.uint8),
+        lambda pixels: np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)]),
     )
-
-
-def of_half_height(pixels: FloatArray) -> FloatArray:
-    """(N, 2) pixels of `twice_as_high` in the image itself: row v is at 2 v + 0.5 there."""
-    return np.column_stack([pixels[:, 0], 0.5 * (pixels[:, 1] - 0.5)])
 
 
 def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) -> FloatArray:

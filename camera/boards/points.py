@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.boards.board import Board
-from camera.boards.charuco import find_charuco, of_half_height, twice_as_high
+from camera.boards.charuco import both_heights, find_charuco
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
@@ -69,14 +69,11 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
     size = (board.columns, board.rows)
     for reduced in _reductions(image):
         per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
-        # Half-height images flatten the squares.
-        for taller in (False, True):
-            searched = twice_as_high(reduced) if taller else reduced
+        for searched, in_image in both_heights(reduced):
             found, corners = cv2.findChessboardCorners(searched, size)
             if not found:
                 continue
-            flat = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-            flat = of_half_height(flat) if taller else flat
+            flat = in_image(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
             flat = (flat + 0.5) * per_pixel - 0.5
             grid = flat.astype(np.float32).reshape(board.rows, board.columns, 2)
             return _in_order(image, _refined(image, grid, window))
@@ -90,7 +87,7 @@ def corners_counted(image: GreyImage) -> tuple[int, int] | None:
     """
     reduced = next(_reductions(image), image)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for searched in (reduced, twice_as_high(reduced)):
+    for searched, _ in both_heights(reduced):
         found, _, meta = cv2.findChessboardCornersSBWithMeta(searched, (3, 3), flags)
         if found:
             rows, columns = np.asarray(meta).shape[:2]
@@ -194,20 +191,17 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     size = (board.columns, board.rows)
+    pictures = image, 255 - image
     # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
-    # ground are dark ones in the negative; and half-height images flatten circle and grid.
-    for taller in (False, True):
-        for negative in (False, True):
-            picture = 255 - image if negative else image
-            searched = twice_as_high(picture) if taller else picture
+    # ground are dark ones in the negative.
+    for heights in zip(*map(both_heights, pictures)):
+        for picture, (searched, in_image) in zip(pictures, heights):
             for extra in (0, cv2.CALIB_CB_CLUSTERING):
                 found, centres = cv2.findCirclesGrid(searched, size, flags=flag | extra)
                 if not found:
                     continue
-                flat = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
-                grid = (of_half_height(flat) if taller else flat).reshape(
-                    board.rows, board.columns, 2
-                )
+                flat = in_image(np.asarray(centres, dtype=np.float64).reshape(-1, 2))
+                grid = flat.reshape(board.rows, board.columns, 2)
                 if board.kind == "circles":
                     grid = _from_the_front(grid)
                 return circle_centroids(picture, grid)

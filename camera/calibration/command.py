@@ -11,7 +11,7 @@ from itertools import islice
 
 import numpy as np
 
-from camera.boards.board import Board, board_of, dictionary_of
+from camera.boards.board import Board, board_of, charuco_of
 from camera.boards.points import corners_counted, find_board
 from camera.calibration.calibrate import (
     BoardView,
@@ -163,7 +163,7 @@ def find_views(
 ) -> tuple[list[BoardView], tuple[int, int]]:
     """Find the board in images; those without it are listed on standard error, and why."""
     if board.kind == "charuco":
-        dictionary_of(board)
+        charuco_of(board)
     views: list[BoardView] = []
     without: dict[str, list[str]] = {}
     size: tuple[int, int] | None = None

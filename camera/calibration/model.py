@@ -69,23 +69,6 @@ def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
     return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
 
 
-def free_span(
-    count: int, aspect: float | None, *, tangential: bool = False, polynomial: int = 0
-) -> FloatArray:
-    """(14, K) directions in which intrinsics may change.
-
-    Free are the principal point, the scales (`aspect` is scaleY / scaleX; None: each by itself),
-    `count` coefficients of the rational distortion (`FREE_COEFFICIENTS`), if `tangential` p1 and
-    p2, and the first `polynomial` of k1, k2, k3.
-    """
-    names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[count], *(TANGENTIAL if tangential else ())]
-    names += POLYNOMIAL[:polynomial]
-    scales = np.zeros((COUNT, 1 if aspect is not None else 2))
-    scales[0, 0] = 1.0
-    scales[1, -1] = 1.0 if aspect is None else aspect
-    return np.hstack([scales, np.eye(COUNT)[:, [INTRINSICS.index(name) for name in names]]])
-
-
 def project_points(
     intrinsics: FloatArray, points_camera: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -163,10 +146,17 @@ class FreeLens(NamedTuple):
     """How many of k1, k2, k3 are."""
 
     def span(self, aspect: float | None) -> FloatArray:
-        """`free_span` of them."""
-        return free_span(
-            self.coefficients, aspect, tangential=self.tangential, polynomial=self.polynomial
-        )
+        """(14, K) directions in which intrinsics may change.
+
+        Free are the scales (`aspect` is scaleY / scaleX; None: each by itself), the principal
+        point, and these coefficients.
+        """
+        names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[self.coefficients]]
+        names += [*(TANGENTIAL if self.tangential else ()), *POLYNOMIAL[: self.polynomial]]
+        scales = np.zeros((COUNT, 1 if aspect is not None else 2))
+        scales[0, 0] = 1.0
+        scales[1, -1] = 1.0 if aspect is None else aspect
+        return np.hstack([scales, np.eye(COUNT)[:, [INTRINSICS.index(name) for name in names]]])
 
     def __str__(self) -> str:
         names = (

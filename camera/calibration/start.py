@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from camera.calibration.adjustment import Estimate, Points, adjust, project_estimate
-from camera.calibration.model import COUNT, free_span, lens_of
+from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, project_estimate
+from camera.calibration.model import COUNT, FreeLens, lens_of
 from camera.distortion import one_to_one_radius, straightened
 from camera.rotations import rotation_of
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 # Focal lengths that are tried, in widths of the image: from 130 to 6 degrees across.
@@ -36,14 +36,10 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
         intrinsics = np.array(
             [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 10]
         )
-        start = board_poses(intrinsics, few)[0]
-        seen = np.flatnonzero(np.isfinite(view_errors(start, few)))
-        if not len(seen):
+        found = _fitted_where_seen(board_poses(intrinsics, few)[0], few, FreeLens(1).span(ratio))
+        if found is None:
             continue
-        try:
-            fit = adjust(start.of(seen), few.of(seen), free_span(1, ratio), tolerance=_LOOSE)
-        except (StartError, np.linalg.LinAlgError):
-            continue
+        fit, seen = found
         # Of all points, so that a focal length gains nothing by views that it doesn't see.
         errors = np.full(few.pixels.size, np.inf)
         errors[: fit.residuals.size] = np.abs(fit.residuals).ravel()
@@ -94,14 +90,21 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
 
 def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
     """Refine the poses from which all points are seen; the others stay as they are."""
-    seen = np.flatnonzero(np.isfinite(view_errors(estimate, points)))
+    found = _fitted_where_seen(estimate, points, np.zeros((COUNT, 0)))
+    return estimate if found is None else estimate.with_poses(found[1], found[0].estimate)
+
+
+def _fitted_where_seen(
+    start: Estimate, points: Points, span: FloatArray
+) -> tuple[Adjusted, IntArray] | None:
+    """A fit to the views in which all points are seen, and which these are; None without one."""
+    seen = np.flatnonzero(np.isfinite(view_errors(start, points)))
     if not len(seen):
-        return estimate
+        return None
     try:
-        fit = adjust(estimate.of(seen), points.of(seen), np.zeros((COUNT, 0)), tolerance=_LOOSE)
+        return adjust(start.of(seen), points.of(seen), span, tolerance=_LOOSE), seen
     except (StartError, np.linalg.LinAlgError):
-        return estimate
-    return estimate.with_poses(seen, fit.estimate)
+        return None
 
 
 def view_errors(estimate: Estimate, points: Points) -> FloatArray:

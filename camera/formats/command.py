@@ -146,28 +146,21 @@ def format_of_text(path: Path, text: str) -> Format:
 
 def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
     """A camera of the text of a file."""
-    if from_format == "cam":
-        return parse_camera(text, name)
-    if from_format == "opencv":
-        return parse_opencv(text, name)
-    if from_format == "ros":
-        return parse_ros(text, name)
     if from_format == "kalibr":
         return parse_kalibr(text, name, camera_name)
-    return parse_colmap(text, name, camera_name)
+    if from_format == "colmap":
+        return parse_colmap(text, name, camera_name)
+    if from_format == "cam":
+        return parse_camera(text, name)
+    return (parse_ros if from_format == "ros" else parse_opencv)(text, name)
 
 
 def format_of(camera: AnyCamera, to_format: Format) -> str:
     """The text of a file of a camera."""
     if isinstance(camera, Camera):
         return format_camera(camera)
-    if to_format == "opencv":
-        return format_opencv(camera)
-    if to_format == "ros":
-        return format_ros(camera)
-    if to_format == "kalibr":
-        return format_kalibr(camera)
-    return format_colmap(camera)
+    formats = {"opencv": format_opencv, "ros": format_ros, "kalibr": format_kalibr}
+    return formats.get(to_format, format_colmap)(camera)
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:

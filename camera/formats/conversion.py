@@ -10,8 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from camera.calibration.model import free_span, is_possible, project_points
-from camera.distortion import NOT_TANGENTIAL, Tangential
+from camera.calibration.model import FreeLens, is_possible, project_points
 from camera.errors import CameraError, ConversionError
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
@@ -184,10 +183,10 @@ def convert_to_foreign(
         fy, cy = held.fy * factor, held.cy * factor
         return _measured(replace(held, width=width, height=height, fy=fy, cy=cy), check)
     pixels, rays = _grid(source, rows, _FIT_GRID)
-    fx, fy, cx, cy = _pinhole(source)
+    fx, fy, cx, cy = source.pinhole
     start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * COEFFICIENTS[model]])
     if model != "fisheye":
-        start[4 + P1 : 4 + P1 + 2] = _tangential(source)
+        start[4 + P1 : 4 + P1 + 2] = source.tangential
 
     def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         return projected(model, parameters, rays)[:2]
@@ -215,23 +214,9 @@ def convert_to_camera(
     fitted beside the source's tangential terms and, where it comes not near, all of them and a
     polynomial together.
 
-    Parameters
-    ----------
-    source : Camera or ForeignCamera
-    rows : str
-        `same`, `halve` or `double`.
-    pose : Camera, optional
-        Whose ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` the result gets; by default those
-        of the source if it has them, else the identity.
-
-    Returns
-    -------
-    Converted
-
-    Raises
-    ------
-    ConversionError
-        If the source does not see all of its image, or the fit fails.
+    Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
+    ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of `pose`; by default those of the source if
+    it has them, else the identity.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)
@@ -245,8 +230,8 @@ def convert_to_camera(
         camera = with_intrinsics(pose, intrinsics, **size, unknown=unknown, covariance=None)
         return _measured(camera, check)
 
-    fx, fy, cx, cy = _pinhole(source)
-    tangential = _tangential(source)
+    fx, fy, cx, cy = source.pinhole
+    tangential = source.tangential
     start = np.array([fx, fy * factor, cx, cy * factor, *[0.0] * 5, *tangential, *[0.0] * 3])
     if isinstance(source, Camera):
         start[4:9], start[11:14] = source.coef, source.polynomial
@@ -269,16 +254,16 @@ def convert_to_camera(
     if not possible(start):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     decentred = any(tangential)
-    spans = [free_span(count, None) for count in range(6)]
+    spans = [FreeLens(count).span(None) for count in range(6)]
     if decentred:
         # Finally, the copied terms may compensate for what the radial part cannot follow.
-        spans.append(free_span(5, None, tangential=True))
+        spans.append(FreeLens(5, tangential=True).span(None))
     fit = CameraFit(pixels, project, possible, measured)
     best = _nearest(fit, start, spans)
     if best.deviation_px <= _NEAR_PX:
         return best
     assert isinstance(best.camera, Camera)
-    together = free_span(5, None, tangential=decentred, polynomial=3)
+    together = FreeLens(5, decentred, 3).span(None)
     return nearer(best, _nearest(fit, intrinsics_of(best.camera), [together]))
 
 
@@ -287,7 +272,7 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if isinstance(source, Camera):
         if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None
-        fx, fy, cx, cy = _pinhole(source)
+        fx, fy, cx, cy = source.pinhole
         distortion = np.zeros(COEFFICIENTS[model])
         distortion[: len(source.brown)] = source.brown
         found = tuple(distortion.tolist())
@@ -299,21 +284,6 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if any(source.distortion[count:]) or any(padded[number:]):
         return None
     return replace(source, model=model, distortion=padded)
-
-
-def _tangential(source: AnyCamera) -> Tangential:
-    """p1 and p2, which mean the same in all models that have them."""
-    if isinstance(source, Camera):
-        return source.tangential
-    if source.model == "fisheye":
-        return NOT_TANGENTIAL
-    return source.distortion[P1], source.distortion[P1 + 1]
-
-
-def _pinhole(source: AnyCamera) -> tuple[float, float, float, float]:
-    if isinstance(source, Camera):
-        return source.scale_x, source.scale_y, source.offset_x, source.offset_y
-    return source.fx, source.fy, source.cx, source.cy
 
 
 def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

@@ -24,6 +24,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
+from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import ConversionError
 from camera.model import inverse_2x2
 from redetect.array_types import FloatArray
@@ -68,7 +69,7 @@ class ForeignCamera:
                 raise ConversionError(
                     f"{name} is {excerpt(side)}: expected 1 to {_LARGEST_SIDE_PX} pixels"
                 )
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        numbers = (*self.pinhole, *self.distortion)
         if not np.all(np.isfinite(numbers)):
             raise ConversionError(f"a number of the camera is not finite: {excerpt(numbers)}")
         if min(self.fx, self.fy) <= 0.0:
@@ -80,6 +81,18 @@ class ForeignCamera:
                 f"{self.model} has {len(self.distortion)} coefficients: expected "
                 f"{COEFFICIENTS[self.model]}"
             )
+
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def tangential(self) -> Tangential:
+        """p1 and p2, which mean the same in all models that have them."""
+        if self.model == "fisheye":
+            return NOT_TANGENTIAL
+        return self.distortion[P1], self.distortion[P1 + 1]
 
     @property
     def matrix(self) -> list[float]:
@@ -119,7 +132,7 @@ class ForeignCamera:
         return np.asarray(xy)
 
     def _seen(self, normalised: FloatArray) -> Projected:
-        parameters = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        parameters = np.array([*self.pinhole, *self.distortion])
         return projected(self.model, parameters, normalised)
 
 

@@ -109,15 +109,17 @@ def image_size(content: dict[str, Any], name: str) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
-def pinhole_matrix(value: Any, key: str, name: str) -> tuple[float, float, float, float]:
+def pinhole_matrix(value: Any, name: str) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a 3 x 3 camera matrix without skew."""
-    m = numbers(value, key, name)
+    m = numbers(value, "camera_matrix", name)
     if len(m) != 9 or m[3:4] + m[6:] != [0.0, 0.0, 0.0, 1.0]:
         raise ConversionError(
-            f"{name}: {key} is {excerpt(m)}: expected the 9 numbers fx 0 cx 0 fy cy 0 0 1"
+            f"{name}: camera_matrix is {excerpt(m)}: expected the 9 numbers fx 0 cx 0 fy cy 0 0 1"
         )
     if m[1] != 0.0:
-        raise ConversionError(f"{name}: {key} has a skew of {m[1]:g}: only 0 can be converted")
+        raise ConversionError(
+            f"{name}: camera_matrix has a skew of {m[1]:g}: only 0 can be converted"
+        )
     return m[0], m[4], m[2], m[5]
 
 
@@ -136,7 +138,7 @@ def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of an OpenCV YAML file."""
     content = parse_yaml(text, name)
     width, height = image_size(content, name)
-    fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), "camera_matrix", name)
+    fx, fy, cx, cy = pinhole_matrix(first_of(content, _MATRIX, name), name)
     d = numbers(first_of(content, _DISTORTION, name), "distortion_coefficients", name)
     kind = content.get("fisheye_model", content.get("distortion_model", 0))
     fisheye = kind.lower() in _FISHEYE if isinstance(kind, str) else kind == 1
@@ -245,7 +247,7 @@ def camera_of_info(content: dict[str, Any], name: str) -> ForeignCamera:
     matrix = first_of(content, ("camera_matrix", "k", "K"), name)
     if not any(numbers(matrix, "camera_matrix", name)):
         raise ConversionError(f"{name}: the camera matrix is 0: the camera is not calibrated")
-    pinhole = pinhole_matrix(matrix, "camera_matrix", name)
+    pinhole = pinhole_matrix(matrix, name)
     coefficients = first_of(content, ("distortion_coefficients", "d", "D"), name)
     d = numbers(coefficients, "distortion_coefficients", name)
     label = content.get("distortion_model", "plumb_bob")
@@ -348,7 +350,7 @@ def format_kalibr(camera: ForeignCamera) -> str:
         {
             "cam0": {
                 "camera_model": "pinhole",
-                "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+                "intrinsics": list(camera.pinhole),
                 "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
                 "distortion_coeffs": list(camera.distortion[:_KALIBR_COEFFICIENTS]),
                 "resolution": [camera.width, camera.height],

@@ -1,181 +1,594 @@
 """Where a disc is exactly: the fit of a disc through the camera to the grey values.
 
-A blurred disc on an unevenly lit background is fitted: pixels are gathered
-(`detect.discs.patch`), the descent goes to the least squares (`detect.discs.descent`), and the
-residuals say how far the fit can be trusted (`detect.discs.least_squares`). It gives the position
-with its covariance, and the share of the grey values that the disc explains.
+A blurred disc is fitted to the pixels about it, in one of two manners. That of the whole disc,
+which has grey levels, gradients and saddles (x^2 - y^2 and x y) of its own inside and outside, the
+same for all pixels:
+
+    grey = outside + slopes . (x, y) + saddles + contrast * W(x, y, radius, blur)
+
+And that by parts: what hides, stains or lights a disc in part pulls at the fit of the whole, so in
+each of 16 sectors s the pixels about the edge have levels of their own,
+
+    grey = outside_s + contrast_s * W(x, y, radius, blur) + ramp_s * (r - radius) * grey
+
+and light may change round the disc as it likes, and rise or fall across the edge. W is the share of
+the disc that a pixel sees (`detect.discs.model`). Everything but W is linear and eliminated in
+every step of Gauss and Newton (Golub and Pereyra 1973). What remains are the normal equations of
+centre, radius, and the blur along either axis of the image, for movement blurs along one. Radius
+and logarithms of the blur are normally distributed beforehand.
+
+A sector counts less if the model does not explain it, and if it shows the edge elsewhere than the
+others do: something else's edge. These weights are Tukey's biweights, found anew in every step
+(A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
+
+The errors of neighbouring pixels are not independent where the model does not fit. For the whole
+disc the correlation of its residuals says how much fewer they count. By parts, those of sectors
+apart from each other nearly are independent: the covariance is that of the noise and that of the
+jackknife, leaving out neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989).
 """
 
 from __future__ import annotations
 
 import math
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.discs.descent import (
-    MOST_BLUR,
-    WORK,
-    Descent,
-    descend,
-    moved,
-    solve_step,
+from camera.kernels import project_floor_point
+from detect.discs.model import (
+    BY_BLUR_1,
+    BY_BLUR_2,
+    BY_RADIUS,
+    BY_X,
+    BY_Y,
+    F32,
+    FASTMATH,
+    SHARE,
+    Blur,
+    Disc,
+    chord_shares,
+    edge_shares,
 )
-from detect.discs.least_squares import (
-    BACKGROUND,
-    UNKNOWNS,
-    correlated_area,
-    factor_rows,
-    residuals,
-    solution,
+from detect.discs.patch import (
+    CAPACITY,
+    CHORDS_ALONG_V,
+    EDGE,
+    PATCH,
+    SECTORS,
+    Candidate,
+    Reach,
+    floor_steps,
+    gather,
 )
-from detect.discs.model import BY_BLUR, BY_X, BY_Y, SHARE, Disc
-from detect.discs.patch import EDGE, Candidate, FitSettings, Gathered, gather
+from detect.discs.rim import median
 from redetect.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 
-#: Pixels within this many radii of the centre are fitted, and those this near to the edge, in
-#: pixels or in standard deviations of the blur.
-_REACH_RADII = 1.7
-_REACH_PX = 3.0
-_REACH_BLURS = 2.0
-#: Standard deviation of the radius about the nominal one (relative), of the log of the blur; and
-#: the blur in pixels about which it lies.
-_RADIUS_SIGMA = 0.08
-_BLUR_SIGMA = 0.7
-_BLUR_PX = 0.6
-#: Grey values are rounded: noise is never below this.
-_LEAST_NOISE = 0.3
+#: Terms of the normal equations: light that is the same for all pixels, that of each sector, the
+#: disc; last the grey values. The fit by parts begins with `OUTSIDE`.
+_SADDLE, _SADDLE_XY, _SLOPE_Y = range(3)
+_OUTSIDE, _SLOPE, _CONTRAST, _BLUR_1, _BLUR_2, _RADIUS, _X, _Y, _GREY = range(3, 12)
+_TERMS = 12
+
+#: Steps of the fit; the first ones leave no sector out, for the start may be off.
+_STEPS, _EARLY = 12, 1
+#: A shorter step is the last, nominal radii.
+_ARRIVED = 5e-3
+#: Longest step, nominal radii (and log blur).
+_LONGEST, _LONGEST_BLUR = 0.2, 0.7
+#: The fit by parts ends at most this far from where it starts, radii.
+_MOST_OFF = 0.3
+#: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
+_LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
+_LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
 #: A flat disc's blur may grow from the one its pixels were gathered for by this factor, and pixels.
 _MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
+#: The usual blur in pixels, and the standard deviation of its logarithm.
+_BLUR_PX, _BLUR_SIGMA = 0.6, 0.7
+#: Grey values are rounded: noise is never below this.
+_LEAST_NOISE = 0.3
+#: Least pixels of a sector, spread of the shares in it, and contrast relative to the median.
+_LEAST_PIXELS, _LEAST_SPREAD, _LEAST_CONTRAST = 6.0, 0.15, 0.4
+#: Standard deviation of the ramp of the light across the edge, relative, per radius.
+_RAMP_SIGMA = 0.5
+#: Least number of sectors, and the weight from which one counts.
+_LEAST_SECTORS, _COUNTS = 5, 0.1
+#: An edge this many deviations off the others has no weight; the least deviation, pixels.
+_FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
+#: Before that, one this many deviations off has half the weight.
+_FAR_EARLY = 2.0
+#: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
+#: the variance is larger than what that gives.
+_STRETCH, _INFLATION = 3, 1.6
 
-#: Result of a fit. The centre, its covariance and the radius are in metres; the blur is a standard
-#: deviation, in pixels; the contrast is the grey level inside minus outside. `explained` is the
-#: share of the variance about the background that the disc explains. A blur of `blur_bound` is the
-#: most that the patch allowed.
-RESULT = np.dtype(
-    [
-        (name, np.float64)
-        for name in (
-            "x", "y", "radius", "blur", "contrast", "explained", "cov_xx", "cov_xy", "cov_yy",
-            "blur_bound",
-        )
-    ]
-)  # fmt: skip
+_MIDDLES = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
+_COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
+
+#: What the fits of one image work in, from one to the next. What is left there does not matter.
+WORK = np.dtype([("patch", PATCH), ("rows", np.float32, (_TERMS, CAPACITY))])
+
+
+class Scene(NamedTuple):
+    """An image, and how discs are placed in it."""
+
+    image: NDArray[np.uint8]
+    floor_xy: NDArray[np.float32]
+    radius: float  # nominal, metres
+    noise: float  # grey levels
+    blur_ratio: float  # of `blur_ratio_of`
+    camera_numbers: NDArray[np.float64]
+
+
+class Start(NamedTuple):
+    """Where a fit starts; lengths in metres."""
+
+    x: float
+    y: float
+    radius: float
+    blur_px: float
+
+
+class Manner(NamedTuple):
+    """How a disc is fitted."""
+
+    by_parts: bool
+    radius: float  # about which that of the disc lies, metres,
+    radius_sigma: float  # and the standard deviation, relative
+    reach: Reach
+
+
+class Fit(NamedTuple):
+    """A fitted disc; lengths in metres."""
+
+    arrived: bool
+    """If not, the covariance is infinite and the rest means nothing."""
+    x: float
+    y: float
+    radius: float
+    blur: float
+    """Along u, pixels."""
+    blur_bound: float
+    """The most blur that the patch allowed."""
+    contrast: float
+    """Grey level inside minus outside (by parts: of the first sector)."""
+    explained: float
+    """Share of the variance about the background that the disc explains (of the first sector)."""
+    cov_xx: float
+    cov_xy: float
+    cov_yy: float
+
+
+_NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf)
+
+
+class Edge(NamedTuple):
+    """A disc relative to its candidate, nominal radii, and its blur."""
+
+    x: float
+    y: float
+    radius: float
+    blur: Blur
+
+
+class Levels(NamedTuple):
+    """What is known of the light in each of G groups of pixels: of all, or of each sector."""
+
+    contrast: FloatArray
+    """(G,) grey levels; 0 where there is no edge to be seen."""
+    variance: FloatArray
+    """(G,) of the residuals."""
+    explained: FloatArray
+    """(G,) share of the variance that the disc explains."""
+    off_px: FloatArray
+    """(G,) how far outside the circle the edge is."""
+    weight: FloatArray
+    """(G,) per variance."""
 
 
 @kernel()
-def fit_disc(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    candidate: Candidate,
-    settings: FitSettings,
-    start: Disc,
-    work: Any,
-    result: Any,
-) -> bool:
-    """Fit one candidate.
+def eliminate(matrices: FloatArray, k: int) -> None:
+    """Eliminate unknown k from the later ones of normal equations, of which the lower half is used.
+
+    `matrices` are (T, T, S), S of them at a time. What is left of the products is that of what the
+    eliminated unknowns leave of all others; an unknown that nothing depends on leaves all.
+    """
+    terms, _, count = matrices.shape
+    per_pivot = np.empty(count)
+    for s in range(count):
+        per_pivot[s] = 1.0 / matrices[k, k, s] if matrices[k, k, s] > 0.0 else 0.0
+    for i in range(k + 1, terms):
+        for j in range(k + 1, i + 1):
+            for s in range(count):
+                matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
+
+
+@kernel()
+def fit_disc(scene: Scene, start: Start, manner: Manner, work: Any) -> Fit:
+    """Fit a disc.
 
     Parameters
     ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    candidate : Candidate
-    settings : FitSettings
-    start : Disc
-        Where to start.
+    scene : Scene
+    start : Start
+    manner : Manner
     work : WORK
         Working space.
-    result : RESULT
-        The result.
-
-    Returns
-    -------
-    bool
-        Whether the fit came to a result.
     """
-    patch, radius = work.patch, candidate.radius
-    _clear(result)
-    gathered = gather(image, floor_xy, candidate, settings, start, patch)
-    most_blur = MOST_BLUR
-    if gathered.shape != EDGE:
-        most_blur = min(_MOST_GROWTH * candidate.blur + _MOST_GROWTH_PX, MOST_BLUR)
-    result.blur_bound = most_blur
-    if gathered.fitted - UNKNOWNS < 4:
-        return False
-    descent = descend(gathered, start, settings, most_blur, work)
-    if not descent.arrived or not _solve_last_step(descent, settings, most_blur, work):
-        return False
-    # The last step is taken as the linear model has it, and so are its residuals.
-    disc = moved(descent.best, descent.contrast, math.log(most_blur), work)
-    residual, near, near_total = residuals(patch, gathered.n, work.values, work.bare)
-    result.x = floor_xy[candidate.v, candidate.u, 0] + disc.x * radius
-    result.y = floor_xy[candidate.v, candidate.u, 1] + disc.y * radius
-    result.radius = disc.radius * radius
-    result.blur = math.exp(disc.log_blur)
-    result.contrast = work.values[SHARE]
-    result.explained = 1.0 - min(near / max(near_total, 1e-12), 1.0)
-    variance = max(residual / (gathered.fitted - UNKNOWNS), settings.noise**2)
-    _find_covariance(gathered, radius, variance, work, result)
-    return True
-
-
-@kernel(forceinline=True)
-def _clear(result: Any) -> None:
-    result.x = result.y = result.radius = result.blur = result.contrast = result.explained = 0.0
-    result.cov_xx = result.cov_xy = result.cov_yy = 0.0
-
-
-@kernel(forceinline=True)
-def _solve_last_step(descent: Descent, settings: FitSettings, most_blur: float, work: Any) -> bool:
-    """All unknowns of the undamped step into `work.values`, the background alone into `bare`."""
-    factor = work.factor
-    if not factor_rows(work.best, 0, BY_BLUR, factor):
-        return False
-    solution(factor, 0, BACKGROUND, work.bare)
-    if not solve_step(
-        descent.best, descent.contrast, descent.variance, 0.0, settings, math.log(most_blur), work
-    ):
-        return False
-    solution(factor, 0, UNKNOWNS, work.values)
-    return True
-
-
-@kernel(forceinline=True)
-def _find_covariance(
-    gathered: Gathered, radius: float, variance: float, work: Any, result: Any
-) -> None:
-    """Covariance of a fit, from the factor and the residuals in the working space.
-
-    `variance` is that of the residuals. x and y are the last unknowns: their covariance is the
-    inverse of the factor's last two rows.
-    """
-    patch, factor = work.patch, work.factor
-    contrast = work.values[SHARE]
-    scale = variance * correlated_area(patch, gathered.n) * (radius / contrast) ** 2
-    per_xx, per_yy, xy = factor[BY_X, BY_X], factor[BY_Y, BY_Y], factor[BY_Y, BY_X]
-    result.cov_xx = scale * per_xx * per_xx * (1.0 + (xy * per_yy) ** 2)
-    result.cov_xy = -scale * per_xx * per_yy * per_yy * xy
-    result.cov_yy = scale * per_yy * per_yy
-
-
-def fit_settings(noise: float, blur_ratio: float) -> FitSettings:
-    """Settings of an image's fits: its noise (grey levels) and `blur_ratio_of` the camera."""
-    return FitSettings(
-        noise=max(noise, _LEAST_NOISE),
-        reach_radii=_REACH_RADII,
-        reach_px=_REACH_PX,
-        reach_blurs=_REACH_BLURS,
-        radius_sigma=_RADIUS_SIGMA,
-        blur_px=_BLUR_PX,
-        blur_sigma=_BLUR_SIGMA,
-        blur_ratio=blur_ratio,
+    patch, rows, by_parts = work.patch, work.rows, manner.by_parts
+    candidate, begin = _candidate_at(scene, manner.radius, start)
+    shape, ends = gather(
+        scene.image, scene.floor_xy, candidate, scene.blur_ratio, manner.reach, begin, patch
     )
+    if ends[SECTORS] == 0:
+        return _NO_FIT
+    per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
+    level = float(scene.image[candidate.v, candidate.u])
+    most_blur = _MOST_BLUR
+    if shape != EDGE:
+        most_blur = min(_MOST_GROWTH * start.blur_px + _MOST_GROWTH_PX, _MOST_BLUR)
+    usual = Edge(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
+    edge = Edge(begin.x, begin.y, begin.radius, _blur_of(shape, start.blur_px, scene.blur_ratio))
+    groups = SECTORS if by_parts else 1
+    levels = Levels(
+        np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups)
+    )
+    products, normal = np.zeros((_TERMS, _TERMS, SECTORS)), np.zeros((_TERMS, _TERMS, 1))
+    movement = np.zeros(_TERMS)
+    for step in range(_STEPS):
+        disc = Disc(edge.x, edge.y, edge.radius)
+        if shape == EDGE:
+            edge_shares(patch, ends[SECTORS], disc, edge.blur)
+        else:
+            chord_shares(patch, ends[SECTORS], disc, edge.blur)
+        _write_rows(patch, ends[SECTORS], edge, level, by_parts, rows)
+        _multiply(rows, ends, _OUTSIDE if by_parts else 0, products)
+        grouped = products if by_parts else _sum_of(products)
+        _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
+        if by_parts and _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
+            return _NO_FIT
+        if not abs(levels.contrast[0]) > 0.0 and not by_parts:
+            return _NO_FIT
+        _scale(grouped, levels)
+        _add_up(grouped, edge, usual, manner.radius_sigma, normal)
+        _solve(normal.copy(), _BLUR_1, movement)
+        moves = math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS])
+        is_short = max(moves[0], moves[1]) < _ARRIVED
+        if is_short and step > _EARLY:
+            break
+        if step < _STEPS - 1:
+            edge = _moved(edge, movement, most_blur)
+    last = _moved(edge, movement, most_blur)
+    if by_parts:
+        xx, xy, yy = _covariance_by_parts(products, levels, normal)
+    else:
+        xx, xy, yy = _covariance_of_whole(patch, rows, ends[SECTORS], products, normal)
+    near = math.hypot(last.x - begin.x, last.y - begin.y) <= _MOST_OFF or not by_parts
+    if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
+        return _NO_FIT
+    floor_xy = scene.floor_xy[candidate.v, candidate.u]
+    area = manner.radius**2
+    return Fit(
+        True,
+        floor_xy[0] + manner.radius * last.x,
+        floor_xy[1] + manner.radius * last.y,
+        manner.radius * last.radius,
+        last.blur.second if shape == CHORDS_ALONG_V else last.blur.first,
+        most_blur,
+        levels.contrast[0],
+        levels.explained[0],
+        area * xx, area * xy, area * yy,
+    )  # fmt: skip
+
+
+@kernel(inline="always")
+def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate, Disc]:
+    """The pixel nearest to a start, and the disc relative to it."""
+    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, start.x, start.y)
+    height, width = scene.image.shape
+    u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
+    x, y = start.x - scene.floor_xy[v, u, 0], start.y - scene.floor_xy[v, u, 1]
+    disc = Disc(x / radius, y / radius, start.radius / radius)
+    return Candidate(u, v, radius, start.blur_px), disc
+
+
+@kernel(forceinline=True)
+def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
+    """A blur (along u, pixels) along the axes of a patch of that shape."""
+    return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
+
+
+@kernel(fastmath=FASTMATH)
+def _write_rows(
+    patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: NDArray[np.float32]
+) -> None:
+    """The derivatives by all unknowns, and the grey values (above `level`), for n pixels."""
+    shares = patch.shares
+    x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
+    for i in range(n):
+        x, y = patch.x[i] - x0, patch.y[i] - y0
+        weight, grey = patch.weight[i], patch.grey[i]
+        rows[_SADDLE, i] = weight * (x * x - y * y)
+        rows[_SADDLE_XY, i] = weight * x * y
+        rows[_SLOPE_Y, i] = weight * y
+        rows[_OUTSIDE, i] = weight
+        # Light that changes across the edge changes what either side gives back of it.
+        ramp = (math.sqrt(x * x + y * y) - r0) * (grey - black)
+        rows[_SLOPE, i] = weight * (ramp if by_parts else x)
+        rows[_CONTRAST, i] = weight * shares[SHARE, i]
+        rows[_BLUR_1, i] = weight * shares[BY_BLUR_1, i]
+        rows[_BLUR_2, i] = weight * shares[BY_BLUR_2, i]
+        rows[_RADIUS, i] = weight * shares[BY_RADIUS, i]
+        rows[_X, i] = weight * shares[BY_X, i]
+        rows[_Y, i] = weight * shares[BY_Y, i]
+        rows[_GREY, i] = weight * grey
+
+
+@kernel(fastmath=FASTMATH)
+def _multiply(
+    rows: NDArray[np.float32], ends: NDArray[np.int64], first: int, products: FloatArray
+) -> None:
+    """Sums of products of rows in each sector, lower halves, from the first term on."""
+    for s in range(SECTORS):
+        # Three by three at a time: each value that is loaded is used three times.
+        for a in range(first, _TERMS, 3):
+            for b in range(first, a + 1, 3):
+                s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = F32(0.0)
+                for i in range(np.uint64(ends[s]), np.uint64(ends[s + 1])):
+                    a0, a1, a2 = rows[a, i], rows[a + 1, i], rows[a + 2, i]
+                    b0, b1, b2 = rows[b, i], rows[b + 1, i], rows[b + 2, i]
+                    s00, s01, s02 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2
+                    s10, s11, s12 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2
+                    s20, s21, s22 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2
+                for j, row in enumerate(((s00, s01, s02), (s10, s11, s12), (s20, s21, s22))):
+                    for k, total in enumerate(row):
+                        products[a + j, b + k, s] = total
+
+
+@kernel()
+def _sum_of(products: FloatArray) -> FloatArray:
+    """(T, T, 1) of all sectors."""
+    total = np.zeros((_TERMS, _TERMS, 1))
+    for a in range(_TERMS):
+        for b in range(a + 1):
+            for s in range(SECTORS):
+                total[a, b, 0] += products[a, b, s]
+    return total
+
+
+@kernel(inline="always")
+def _eliminate_levels(
+    grouped: FloatArray, levels: Levels, by_parts: bool,
+    per_pixel: tuple[float, float, float, float], noise: float,
+) -> None:  # fmt: skip
+    """Eliminate the light of each group; its contrast, residuals, and where its edge is."""
+    groups = grouped.shape[2]
+    pixels = grouped[_OUTSIDE, _OUTSIDE].copy()
+    if by_parts:
+        for s in range(groups):
+            grouped[_SLOPE, _SLOPE, s] += (noise / _RAMP_SIGMA) ** 2
+    for k in range(_OUTSIDE if by_parts else 0, _SLOPE):
+        eliminate(grouped, k)
+    spread = grouped[_CONTRAST, _CONTRAST].copy()
+    eliminate(grouped, _SLOPE)
+    without = grouped[_GREY, _GREY].copy()
+    eliminate(grouped, _CONTRAST)
+    for s in range(groups):
+        levels.contrast[s] = levels.weight[s] = levels.explained[s] = 0.0
+        if pixels[s] < _LEAST_PIXELS or spread[s] < _LEAST_SPREAD:
+            continue
+        contrast = grouped[_GREY, _CONTRAST, s] / grouped[_CONTRAST, _CONTRAST, s]
+        levels.contrast[s] = contrast
+        residual = max(grouped[_GREY, _GREY, s], 0.0)
+        levels.explained[s] = 1.0 - residual / max(without[s], 1e-9)
+        if by_parts:
+            levels.variance[s] = residual / (pixels[s] - 3.0)
+            per_u = per_pixel[0] * _COSINES[s] + per_pixel[1] * _SINES[s]
+            per_v = per_pixel[2] * _COSINES[s] + per_pixel[3] * _SINES[s]
+            off = grouped[_GREY, _RADIUS, s] / (contrast * grouped[_RADIUS, _RADIUS, s])
+            levels.off_px[s] = off / math.hypot(per_u, per_v)
+        else:
+            freedom = pixels[s] - (_GREY - 1)
+            levels.contrast[s] = contrast if freedom >= 4.0 else 0.0
+            levels.variance[s] = max(residual / max(freedom, 1.0), noise * noise)
+            levels.weight[s] = 1.0 / levels.variance[s]
+
+
+@kernel(inline="always")
+def _weigh(levels: Levels, early: bool, noise: float) -> int:
+    """Weigh the sectors; returns how many count."""
+    contrast, variance, off_px = levels.contrast, levels.variance, levels.off_px
+    chosen, some = np.zeros(SECTORS, np.bool_), np.empty(SECTORS)
+    total = 0.0
+    for s in range(SECTORS):
+        total += contrast[s]
+        levels.weight[s] = 0.0
+    sign = 1.0 if total > 0.0 else -1.0
+    for s in range(SECTORS):
+        chosen[s] = sign * contrast[s] > 0.0
+        some[s] = sign * contrast[s]
+    least = _LEAST_CONTRAST * _median_of(some, chosen)
+    for s in range(SECTORS):
+        chosen[s] = chosen[s] and sign * contrast[s] >= least
+    usual = max(_median_of(variance, chosen), noise * noise)
+    middle = _median_of(off_px, chosen)
+    for s in range(SECTORS):
+        some[s] = abs(off_px[s] - middle)
+    spread = max(1.4826 * _median_of(some, chosen), _LEAST_OFF_PX)
+    count = 0
+    for s in range(SECTORS):
+        if chosen[s]:
+            far = off_px[s] / spread
+            if early:
+                weight = 1.0 / (1.0 + (far / _FAR_EARLY) ** 2)
+            else:
+                weight = max(1.0 - (far / _FAR_OFF) ** 2, 0.0) ** 2
+            weight *= usual / max(variance[s], usual)
+            count += weight > _COUNTS
+            levels.weight[s] = weight / usual
+    return count
+
+
+@kernel()
+def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
+    """Median of the chosen values, 0 if there are none."""
+    some, count = np.empty(len(values)), 0
+    for k in range(len(values)):
+        if chosen[k]:
+            some[count] = values[k]
+            count += 1
+    return median(some[:count]) if count > 0 else 0.0
+
+
+@kernel(inline="always")
+def _scale(grouped: FloatArray, levels: Levels) -> None:
+    """Weigh what groups say of the disc: derivatives are by the shares, so times the contrast."""
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            for s in range(grouped.shape[2]):
+                contrast = levels.contrast[s]
+                scale = levels.weight[s] * contrast * (1.0 if a == _GREY else contrast)
+                grouped[a, b, s] *= scale
+
+
+@kernel(inline="always")
+def _add_up(
+    grouped: FloatArray, edge: Edge, usual: Edge, radius_sigma: float, normal: FloatArray
+) -> None:
+    """The normal equations of the step of the edge, of all groups and what is expected of it."""
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            normal[a, b, 0] = np.sum(grouped[a, b])
+    for k, sigma, off in (
+        (_RADIUS, radius_sigma, usual.radius - edge.radius),
+        (_BLUR_1, _BLUR_SIGMA, math.log(usual.blur.first / edge.blur.first)),
+        (_BLUR_2, _BLUR_SIGMA, math.log(usual.blur.second / edge.blur.second)),
+    ):
+        normal[k, k, 0] += 1.0 / sigma**2
+        normal[_GREY, k, 0] += off / sigma**2
+
+
+@kernel()
+def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
+    """Solve normal equations (T, T, 1), which are overwritten, for all unknowns from the first."""
+    for k in range(first, _GREY):
+        eliminate(normal, k)
+    for k in range(_Y, first - 1, -1):
+        rest = normal[_GREY, k, 0]
+        for i in range(k + 1, _GREY):
+            rest -= normal[i, k, 0] * unknowns[i]
+        unknowns[k] = rest / normal[k, k, 0] if normal[k, k, 0] > 0.0 else 0.0
+
+
+@kernel(inline="always")
+def _moved(edge: Edge, step: FloatArray, most_blur: float) -> Edge:
+    """The edge after a step, within limits."""
+    radius = edge.radius + _within(step[_RADIUS], _LONGEST)
+    return Edge(
+        edge.x + _within(step[_X], _LONGEST),
+        edge.y + _within(step[_Y], _LONGEST),
+        min(max(radius, _LEAST_RADIUS), _MOST_RADIUS),
+        Blur(
+            _scaled(edge.blur.first, step[_BLUR_1], most_blur),
+            _scaled(edge.blur.second, step[_BLUR_2], most_blur),
+        ),
+    )
+
+
+@kernel(inline="always")
+def _within(step: float, longest: float) -> float:
+    return min(max(step, -longest), longest)
+
+
+@kernel(inline="always")
+def _scaled(blur: float, step: float, most: float) -> float:
+    return min(max(blur * math.exp(_within(step, _LONGEST_BLUR)), _LEAST_BLUR), most)
+
+
+@kernel(inline="always")
+def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre where everything else is eliminated."""
+    xx, xy, yy = normal[_X, _X, s], normal[_Y, _X, s], normal[_Y, _Y, s]
+    per_area = 1.0 / (xx * yy - xy * xy)
+    return per_area * yy, -per_area * xy, per_area * xx
+
+
+@kernel(inline="always")
+def _covariance_of_whole(
+    patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray, normal: FloatArray
+) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre, by residuals that are as correlated as they are."""
+    unknowns = np.zeros(_TERMS)
+    _solve(_sum_of(products), 0, unknowns)
+    area = _correlated_area(patch, rows, n, unknowns)
+    for k in range(_BLUR_1, _X):
+        eliminate(normal, k)
+    xx, xy, yy = _inverse(normal, 0)
+    return area * xx, area * xy, area * yy
+
+
+@kernel(fastmath=FASTMATH)
+def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: FloatArray) -> float:
+    """How many pixels go with one independent residual, from the correlation of neighbours.
+
+    White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
+    the residuals are correlated, and their number overstates their information: for a first-order
+    process of correlation c by (1 + c) / (1 - c) in either direction.
+    """
+    residual = rows[_GREY, :n].copy()
+    for k in range(_GREY):
+        value = F32(unknowns[k])
+        for i in range(n):
+            residual[i] -= value * rows[k, i]
+    product = square = pairs = F32(0.0)
+    for i in range(1, n):
+        linked = F32(1.0) if patch.pixel[i] == patch.pixel[i - 1] + np.uint32(1) else F32(0.0)
+        here, before = residual[i], residual[i - 1]
+        product += linked * here * before
+        square += linked * (here * here + before * before)
+        pairs += linked
+    if not square > 0.0:
+        return 1.0
+    # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
+    correlation = min(max(2.0 * product / square - 1.5 / math.sqrt(pairs), 0.0), 0.8)
+    area: float = ((1.0 + correlation) / (1.0 - correlation)) ** 2
+    return area
+
+
+@kernel(inline="always")
+def _covariance_by_parts(
+    products: FloatArray, levels: Levels, normal: FloatArray
+) -> tuple[float, float, float]:
+    """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors."""
+    left_out = np.empty((_TERMS, _TERMS, SECTORS))
+    for a in range(_BLUR_1, _TERMS):
+        for b in range(_BLUR_1, min(a, _Y) + 1):
+            for s in range(SECTORS):
+                left_out[a, b, s] = normal[a, b, 0]
+                for k in range(_STRETCH):
+                    left_out[a, b, s] -= products[a, b, (s + k) % SECTORS]
+    for k in range(_BLUR_1, _X):
+        eliminate(left_out, k)
+        eliminate(normal, k)
+    centres = np.empty((SECTORS, 2))
+    mean_x = mean_y = 0.0
+    count = 0
+    for s in range(SECTORS):
+        xx, xy, yy = _inverse(left_out, s)
+        x, y = left_out[_GREY, _X, s], left_out[_GREY, _Y, s]
+        centres[s, 0], centres[s, 1] = xx * x + xy * y, xy * x + yy * y
+        mean_x, mean_y = mean_x + centres[s, 0] / SECTORS, mean_y + centres[s, 1] / SECTORS
+        count += levels.weight[s] > 0.0
+    xx = xy = yy = 0.0
+    for s in range(SECTORS):
+        x, y = centres[s, 0] - mean_x, centres[s, 1] - mean_y
+        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+    noise_xx, noise_xy, noise_yy = _inverse(normal, 0)
+    scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
+    return scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy
 
 
 #: Memory that is new for every image has to be fetched first.
@@ -183,7 +596,7 @@ _kept = threading.local()
 
 
 def working_space() -> NDArray[Any]:
-    """(1,) `detect.discs.descent.WORK`: what the calling thread's fits work in."""
+    """(1,) `WORK`: what the calling thread's fits work in."""
     space: NDArray[Any] | None = getattr(_kept, "space", None)
     if space is None:
         space = np.zeros(1, WORK)
@@ -191,13 +604,9 @@ def working_space() -> NDArray[Any]:
     return space
 
 
-def fitted_positions(results: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) centres, metres, and their (N, 2, 2) covariances from (N,) `RESULT`."""
-    covariance = np.empty((len(results), 2, 2))
-    covariance[:, 0, 0] = results["cov_xx"]
-    covariance[:, 0, 1] = covariance[:, 1, 0] = results["cov_xy"]
-    covariance[:, 1, 1] = results["cov_yy"]
-    return np.stack([results["x"], results["y"]], axis=-1), covariance
+def least_noise(noise: float) -> float:
+    """Noise of a scene: grey values are rounded."""
+    return max(noise, _LEAST_NOISE)
 
 
 def blur_ratio_of(camera: Camera) -> float:

@@ -5,7 +5,7 @@ There are two formulas for it, `edge_shares` and `chord_shares`.
 Both see the floor as it is around each pixel: where it is, and by which steps it moves from pixel
 to pixel (`detect.discs.patch.PATCH`), in nominal radii. The blur is a Gaussian along the image's
 axes, of the optics' variance plus that of a pixel (1/12). The shares W and their derivatives by
-log blur, radius, x and y go into five rows of the patch's design matrix.
+log blur along either axis, radius, x and y go into the six rows of the patch's `shares`.
 
 `edge_shares` is for discs that are large against the blur. Across its edge such a disc is a blurred
 step, moved and bent a little by the edge's curvature. With z the distance from the edge and t the
@@ -45,22 +45,18 @@ F32: Callable[[Any], Any] = np.float32
 #: that nothing is NaN or infinite.
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
-#: Rows of the design matrix: terms of the background (1, x, y, x^2 - y^2, x y), those of the disc,
-#: and the grey values.
-ONE, PLANE_X, PLANE_Y, SADDLE, SADDLE_XY = range(5)
-SHARE, BY_BLUR, BY_RADIUS, BY_X, BY_Y, GREY = range(5, 11)
-ROWS = 11
+#: Rows of a patch's `shares`: of the disc, and the derivatives, by log blur along either axis first.
+SHARE, BY_BLUR_1, BY_BLUR_2, BY_RADIUS, BY_X, BY_Y = range(6)
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
 
 class Disc(NamedTuple):
-    """A blurred disc, relative to its candidate and in nominal radii."""
+    """A disc, relative to its candidate and in nominal radii."""
 
     x: float
     y: float
     radius: float
-    log_blur: float  # of the optics' standard deviation along u, pixels
 
 
 class Blur(NamedTuple):
@@ -146,7 +142,7 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     With G the deviation of the blur across the edge, on the floor, and D that of its area, an edge
     of radius R has the curvature t = D^2 / (R G^3) in units of the blur.
     """
-    design = patch.design
+    shares = patch.shares
     x0, y0, r0 = F32(disc.x), F32(disc.y), F32(disc.radius)
     per_r0 = _1 / r0
     variance_1 = F32(blur.first * blur.first + PIXEL_VARIANCE)
@@ -166,7 +162,8 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         g1 = g1 * g1 * variance_1
         g2 = g2 * g2 * variance_2
         per_g = _1 / math.sqrt(g1 + g2 + _TINY)
-        optics = (g1 * optics_1 + g2 * optics_2) * per_g * per_g
+        by_1 = g1 * optics_1 * per_g * per_g
+        by_2 = g2 * optics_2 * per_g * per_g
         steps = patch.x1[i] * patch.y2[i] - patch.x2[i] * patch.y1[i]
         t = min(steps * steps * area * per_g * per_g * per_g * per_r0, _T_LIMIT)
         z_all = (r - r0) * per_g
@@ -186,12 +183,14 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         by_z = -density * (_1 + t * t * q_z)
         by_z = by_z if z == z_all else _0
         by_t = -density * (_HALF + t * (_2 * q + t * q_t))
+        by_t = by_t if t < _T_LIMIT else _0
         per_radius = by_z * per_g
-        design[SHARE, i] = _1 - outside
-        design[BY_BLUR, i] = (by_t * t - by_z * z) * optics
-        design[BY_RADIUS, i] = -per_radius - by_t * t * per_r0
-        design[BY_X, i] = -per_radius * nx
-        design[BY_Y, i] = -per_radius * ny
+        shares[SHARE, i] = _1 - outside
+        shares[BY_BLUR_1, i] = by_t * t * (_2 * optics_1 - _3 * by_1) - by_z * z * by_1
+        shares[BY_BLUR_2, i] = by_t * t * (_2 * optics_2 - _3 * by_2) - by_z * z * by_2
+        shares[BY_RADIUS, i] = -per_radius - by_t * t * per_r0
+        shares[BY_X, i] = -per_radius * nx
+        shares[BY_Y, i] = -per_radius * ny
 
 
 #: Gauss-Legendre quadrature at four nodes, two to either side of the middle.
@@ -259,7 +258,7 @@ def _chord(
 @kernel(forceinline=True, fastmath=FASTMATH)
 def chord_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     """W by the blurred chords along the patch's first axis, for the first n pixels."""
-    design = patch.design
+    shares = patch.shares
     x0, y0, r0 = F32(disc.x), F32(disc.y), F32(disc.radius)
     per_r0 = _1 / r0
     variance_1 = blur.first * blur.first + PIXEL_VARIANCE
@@ -291,9 +290,9 @@ def chord_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         total = _KERNEL_HEIGHT * half * r0 / reach
         by_along = total * per_sigma * (a[3] + b[3] + c[3] + d[3])
         by_across = total * per_sigma * per_length * (a[4] + b[4] + c[4] + d[4])
-        by_blur = optics_1 * (a[1] + b[1] + c[1] + d[1]) + optics_2 * (a[2] + b[2] + c[2] + d[2])
-        design[SHARE, i] = total * (a[0] + b[0] + c[0] + d[0])
-        design[BY_BLUR, i] = total * by_blur
-        design[BY_RADIUS, i] = total * per_sigma * per_length * (a[5] + b[5] + c[5] + d[5])
-        design[BY_X, i] = by_along * along_x + by_across * across_x
-        design[BY_Y, i] = by_along * along_y + by_across * across_y
+        shares[SHARE, i] = total * (a[0] + b[0] + c[0] + d[0])
+        shares[BY_BLUR_1, i] = total * optics_1 * (a[1] + b[1] + c[1] + d[1])
+        shares[BY_BLUR_2, i] = total * optics_2 * (a[2] + b[2] + c[2] + d[2])
+        shares[BY_RADIUS, i] = total * per_sigma * per_length * (a[5] + b[5] + c[5] + d[5])
+        shares[BY_X, i] = by_along * along_x + by_across * across_x
+        shares[BY_Y, i] = by_along * along_y + by_across * across_y

@@ -18,23 +18,13 @@ from numpy.typing import NDArray
 from detect.discs.model import (
     F32,
     FASTMATH,
-    GREY,
-    ONE,
     PIXEL_VARIANCE,
-    PLANE_X,
-    PLANE_Y,
-    ROWS,
-    SADDLE,
-    SADDLE_XY,
     Disc,
 )
 from redetect.compiled import kernel
 
-#: Most pixels of a patch.
-CAPACITY = 4096
-#: Loops work on this many pixels at a time, or on single ones: a patch is filled up with pixels far
-#: from the disc, whose rows of the design matrix are zero.
-WHOLE = 32
+#: Most pixels of a patch. No power of two: arrays that far apart would share lines of the cache.
+CAPACITY = 4000
 
 _VALUES = (np.float32, CAPACITY)
 #: A patch. A structure, so that the compiler knows that its arrays do not overlap.
@@ -42,21 +32,22 @@ PATCH = np.dtype(
     [
         # Index of each pixel in the image.
         ("pixel", np.uint32, CAPACITY),
-        # Its weight in the explained variance, in pixels: 0 too far from the disc to count.
+        # 0 of pixels that only fill up a sector, 1 of all others.
         ("weight", *_VALUES),
+        # Grey value, relative to that of the candidate.
+        ("grey", *_VALUES),
         # Place on the floor relative to the candidate, in nominal radii, and how far that moves by
         # one step along the first axis and along the second: u and v, or the steeper one and the
         # other.
         *((name, *_VALUES) for name in ("x", "y", "x1", "y1", "x2", "y2")),
         # By what share steps along the first axis grow from each to the next.
         ("growth", np.float32),
-        # See `detect.discs.model`: relative to the grey value of the candidate.
-        ("design", np.float32, (ROWS, CAPACITY)),
-        # Of the fit, grey levels.
-        ("residual", *_VALUES),
+        # See `detect.discs.model`.
+        ("shares", np.float32, (6, CAPACITY)),
         ("sector", np.int32, CAPACITY),
-        # Working space, of one row of the image: weights, and places on the floor.
-        *((name, *_VALUES) for name in ("row", "row_x", "row_y")),
+        # Working space, of one row of the image: how it is taken, and places on the floor.
+        ("taken", np.int32, CAPACITY),
+        *((name, *_VALUES) for name in ("row_x", "row_y")),
     ]
 )  # fmt: skip
 
@@ -73,37 +64,29 @@ EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 #: blur, or its smaller half axis less than this number of deviations of the blur.
 _MOST_CURVED = 0.25
 _LEAST_HALF_AXIS = 4.0
-#: Pixels within this many radii, or this near to the edge, count in the explained variance.
-_NEAR_RADII = 1.45
-_NEAR_PX = 2.0
 #: What is called the edge: this many deviations of the blur on either side.
 _EDGE_BLURS = 2.0
 #: Of windows of more pixels than this, some are taken off the edge.
 _DENSE_WINDOW = 2048
+_NEVER, _SOMETIMES, _ALWAYS = range(3)
 #: Share of the distance between pixels that are taken by which they shift from row to row: one that
 #: never repeats soon.
 _SHIFT = 0.381966
 
 
-class FitSettings(NamedTuple):
-    """Settings of a fit, apart from the image and the candidates."""
+class Reach(NamedTuple):
+    """Which pixels are fitted."""
 
-    noise: float
-    """Standard deviation of the noise, grey levels."""
-    reach_radii: float
-    """Pixels within this many radii of the candidate are fitted,"""
-    reach_px: float
+    radii: float
+    """All within this many radii of the start,"""
+    px: float
     """and those this near to the disc's edge, pixels,"""
-    reach_blurs: float
-    """or this many standard deviations of the blur."""
-    radius_sigma: float
-    """Standard deviation of the radius about the nominal one, relative."""
-    blur_px: float
-    """The blur about which the fitted one lies (along u), pixels,"""
-    blur_sigma: float
-    """and the standard deviation of its logarithm."""
-    blur_ratio: float
-    """Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames."""
+    blurs: float
+    """or this many standard deviations of the blur;"""
+    nearest: float
+    """but none nearer than this, radii,"""
+    farthest: float
+    """nor farther."""
 
 
 class Candidate(NamedTuple):
@@ -130,12 +113,6 @@ class View(NamedTuple):
 
 
 @kernel(forceinline=True)
-def padded(n: int) -> int:
-    """A number of pixels, rounded up to what loops work on at once."""
-    return (n + WHOLE - 1) // WHOLE * WHOLE
-
-
-@kernel(forceinline=True)
 def floor_steps(
     floor_xy: NDArray[np.float32], u0: int, v0: int
 ) -> tuple[float, float, float, float]:
@@ -157,7 +134,7 @@ def view_of(
 ) -> View:
     """How a candidate of a radius relative to the nominal one is seen.
 
-    `ratio` is that of the blur in `FitSettings`.
+    `ratio` is the blur along v over that along u, in pixels.
     """
     per_radius = 1.0 / (candidate.radius * relative)
     xu, yu, xv, yv = floor_steps(floor_xy, candidate.u, candidate.v)
@@ -183,26 +160,16 @@ def view_of(
     return View(shape, along_u, along_v, (xu, yu, xv, yv))
 
 
-class Gathered(NamedTuple):
-    """What became of a patch."""
-
-    shape: int
-    """`EDGE`, or along which axis chords run."""
-    n: int
-    """Pixels of the patch, those that only fill it up included."""
-    fitted: int
-    """Those of them that are fitted."""
-
-
-@kernel(forceinline=True)
+@kernel()
 def gather(
     image: NDArray[np.uint8],
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
-    settings: FitSettings,
+    blur_ratio: float,
+    reach: Reach,
     start: Disc,
     patch: Any,
-) -> Gathered:
+) -> tuple[int, NDArray[np.int64]]:
     """Fill a patch with the pixels round a candidate; none where it sees no floor.
 
     Parameters
@@ -211,36 +178,28 @@ def gather(
     floor_xy : (H, W, 2) float32
         Floor position of each pixel, metres.
     candidate : Candidate
-    settings : FitSettings
+    blur_ratio : float
+        Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames.
+    reach : Reach
     start : Disc
         Where the fit starts.
     patch : PATCH
         The result.
+
+    Returns
+    -------
+    shape : int
+        `EDGE`, or along which axis chords run.
+    ends : (SECTORS + 1,) int64
+        Where in the patch each sector begins, and the last ends.
     """
-    shape, count = _choose(floor_xy, candidate, settings, start, patch)
-    _describe(image, floor_xy, candidate, shape, count, patch)
-    return Gathered(shape, padded(count), count)
-
-
-@kernel()
-def gather_by_sector(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
-    candidate: Candidate,
-    settings: FitSettings,
-    start: Disc,
-    between: tuple[float, float],
-    patch: Any,
-    ends: NDArray[np.int64],
-) -> Gathered:
-    """As `gather`, of the pixels between two distances, radii, and sector by sector.
-
-    `ends` (SECTORS + 1,) is a result: where in the patch each sector begins, and the last ends.
-    """
-    shape, count = _choose(floor_xy, candidate, settings, start, patch)
-    count = _sort_by_sector(floor_xy, candidate, start, between, count, patch, ends)
-    _describe(image, floor_xy, candidate, shape, count, patch)
-    return Gathered(shape, padded(count), count)
+    ends = np.zeros(SECTORS + 1, np.int64)
+    view = view_of(floor_xy, candidate, start.radius, blur_ratio)
+    if view.u_per_radius > 0.0:
+        count = _choose(floor_xy, candidate, blur_ratio, reach, start, view, patch)
+        _sort_by_sector(floor_xy, candidate, start, reach, count, patch, ends)
+    _describe(image, floor_xy, candidate, view.shape, ends[SECTORS], patch)
+    return view.shape, ends
 
 
 @kernel(forceinline=True)
@@ -257,12 +216,12 @@ def _sort_by_sector(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
     start: Disc,
-    between: tuple[float, float],
+    reach: Reach,
     count: int,
     patch: Any,
     ends: NDArray[np.int64],
-) -> int:
-    """Sort pixels by sector, and leave out those that are not between the distances.
+) -> None:
+    """Sort pixels by sector, and leave out those that are too near or too far.
 
     Sectors are filled up to whole numbers of pixels with more of the same, of no weight.
     """
@@ -270,7 +229,7 @@ def _sort_by_sector(
     x0 = F32(floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x)
     y0 = F32(floor_xy[candidate.v, candidate.u, 1] + candidate.radius * start.y)
     radius = candidate.radius * start.radius
-    nearest_2, farthest_2 = F32((between[0] * radius) ** 2), F32((between[1] * radius) ** 2)
+    nearest_2, farthest_2 = F32((reach.nearest * radius) ** 2), F32((reach.farthest * radius) ** 2)
     for i in range(count):
         x, y = floor[np.uint64(pixel[i]), 0] - x0, floor[np.uint64(pixel[i]), 1] - y0
         r_2 = x * x + y * y
@@ -291,26 +250,24 @@ def _sort_by_sector(
     for s in range(SECTORS):
         for i in range(following[s], ends[s + 1]):
             patch.pixel[i], patch.weight[i] = patch.pixel[ends[s]], 0.0
-    return int(ends[SECTORS])
 
 
 @kernel(forceinline=True)
 def _choose(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
-    settings: FitSettings,
+    blur_ratio: float,
+    reach: Reach,
     start: Disc,
+    view: View,
     patch: Any,
-) -> tuple[int, int]:
-    """Which pixels are taken, and the weight of each; returns the shape and their number."""
-    view = view_of(floor_xy, candidate, start.radius, settings.blur_ratio)
-    if view.u_per_radius == 0.0:
-        return view.shape, 0
+) -> int:
+    """Which pixels are within reach; returns their number."""
     height, width = floor_xy.shape[:2]
     u0, v0 = candidate.u, candidate.v
-    most = 1.08 * settings.reach_radii
-    beyond_u = max(settings.reach_px, settings.reach_blurs * candidate.blur)
-    beyond_v = max(settings.reach_px, settings.reach_blurs * candidate.blur * settings.blur_ratio)
+    most = 1.08 * reach.radii
+    beyond_u = max(reach.px, reach.blurs * candidate.blur)
+    beyond_v = max(reach.px, reach.blurs * candidate.blur * blur_ratio)
     half_u = int(max(most * view.u_per_radius, 1.08 * view.u_per_radius + beyond_u)) + 1
     half_v = int(max(most * view.v_per_radius, 1.08 * view.v_per_radius + beyond_v)) + 1
     first_u, last_u = max(1, u0 - half_u), min(width - 2, u0 + half_u)
@@ -319,13 +276,7 @@ def _choose(
     every = 1 + window // _DENSE_WINDOW
     shift = max(1, int(_SHIFT * every + 0.5))
     floor = floor_xy.reshape(-1, 2)
-    pixel, weight, row, row_x, row_y = (
-        patch.pixel,
-        patch.weight,
-        patch.row,
-        patch.row_x,
-        patch.row_y,
-    )
+    pixel, taken, row_x, row_y = patch.pixel, patch.taken, patch.row_x, patch.row_y
     # Places relative to the start, in its radii.
     x0 = F32(floor_xy[v0, u0, 0] + candidate.radius * start.x)
     y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
@@ -341,38 +292,28 @@ def _choose(
         for k in range(np.uint64(length)):
             row_x[k] = (places[k, 0] - x0) * per_radius
             row_y[k] = (places[k, 1] - y0) * per_radius
-        _weigh(length, candidate, settings, view, F32(every), patch)
+        _take(length, candidate.blur, blur_ratio, reach, view, patch)
         for k in range(length):
-            if row[k] >= F32(0.0) and (turn == 0 or row[k] == F32(1.0)):
+            if taken[k] == _ALWAYS or (taken[k] == _SOMETIMES and turn == 0):
                 pixel[count] = begin + k
-                weight[count] = row[k]
                 count += 1
             turn = turn - 1 if turn > 0 else every - 1
-    return view.shape, count
+    return count
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def _weigh(
-    length: int,
-    candidate: Candidate,
-    settings: FitSettings,
-    view: View,
-    stands_for: float,
-    patch: Any,
+def _take(
+    length: int, blur: float, blur_ratio: float, reach: Reach, view: View, patch: Any
 ) -> None:
-    """Weights of the pixels of a row: -1 beyond reach, 0 too far from the disc."""
+    """How the pixels of a row are taken: at the edge all, of the others within reach some."""
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
-    ratio_2 = settings.blur_ratio**2
-    blur_2 = candidate.blur**2
-    reach_px = F32(settings.reach_px**2)
-    reach_u = F32(settings.reach_blurs**2 * blur_2)
-    reach_v = F32(settings.reach_blurs**2 * blur_2 * ratio_2)
-    edge_u = F32(_EDGE_BLURS**2 * (blur_2 + PIXEL_VARIANCE))
-    edge_v = F32(_EDGE_BLURS**2 * (blur_2 * ratio_2 + PIXEL_VARIANCE))
-    reach_radii, near_radii = F32(settings.reach_radii), F32(_NEAR_RADII)
-    near_px = F32(_NEAR_PX**2)
+    blur_u_2, blur_v_2 = blur**2, (blur * blur_ratio) ** 2
+    reach_radii, reach_px = F32(reach.radii), F32(reach.px**2)
+    reach_u, reach_v = F32(reach.blurs**2 * blur_u_2), F32(reach.blurs**2 * blur_v_2)
+    edge_u = F32(_EDGE_BLURS**2 * (blur_u_2 + PIXEL_VARIANCE))
+    edge_v = F32(_EDGE_BLURS**2 * (blur_v_2 + PIXEL_VARIANCE))
     for k in range(length):
         x, y = patch.row_x[k], patch.row_y[k]
         r_2 = x * x + y * y
@@ -388,12 +329,10 @@ def _weigh(
             | (off_2 <= reach_px * (gu + gv))
             | (off_2 <= reach_u * gu + reach_v * gv)
         )
-        near = (r <= near_radii) | (off_2 <= near_px * (gu + gv))
         # At the candidate itself, where all is zero, there is no edge.
         edge = off_2 < edge_u * gu + edge_v * gv
-        weight = F32(0.0) if within else F32(-1.0)
-        weight = stands_for if near else weight
-        patch.row[k] = F32(1.0) if near & edge else weight
+        taken = _SOMETIMES if within else _NEVER
+        patch.taken[k] = _ALWAYS if within & edge else taken
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
@@ -405,9 +344,8 @@ def _describe(
     count: int,
     patch: Any,
 ) -> None:
-    """The floor at the pixels chosen, and the design matrix but for the disc's rows."""
+    """The floor and the grey values at the pixels chosen."""
     grey, floor = image.reshape(-1), floor_xy.reshape(-1, 2)
-    design, pixel = patch.design, patch.pixel
     width = image.shape[1]
     first, second = (width, 1) if shape == CHORDS_ALONG_V else (1, width)
     x0, y0 = floor_xy[candidate.v, candidate.u, 0], floor_xy[candidate.v, candidate.u, 1]
@@ -419,25 +357,11 @@ def _describe(
     before = math.hypot(floor[at, 0] - floor[at - first, 0], floor[at, 1] - floor[at - first, 1])
     patch.growth = F32(2.0) * (after - before) / (after + before + F32(1e-9))
     for i in range(count):
-        at, one, two = np.uint64(pixel[i]), np.uint64(first), np.uint64(second)
+        at, one, two = np.uint64(patch.pixel[i]), np.uint64(first), np.uint64(second)
         patch.x[i] = (floor[at, 0] - x0) * per_radius
         patch.y[i] = (floor[at, 1] - y0) * per_radius
         patch.x1[i] = (floor[at + one, 0] - floor[at - one, 0]) * per_two
         patch.y1[i] = (floor[at + one, 1] - floor[at - one, 1]) * per_two
         patch.x2[i] = (floor[at + two, 0] - floor[at - two, 0]) * per_two
         patch.y2[i] = (floor[at + two, 1] - floor[at - two, 1]) * per_two
-        design[GREY, i] = F32(grey[at]) - middle
-    nowhere, zero = F32(1e3), F32(0.0)
-    for i in range(count, padded(count)):
-        patch.x[i] = patch.y[i] = nowhere
-        patch.x1[i] = patch.y2[i] = F32(1.0)
-        patch.y1[i] = patch.x2[i] = patch.weight[i] = design[GREY, i] = zero
-        pixel[i] = pixel[count - 1]
-    for i in range(padded(count)):
-        x = patch.x[i] if patch.x[i] < nowhere else zero
-        y = patch.y[i] if patch.x[i] < nowhere else zero
-        design[ONE, i] = F32(1.0) if patch.x[i] < nowhere else zero
-        design[PLANE_X, i] = x
-        design[PLANE_Y, i] = y
-        design[SADDLE, i] = x * x - y * y
-        design[SADDLE_XY, i] = x * y
+        patch.grey[i] = F32(grey[at]) - middle

@@ -88,14 +88,14 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
         reader.close()
 
 
-def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[str, float, Any]]:
-    """The messages of a topic: type, time of recording (s), and content."""
+def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[float, Any]]:
+    """The messages of a topic: time of recording (s), and content."""
     number = 0
     try:
         connections = [c for c in reader.connections if c.topic == topic]
         for connection, recorded_ns, content in reader.messages(connections):
             message = reader.deserialize(content, connection.msgtype)
-            yield connection.msgtype, recorded_ns / 1e9, message
+            yield recorded_ns / 1e9, message
             number += 1
     except Exception as error:  # as above
         raise DetectError(
@@ -181,8 +181,10 @@ def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     return pixels[:, :, [2, 1, 0, 3][:channels]] if encoding.startswith("rgb") else pixels
 
 
-def compressed_content(message: Any, name: object) -> bytes:
-    """The image file in a `sensor_msgs/CompressedImage`."""
+def content_of_message(message: Any, name: object) -> bytes | GreyImage:
+    """The grey values of a `sensor_msgs/Image`, or the file in a `sensor_msgs/CompressedImage`."""
+    if not hasattr(message, "format"):
+        return gray_of_pixels(pixels_of_message(message, name), name)
     if "compressedDepth" in message.format:
         raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
     return bytes(message.data)
@@ -222,7 +224,7 @@ class Bag(Source):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with opened_bag(self.path) as reader:
             said = messages(reader, self.path, self.topic)
-            for number, (kind, recorded_s, message) in enumerate(said):
+            for number, (recorded_s, message) in enumerate(said):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
                 content: bytes | GreyImage | None = None
@@ -230,10 +232,7 @@ class Bag(Source):
                 try:
                     with understood(name):
                         time_s = stamp_s(message, recorded_s)
-                        if kind == _COMPRESSED:
-                            content = compressed_content(message, name)
-                        else:
-                            content = gray_of_pixels(pixels_of_message(message, name), name)
+                        content = content_of_message(message, name)
                 except FrameError as error:
                     failure = str(error)
                 yield RunFrame(still(prefix), None, content, time_s, failure)
@@ -258,7 +257,7 @@ class Bag(Source):
 def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPose, FloatArray]]:
     """Poses of a topic, each with the (3, 3) covariance of its twist, in the robot's frame."""
     with opened_bag(path) as reader:
-        for _, recorded_s, message in messages(reader, path, topic):
+        for recorded_s, message in messages(reader, path, topic):
             with understood(name):
                 pose = message.pose.pose
                 q, p = pose.orientation, pose.position
@@ -314,9 +313,9 @@ def _recorded_calibration(path: Path, image_topic: str) -> Camera | None:
         found = next(messages(reader, path, topic), None)
     with understood(name):
         # Drivers that are not calibrated publish a matrix of zeros.
-        if found is None or not np.any(_field(found[2], "k")):
+        if found is None or not np.any(_field(found[1], "k")):
             return None
-        return _camera_of_info(found[2], name)
+        return _camera_of_info(found[1], name)
 
 
 def _info_topic(reader: AnyReader, image_topic: str) -> str | None:

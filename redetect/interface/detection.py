@@ -7,6 +7,7 @@ import html
 import json
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,8 @@ class Detection(Table):
     settings : CircleSettings
     frame : redetect.landmarks.Frame
         The same as rows of files, in the data set's axes: for `redetect.landmarks.write_frames`.
+    frame_tilt : redetect.landmarks.FrameTilt or None
+        The tilt likewise, as the row of a `.tilt` file.
     """
 
     discs: Discs
@@ -164,6 +167,7 @@ class Detection(Table):
     camera: Camera
     settings: CircleSettings
     frame: Frame
+    frame_tilt: FrameTilt | None
 
     def columns(self) -> dict[str, Any]:
         """Discs, then verticals, one row each; what a kind does not have is NaN."""
@@ -191,7 +195,7 @@ class Detection(Table):
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
-        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=_as_row(self.tilt, self.axes))
+        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
         sight = Sight(self.camera, self.settings.radius_m)
         return draw_rows(self.image, sight, rows, self.settings, self.name)
 
@@ -258,33 +262,67 @@ def detect(
     camera.CameraError
         If the calibration cannot be read.
     """
-    frame = frame_of_image(image)
-    return detect_frame(
-        frame, camera_of(camera), settings_of(settings, radius_m, polarity), line_settings,
-        level=level, axes=axes,
-    )  # fmt: skip
-
-
-def detect_frame(
-    frame: RunFrame,
-    camera: Camera,
-    settings: CircleSettings,
-    line_settings: LineSettings | None,
-    *,
-    level: bool,
-    axes: Axes,
-) -> Detection:
-    """As `detect`, of a frame of a run."""
-    plan = FramePlan(
-        camera,
-        lines=line_settings or LineSettings(),
-        circles=settings,
-        levelling="frame" if level else "none",
+    return RecordedFrame(frame_of_image(image), camera_of(camera)).detect(
+        radius_m, polarity, level=level, axes=axes, settings=settings, line_settings=line_settings
     )
-    (found,) = detect_batch([FrameTask(frame)], plan)
-    if found.error is not None:
-        raise FrameError(found.error)
-    return _detection(found, frame.step, camera, settings, axes)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One frame of a recording.
+
+    Attributes
+    ----------
+    frame : detect.sources.interface.RunFrame
+        Its odometry step, and where its image comes from.
+    camera : Camera
+    """
+
+    frame: RunFrame
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """The image's name."""
+        return self.frame.step.prefix
+
+    @property
+    def time_s(self) -> float | None:
+        """When it was taken, if that is known."""
+        return self.frame.time_s
+
+    @property
+    def step(self) -> Step:
+        """The robot's movement since the frame before."""
+        return self.frame.step
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
+        return read_image(self.frame, self.camera)
+
+    def detect(
+        self,
+        radius_m: float | None = None,
+        polarity: Polarity | None = None,
+        *,
+        level: bool = True,
+        axes: Axes = "dataset",
+        settings: CircleSettings | None = None,
+        line_settings: LineSettings | None = None,
+    ) -> Detection:
+        """Find discs, verticals and tilt: see `detect`."""
+        chosen = settings_of(settings, radius_m, polarity)
+        plan = FramePlan(
+            self.camera,
+            lines=line_settings or LineSettings(),
+            circles=chosen,
+            levelling="frame" if level else "none",
+        )
+        (found,) = detect_batch([FrameTask(self.frame)], plan)
+        if found.error is not None:
+            raise FrameError(found.error)
+        return _detection(found, self.step, self.camera, chosen, axes)
 
 
 def settings_of(
@@ -358,6 +396,7 @@ def _detection(
         camera=camera,
         settings=settings,
         frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
+        frame_tilt=found.tilt,
     )
 
 
@@ -370,21 +409,13 @@ def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
 
 
-def _as_row(tilt: Tilt | None, axes: Axes) -> FrameTilt | None:
-    if tilt is None:
-        return None
-    sign = 1.0 if axes == "dataset" else -1.0
-    (cpp, cpr), (_, crr) = tilt.covariance.tolist()
-    return FrameTilt("", tilt.pitch_rad, sign * tilt.roll_rad, cpp, sign * cpr, crr, tilt.lines)
-
-
 def _records(table: Table) -> list[dict[str, Any]]:
     columns = plain(table.columns())
     return [dict(zip(columns, values)) for values in zip(*columns.values())]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Explanation(Table):
+class Explanation(DiscExplanation, Table):
     """Candidates of an image with the stage and the number that dropped them, and what to try.
 
     Attributes
@@ -397,9 +428,6 @@ class Explanation(Table):
         Flags or settings to try, and what they would find.
     """
 
-    candidates: tuple[Candidate, ...]
-    place: str
-    suggestions: tuple[str, ...]
     image: NDArray[np.uint8]
     camera: Camera
     settings: CircleSettings
@@ -414,10 +442,6 @@ class Explanation(Table):
             **{name: [getattr(row, name) for row in rows] for name in fields},
             "reason": [row.reason() for row in rows],
         }
-
-    def to_json(self) -> str:
-        """An object with `candidates` (a list of records), `place` and `suggestions`."""
-        return DiscExplanation(self.candidates, self.place, self.suggestions).to_json()
 
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
@@ -474,4 +498,4 @@ def explain(
     chosen = settings_of(settings, radius_m, polarity)
     pixels = read_image(frame, camera)
     found = explain_discs(pixels, camera, chosen, at)
-    return Explanation(found.candidates, found.place, found.suggestions, pixels, camera, chosen, at)
+    return Explanation(**vars(found), image=pixels, camera=camera, settings=chosen, at=at)

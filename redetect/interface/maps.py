@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ class RunMap(Table):
         return self.result.landmarks_jointly().joint_covariance
 
     def _repr_png_(self) -> bytes:
-        return _picture(self.result.landmarks, self.path)
+        return draw_map(self.result.landmarks, self.path)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -146,7 +145,7 @@ class Localization(Poses):
         return path_distance(self.path, reference.poses)
 
     def _repr_png_(self) -> bytes:
-        return _picture(self.landmarks, self.path)
+        return draw_map(self.landmarks, self.path)
 
 
 def map_landmarks(
@@ -228,10 +227,3 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
     if "more" in paths:
         paths["more"] = tuple(map(Path, paths["more"]))
     return paths
-
-
-def _picture(landmarks: LandmarkMap, path: Path2D) -> bytes:
-    with TemporaryDirectory() as folder:
-        place = Path(folder) / "map.png"
-        draw_map(place, landmarks, path, overwrite=False)
-        return place.read_bytes()

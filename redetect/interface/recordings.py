@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.comparison.compare import compare_with_file
@@ -18,69 +13,14 @@ from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.line_settings import LineSettings
 from detect.options import SourceOptions
 from detect.seen import Sight
-from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import Run, RunFrame, read_image
+from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
 from detect.viewing_options import Compare, CompareOptions
-from redetect.interface.detection import CameraLike, Detection, detect_frame, settings_of
-from redetect.landmarks import Step
-from redetect.landmarks.axes import Axes
+from redetect.interface.detection import CameraLike, Detection, RecordedFrame
 
 PathLike = str | os.PathLike[str]
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedFrame:
-    """One frame of a recording.
-
-    Attributes
-    ----------
-    frame : detect.sources.interface.RunFrame
-        Its odometry step, and where its image comes from.
-    camera : Camera
-    """
-
-    frame: RunFrame
-    camera: Camera
-
-    @property
-    def name(self) -> str:
-        """The image's name."""
-        return self.frame.step.prefix
-
-    @property
-    def time_s(self) -> float | None:
-        """When it was taken, if that is known."""
-        return self.frame.time_s
-
-    @property
-    def step(self) -> Step:
-        """The robot's movement since the frame before."""
-        return self.frame.step
-
-    @cached_property
-    def image(self) -> NDArray[np.uint8]:
-        """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
-        return read_image(self.frame, self.camera)
-
-    def detect(
-        self,
-        radius_m: float | None = None,
-        polarity: Polarity | None = None,
-        *,
-        level: bool = True,
-        axes: Axes = "dataset",
-        settings: CircleSettings | None = None,
-        line_settings: LineSettings | None = None,
-    ) -> Detection:
-        """Find discs, verticals and tilt: see `redetect.interface.detection.detect`."""
-        settings = settings_of(settings, radius_m, polarity)
-        return detect_frame(
-            self.frame, self.camera, settings, line_settings, level=level, axes=axes
-        )
 
 
 class Recording:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -73,16 +73,25 @@ def printable(value: Any) -> Any:
 
 @contextmanager
 def figure_file(
-    size: tuple[float, float], kind: Literal["png", "svg"]
+    size: tuple[float, float],
+    kind: Literal["png", "svg"],
+    *,
+    framed: bool = False,
+    new: Callable[..., Figure] = Figure,
 ) -> Iterator[tuple[Figure, io.BytesIO]]:
-    """An empty figure of a width and height (inches) to draw into, and its file afterwards."""
+    """An empty figure of a width and height (inches) to draw into, and its file afterwards.
+
+    Axes that are `framed` have a line at all four sides. `new` makes the figure: that of a window
+    is `matplotlib.pyplot.figure`.
+    """
     with mpl.rc_context():
         mpl.rcdefaults()
         # Names of parts are hashes with a fixed salt; text remains text, in the viewer's own font.
         mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
-        mpl.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
-        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-        FigureCanvasAgg(figure)
+        mpl.rcParams.update({"axes.spines.top": framed, "axes.spines.right": framed})
+        figure = new(figsize=size, dpi=_DPI, layout="constrained")
+        if new is Figure:
+            FigureCanvasAgg(figure)
         content = io.BytesIO()
         yield figure, content
         # Without date, name and version of the program: the same bytes each time.

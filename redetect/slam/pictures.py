@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -25,9 +24,9 @@ from redetect import plane
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.reporting.page import figure_file
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import PICTURES
-from redetect.storage import OutputExistsError, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 #: Central 95 % of chi squared with 3 degrees of freedom.
 NEES_BAND = (0.21579528262389785, 9.348403604496145)
 
-DPI = 120
 _WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
@@ -52,27 +50,14 @@ _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
 
 @contextmanager
-def picture(
-    png: Path, size: tuple[float, float], *, overwrite: bool, interactive: bool
-) -> Iterator[Figure]:
-    """A figure to draw into (size in inches); at the end it is written and, on request, shown."""
-    if not overwrite and png.exists():  # before the work instead of after it
-        raise OutputExistsError(png)
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        if interactive:
-            if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
-                raise SlamError("no window can be opened here: expected a display for interactive")
-            figure = pyplot.figure(figsize=size, dpi=DPI, layout="constrained")
-        else:
-            figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-            FigureCanvasAgg(figure)
+def picture(size: tuple[float, float], *, interactive: bool) -> Iterator[tuple[Figure, io.BytesIO]]:
+    """A figure to draw into (size in inches), and its file; on request, it is shown at the end."""
+    if interactive and mpl.get_backend().lower() in _WITHOUT_WINDOWS:
+        raise SlamError("no window can be opened here: expected a display for interactive")
+    new = pyplot.figure if interactive else Figure
+    with figure_file(size, "png", framed=True, new=new) as (figure, content):
         try:
-            yield figure
-            stream = io.BytesIO()
-            # Without the name and version of the program that made it: the same bytes everywhere.
-            figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
-            write_bytes(png, stream.getvalue(), overwrite=overwrite)
+            yield figure, content
             if interactive:
                 pyplot.show()
         finally:
@@ -97,22 +82,18 @@ def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def draw_map(
-    png: Path,
     landmark_map: LandmarkMap,
     path: Path2D,
     *,
     before: tuple[LandmarkMap, Path2D] | None = None,
     reference: Path2D | None = None,
     title: str = "",
-    overwrite: bool,
     interactive: bool = False,
-) -> None:
-    """Draw a map: path, landmarks and their 3-sigma ellipses.
+) -> bytes:
+    """Draw a map: path, landmarks and their 3-sigma ellipses; returns a PNG's bytes.
 
     Parameters
     ----------
-    png : Path
-        The picture's file.
     landmark_map : LandmarkMap
         Discs and verticals. Verticals far outside are counted in the legend, not drawn.
     path : Path2D
@@ -123,15 +104,11 @@ def draw_map(
         The true path, or another to compare with; dashed.
     title : str
         Drawn above the picture.
-    overwrite : bool
-        Whether an existing file may be replaced.
     interactive : bool
         Show a window as well, and wait until it is closed.
 
     Raises
     ------
-    redetect.storage.OutputExistsError
-        If the file exists and may not be replaced.
     SlamError
         If it is `interactive` where no window can be opened.
     """
@@ -145,7 +122,7 @@ def draw_map(
     width, height = (8.0 * (high - low) / np.max(high - low)).tolist()
     rows, columns = (len(panels), 1) if width > 1.5 * height else (1, len(panels))
     size = max(columns * width, 6.0) + 1.2, rows * height + 1.8
-    with picture(png, size, overwrite=overwrite, interactive=interactive) as figure:
+    with picture(size, interactive=interactive) as (figure, content):
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
             _draw_panel(axes, some, poses, reference, low, high)
@@ -163,26 +140,21 @@ def draw_map(
         )
         if title:
             figure.suptitle(title, fontsize=12)
+    return content.getvalue()
 
 
 def draw_errors(
-    png: Path,
-    path: Path2D,
-    reference: FloatArray,
-    *,
-    title: str = "",
-    overwrite: bool,
-    interactive: bool = False,
-) -> None:
+    path: Path2D, reference: FloatArray, *, title: str = "", interactive: bool = False
+) -> bytes:
     """Draw position and heading error over the steps, and the normalised error squared.
 
-    Takes a path with covariances and `reference` (N, 3).
+    Takes a path with covariances and `reference` (N, 3); returns a PNG's bytes.
     """
     error, sigma, nees = pose_errors(path, reference)
     step = np.arange(len(error))
     unit = np.array([1.0, 1.0, 180.0 / np.pi])
     names = ("x error / m", "y error / m", "heading error / °")
-    with picture(png, (10.0, 8.6), overwrite=overwrite, interactive=interactive) as figure:
+    with picture((10.0, 8.6), interactive=interactive) as (figure, content):
         all_axes = figure.subplots(4, 1, sharex=True)
         for i, (axes, name) in enumerate(zip(all_axes, names)):
             value = unit[i] * error[:, i]
@@ -203,6 +175,7 @@ def draw_errors(
         figure.align_ylabels(list(all_axes))
         if title:
             figure.suptitle(title, fontsize=12)
+    return content.getvalue()
 
 
 def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
@@ -338,11 +311,11 @@ def picture_of_frame(folder: Path, prefix: str) -> Path | None:
     return None
 
 
-def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool = False) -> None:
+def draw_crops(crops: Sequence[Crop], title: str) -> bytes:
     """Draw parts of images side by side, a cross-hair with a gap in the middle of each."""
     rows = -(-len(crops) // _CROPS_ABREAST)
     size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
-    with picture(png, size, overwrite=overwrite, interactive=False) as figure:
+    with picture(size, interactive=False) as (figure, content):
         figure.suptitle(title)
         axes = figure.subplots(rows, _CROPS_ABREAST, squeeze=False)
         for some in axes.flat:
@@ -354,3 +327,4 @@ def draw_crops(png: Path, crops: Sequence[Crop], *, title: str, overwrite: bool 
             some.set_xlim(u - _CROP_PX, u + _CROP_PX)
             some.set_ylim(v + _CROP_PX / 2, v - _CROP_PX / 2)
             some.set_title(crop.name, fontsize=8)
+    return content.getvalue()

@@ -28,7 +28,6 @@ from camera.calibration.model import (
     COUNT,
     CalibrationSettings,
     FreeLens,
-    free_span,
     is_possible,
     project_points,
 )
@@ -317,12 +316,12 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
 
 
 def test_free_span_ties_the_scales() -> None:
-    span = free_span(2, 0.5)
+    span = FreeLens(2).span(0.5)
     assert span.shape == (14, 5)
     assert span[1, 0] == 0.5 * span[0, 0]
-    assert free_span(5, None).shape == (14, 9)
-    assert free_span(5, None, tangential=True).shape == (14, 11)
-    assert free_span(0, 1.0, tangential=True, polynomial=3).shape == (14, 8)
+    assert FreeLens(5).span(None).shape == (14, 9)
+    assert FreeLens(5, tangential=True).span(None).shape == (14, 11)
+    assert FreeLens(0, tangential=True, polynomial=3).span(1.0).shape == (14, 8)
 
 
 def test_too_few_pictures_say_how_many_are_needed(published_camera: Camera) -> None:

@@ -37,10 +37,10 @@ def documents(root: Path) -> list[Path]:
     """Every document of the project that people read."""
     single = (
         "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "examples/README.md",
-        "images/README.md",
+        "images/README.md", "requirements/README.md", "ros/redetect_ros/README.md",
     )  # fmt: skip
     pages = sorted((root / "docs").rglob("*.md"))
-    return [*(root / name for name in single), root / "requirements" / "README.md", *pages]
+    return [*(root / name for name in single), *pages]
 
 
 def blocks_of(document: Path) -> Iterator[Block]:

@@ -13,7 +13,7 @@ import pytest
 
 ROOMS = ("camera", "detect", "lut", "redetect")
 #: What the project has beside its rooms.
-BESIDE = ("conda", "docs", "examples", "images", "requirements", "tests", "tools")
+BESIDE = ("conda", "docs", "examples", "images", "requirements", "ros", "tests", "tools")
 SINGLE = (
     "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "Dockerfile", "LICENSE", "MANIFEST.in",
     "Makefile", "README.md", "SECURITY.md",

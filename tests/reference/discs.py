@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.special import chndtr, ndtr
 
 from detect.discs.model import BEND, T_LIMIT, Z_LIMIT
-from detect.discs.patch import Candidate, FitSettings
+from detect.discs.patch import Candidate, Reach
 from redetect.array_types import FloatArray, IntArray
 
 PIXEL_VARIANCE = 1.0 / 12.0
@@ -113,7 +113,7 @@ def chord_share(
 
 
 def pixels_within_reach(
-    floor_xy: NDArray[np.float32], candidate: Candidate, settings: FitSettings
+    floor_xy: NDArray[np.float32], candidate: Candidate, reach: Reach, blur_ratio: float
 ) -> IntArray:
     """(N,) flat indices of all pixels to which a disc at the candidate is fitted."""
     floor = floor_xy.astype(float)
@@ -123,12 +123,13 @@ def pixels_within_reach(
     place = (floor - floor[v, u]) / candidate.radius
     r = np.linalg.norm(place, axis=-1)
     off = np.abs(r - 1.0) * r
-    blur_u, blur_v = candidate.blur, candidate.blur * settings.blur_ratio
+    blur_u, blur_v = candidate.blur, candidate.blur * blur_ratio
     with np.errstate(invalid="ignore"):
         per_u, per_v = place @ by_u, place @ by_v
-        within = r <= settings.reach_radii
-        within |= off <= settings.reach_px * np.hypot(per_u, per_v)
-        within |= off <= settings.reach_blurs * np.hypot(blur_u * per_u, blur_v * per_v)
+        within = r <= reach.radii
+        within |= off <= reach.px * np.hypot(per_u, per_v)
+        within |= off <= reach.blurs * np.hypot(blur_u * per_u, blur_v * per_v)
+        within &= (r >= reach.nearest) & (r <= reach.farthest)
     within[[0, -1]] = within[:, [0, -1]] = False
     return np.flatnonzero(within)
 
@@ -141,28 +142,30 @@ def background_of(at: Pixels) -> FloatArray:
     return np.stack([np.ones_like(at.x), at.x, at.y, at.x**2 - at.y**2, at.x * at.y])
 
 
-def fitted_disc(
-    at: Pixels, grey: FloatArray, flat: bool, settings: FitSettings, swapped: bool
-) -> FloatArray:
-    """x, y, radius and log blur of the disc that explains the grey values best.
+@dataclass(frozen=True)
+class Expected:
+    """What is expected of a disc before it is fitted."""
 
-    `swapped` says that the first axis of the pixels is v. The noise is that of the settings.
-    """
+    noise: float  # grey levels
+    radius_sigma: float  # relative, about the nominal one
+    blur_px: tuple[float, float]  # along either axis of the pixels
+    blur_sigma: float  # of its logarithm
+
+
+def fitted_disc(at: Pixels, grey: FloatArray, flat: bool, expected: Expected) -> FloatArray:
+    """x, y, radius and logarithms of both blurs of the disc that explains the grey values best."""
     share_of = chord_share if flat else edge_share
+    usual = np.log(expected.blur_px)
 
     def misfit(p: FloatArray) -> FloatArray:
-        blur = math.exp(p[3])
-        blurs = (
-            (blur * settings.blur_ratio, blur) if swapped else (blur, blur * settings.blur_ratio)
-        )
-        share = share_of(at, p[0], p[1], p[2], *blurs)
+        share = share_of(at, p[0], p[1], p[2], *np.exp(p[3:]))
         terms = np.vstack([background_of(at), share])
         linear = np.linalg.lstsq(terms.T, grey, rcond=None)[0]
         beforehand = [
-            (p[3] - math.log(settings.blur_px)) / settings.blur_sigma,
-            (p[2] - 1.0) / settings.radius_sigma,
+            (p[2] - 1.0) / expected.radius_sigma,
+            *((p[3:] - usual) / expected.blur_sigma),
         ]
-        return np.append((grey - terms.T @ linear) / settings.noise, beforehand)
+        return np.append((grey - terms.T @ linear) / expected.noise, beforehand)
 
-    start = np.array([0.0, 0.0, 1.0, math.log(settings.blur_px)])
-    return np.asarray(least_squares(misfit, start, x_scale=[0.1, 0.1, 0.1, 0.5]).x)
+    start = np.array([0.0, 0.0, 1.0, *usual])
+    return np.asarray(least_squares(misfit, start, x_scale=[0.1, 0.1, 0.1, 0.5, 0.5]).x)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from camera import Camera, CameraError
+from camera.boards.board import Board
 from camera.calibration.images import read_grey
 from detect.errors import FrameError
 from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
+from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.storage.bounded import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
@@ -36,7 +37,9 @@ def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Ca
     path.write_bytes(content)
     said = f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
     with pytest.raises(GroundTruthError, match=re.escape(said)):
-        find_boards(BoardImage("a", "b", 0, path), checkerboard(5, 4, 0.1), published_camera)
+        find_boards(
+            BoardImage("a", "b", 0, path), Board("checkerboard", 5, 4, 0.1), published_camera
+        )
 
 
 @pytest.mark.parametrize("deep", [False, True])

@@ -48,7 +48,7 @@ def perform(command: Poses) -> int:
     )
     if track.unknown_markers:
         print(f"{track.unknown_markers} markers found are not on the rig: left out")
-    left_out = sum(int((~pose.views).sum()) for _, pose in track.posed)
+    left_out = sum(int((~t.estimate.views).sum()) for t in track.times if t.pose and t.estimate)
     if left_out:
         print(f"{left_out} markers do not fit the others of their time: left out")
     if command.report is not None:

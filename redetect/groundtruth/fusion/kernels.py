@@ -321,10 +321,8 @@ def filter_forward(
                 innovation[2] = wrap(innovation[2])
             lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
             if lost or rejections >= gating.restart_after:
-                for i in range(POSE):
-                    for j in range(STATE):
-                        p[i, j] = 0.0
-                        p[j, i] = 0.0
+                p[:POSE] = 0.0
+                p[:, :POSE] = 0.0
                 for i in range(POSE):
                     p[i, i] = gating.restart_variances[i]
                     x[i] += innovation[i]
@@ -334,9 +332,7 @@ def filter_forward(
                 restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
                 if kept:
                     keep(predicted, predicted_covariance, k, x, p)
-                    for i in range(POSE):
-                        for j in range(STATE):
-                            transitions[k, i, j] = 0.0
+                    transitions[k, :POSE] = 0.0
             for j in range(POSE):
                 for i in range(STATE):
                     common[i, j] = p[i, j]

@@ -29,10 +29,11 @@ from redetect.plane import apply
 _REPEATED, _DAMPING = 10, 1e-3
 
 
+@kernel()
 def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
     """Which of (n,) squared distances (m^2) are within the gate and among the best share."""
-    within = np.asarray(squared <= gate_m * gate_m)
-    count = int(within.sum())
+    within = squared <= gate_m * gate_m
+    count = np.count_nonzero(within)
     if kept < 1.0 and count > 0:
         last = math.ceil(kept * count) - 1
         within &= squared <= np.partition(squared[within], last)[last]
@@ -211,13 +212,10 @@ def fit_outline(
         c, s = math.cos(pose[2]), math.sin(pose[2])
         back = np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
         nearest, _, squared = nearest_on_segments(moved(points, back), faces)
-        limit = gate_m * gate_m
-        within = squared[squared <= limit]
-        if within.size < 3:
-            return pose, np.inf, within.size
-        within.sort()
-        limit = within[math.ceil(kept * within.size) - 1]
-        used = squared <= limit
+        near = int(np.count_nonzero(squared <= gate_m * gate_m))
+        if near < 3:
+            return pose, np.inf, near
+        used = best_share(squared, gate_m, kept)
         count = int(np.count_nonzero(used))
         rms = math.sqrt(squared[used].sum() / count)
         if abs(before - rms) < threshold_m or step == most_steps:

@@ -206,17 +206,14 @@ def _hold_open(
     )
     values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
     there = np.linalg.inv(back)
+    p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
     open_count = 0
     for k in range(3):
         if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
             open_count += 1
             row = np.ascontiguousarray(vectors[:, k]) @ there
-            p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
-            ahead = row @ to_start
-            for a in range(3):
-                g[a] -= p * row[a] * ahead
-                for b in range(3):
-                    h[a, b] += p * row[a] * row[b]
+            g -= p * row * (row @ to_start)
+            h += np.outer(p * row, row)
     return open_count, vectors[:, 0].copy()
 
 

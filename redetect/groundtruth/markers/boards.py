@@ -41,24 +41,6 @@ from redetect.storage.messages import excerpt
 _WINDOW = 0.4
 
 
-def checkerboard(columns: int, rows: int, square_m: float) -> Board:
-    """A board by its numbers of inner corners, one even and one odd, and the side of a square.
-
-    Raises `GroundTruthError` if the board is symmetric under rotation by 180 degrees, or is too
-    small.
-    """
-    try:
-        board = Board("checkerboard", columns, rows, square_m)
-    except CalibrationError as error:
-        raise GroundTruthError(str(error)) from None
-    if board.looks_turned:
-        raise GroundTruthError(
-            f"board of {columns} x {rows} inner corners looks the same turned by 180 degrees: "
-            "expected one even and one odd number"
-        )
-    return board
-
-
 BOARDS_NAME = "boards.json"
 FIRST, SECOND, WORLD = "first", "second", "world"
 
@@ -171,9 +153,15 @@ def _inside(path: Path, name: str) -> Path:
 def _board(entry: JsonObject) -> Board:
     columns, rows = entry.whole("columns"), entry.whole("rows")
     try:
-        return checkerboard(columns, rows, entry.number("square_m"))
-    except GroundTruthError as error:
+        board = Board("checkerboard", columns, rows, entry.number("square_m"))
+    except CalibrationError as error:
         raise GroundTruthError(f"{entry.place}: {error}") from None
+    if board.looks_turned:
+        raise GroundTruthError(
+            f"{entry.place}: board of {columns} x {rows} inner corners looks the same turned by "
+            "180 degrees: expected one even and one odd number"
+        )
+    return board
 
 
 def _image(row: JsonObject, path: Path, boards: dict[str, Board]) -> BoardImage:

@@ -23,17 +23,15 @@ from redetect.groundtruth.markers.refinement import (
     RefinedPose,
     predicted_errors,
     refine_pose,
+    refined_poses,
 )
 from redetect.groundtruth.settings import PoseSettings, Solver
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     log_se3,
-    rotation_angle,
     transform,
 )
-
-SOLVERS: tuple[Solver, ...] = ("sqpnp", "epnp", "iterative", "ippe", "pycolmap")
 
 _RANSAC_PX = 4.0
 
@@ -218,18 +216,12 @@ _FARTHEST_M = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidate(RefinedPose):
-    """A pose that may be the robot's, refined over the views that it explains."""
-
-    views: BoolArray  # (V,): which of all views those are
-
-
-@dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """Pose estimate from the corners of one time."""
 
     # The best first; several if the markers are ambiguous.
-    candidates: tuple[PoseCandidate, ...]
+    candidates: tuple[RefinedPose, ...]
+    views: BoolArray  # (V,): which of all views they explain
     # Natural logarithm of how much likelier the first is than each candidate: 0 for the first
     log_odds: tuple[float, ...]
 
@@ -247,24 +239,23 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
-    everything, settings = np.ones(problem.views, dtype=np.bool_), problem.settings
+    settings = problem.settings
     found = _refined(problem, _starts(problem)[:1])
     # Least squares may not have reached the right minimum from the solver's start.
     if not (found and _all_agree(found[0], settings)):
         found = _refined(problem, _starts(problem) + _own_poses(problem))
     if found and _all_agree(found[0], settings):
-        views = everything
+        views = np.ones(problem.views, dtype=np.bool_)
     else:
         views, refined = _consensus(problem)
         found = [refined]
     alone = problem.only(views)
     starts = _starts(alone)[:1] + _mirrored(alone)
-    likely = _likely(_distinct(found + _refined(alone, starts)), settings)
-    candidates = tuple(PoseCandidate(**vars(pose), views=views) for pose in likely)
+    candidates = _likely(_distinct(found + _refined(alone, starts)), settings)
     best = candidates[0]
     inflation = _inflation(best)
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
-    return PoseEstimate(candidates, log_odds)
+    return PoseEstimate(tuple(candidates), views, log_odds)
 
 
 def _all_agree(refined: RefinedPose, settings: PoseSettings) -> bool:
@@ -302,13 +293,7 @@ def _mirrored(problem: PoseProblem) -> list[FloatArray]:
 
 def _refined(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
     """Distinct minima below the starts, the best first."""
-    minima = []
-    for start in starts:
-        try:
-            minima.append(refine_pose(problem, start))
-        except GeometryError:
-            continue
-    return _distinct(minima)
+    return _distinct(refined_poses(problem, starts))
 
 
 def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
@@ -322,8 +307,9 @@ def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:
-    apart = np.linalg.norm(a[:3, 3] - b[:3, 3])
-    return bool(apart < _SAME_PLACE_M and rotation_angle(inverse(a) @ b) < _SAME_ANGLE_RAD)
+    apart = inverse(a) @ b
+    turn = np.linalg.norm(log_se3(apart)[3:])
+    return bool(np.linalg.norm(apart[:3, 3]) < _SAME_PLACE_M and turn < _SAME_ANGLE_RAD)
 
 
 def _inflation(best: RefinedPose) -> float:

@@ -14,6 +14,7 @@ marginalised: its uncertainty reaches the pose's covariance, and counts in the w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -158,6 +159,15 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
     )
 
 
+def refined_poses(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
+    """The minima below the starts that have one, the best first."""
+    minima = []
+    for start in starts:
+        with suppress(GeometryError):
+            minima.append(refine_pose(problem, start))
+    return sorted(minima, key=lambda pose: pose.cost)
+
+
 class _Linearised(NamedTuple):
     """The squares of a problem about a pose."""
 
@@ -171,7 +181,8 @@ class _Linearised(NamedTuple):
 def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
     here = _corners(problem, pose)
     assert here is not None
-    covariance = _covariance(problem, here, _view_weights(problem, here))
+    weights = 1.0 / np.maximum(_view_errors(problem, here) / _HUBER, 1.0)
+    covariance = _covariance(problem, here, weights)
     stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
     products = stacked.T @ np.linalg.solve(covariance, stacked)
     normal = 0.5 * (products[1:, 1:] + products[1:, 1:].T)
@@ -192,7 +203,8 @@ def predicted_errors(
         if here is not None:
             covariance = _covariance(alone, here, np.ones(1))
             covariance += here.jacobian @ pose_covariance @ here.jacobian.T
-            errors[view] = _normalised_rms(here.residuals, covariance)
+            squared = squared_mahalanobis(here.residuals, covariance)
+            errors[view] = np.sqrt(squared / len(here.residuals))
     return errors
 
 
@@ -243,21 +255,12 @@ def _cost(problem: PoseProblem, pose: FloatArray, covariance: FloatArray) -> flo
     return float(squared_mahalanobis(residuals, covariance))
 
 
-def _normalised_rms(residuals: FloatArray, covariance: FloatArray) -> float:
-    return float(np.sqrt(squared_mahalanobis(residuals, covariance) / len(residuals)))
-
-
 def _view_errors(problem: PoseProblem, here: _Corners) -> FloatArray:
     covariance = _covariance(problem, here, np.ones(problem.views))
     views = np.arange(problem.views)
     own = covariance.reshape(len(views), _ROWS, len(views), _ROWS)[views, :, views, :]
     residuals = here.residuals.reshape(-1, _ROWS)
     return np.asarray(np.sqrt(squared_mahalanobis(residuals, own) / _ROWS))
-
-
-def _view_weights(problem: PoseProblem, here: _Corners) -> FloatArray:
-    """Huber's."""
-    return np.asarray(1.0 / np.maximum(_view_errors(problem, here) / _HUBER, 1.0))
 
 
 def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> ChainPoints:

@@ -30,7 +30,7 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
 )
 from redetect.groundtruth.markers.poses import view_poses
-from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refine_pose
+from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refined_poses
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings, RigSettings
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose
@@ -181,15 +181,9 @@ def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) ->
         np.zeros(4, dtype=np.int64),
         PoseSettings(),
     )
-    found = []
-    for start in view_poses(problem, 0):
-        try:
-            found.append(refine_pose(problem, start))
-        except GeometryError:
-            continue
+    found = refined_poses(problem, view_poses(problem, 0))
     if not found:
         return None
-    found.sort(key=lambda refined: refined.cost)
     return MarkerPose(
         np.stack([refined.world_from_robot for refined in found]),
         np.stack([refined.covariance for refined in found]),
@@ -231,15 +225,13 @@ def _reasons(
     seen: Sequence[Sequence[View]],
     settings: RigSettings,
 ) -> dict[int, str]:
-    reasons = {}
-    for index, marker in enumerate(ids):
-        alone = sum(any(v.rig_index == index for v in views) for views in seen)
-        if index not in kept:
-            reasons[marker] = (
-                f"seen at {alone} times, but not {settings.least_support} times in agreement with "
-                "a marker of the rig"
-            )
-    return reasons
+    """Why markers are left out."""
+    times = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]
+    return {
+        ids[k]: f"seen at {times[k]} times, but not {settings.least_support} times in agreement "
+        "with a marker of the rig"
+        for k in np.setdiff1d(np.arange(len(ids)), kept).tolist()
+    }
 
 
 def _bundle(

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from camera import Camera, read_camera
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform_from_quaternion
+from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
 from redetect.storage.bounds import Bounds
@@ -171,7 +172,7 @@ def parse_pose(entry: JsonObject) -> FloatArray:
         raise GroundTruthError(
             f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
-    return transform_from_quaternion(quaternion / length, translation)
+    return transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
 
 
 def _joint_covariance(

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
-from redetect.groundtruth.markers.refinement import pose_problem
+from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
 from redetect.groundtruth.markers.session import (
     MarkerFrame,
     Network,
@@ -44,15 +44,7 @@ class TrackedTime:
     estimate: PoseEstimate | None = None
     choice: Choice | None = None
     reason: str = ""  # Why there is no pose, or a remark on it
-
-    @property
-    def pose(self) -> PoseCandidate | None:
-        """The robot's pose; None if there is no reliable one."""
-        if self.status in ("clear", "resolved") and self.estimate is not None:
-            assert self.choice is not None
-            assert self.choice.candidate is not None
-            return self.estimate.candidates[self.choice.candidate]
-        return None
+    pose: RefinedPose | None = None  # The robot's; None if there is no reliable one
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +55,7 @@ class Track:
     unknown_markers: int  # Markers found in the images that are not on the rig
 
     @property
-    def posed(self) -> list[tuple[float, PoseCandidate]]:
+    def posed(self) -> list[tuple[float, RefinedPose]]:
         """Times with a pose."""
         return [(t.time_s, t.pose) for t in self.times if t.pose is not None]
 
@@ -153,9 +145,9 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     entry["markers"] = [
         {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
     ]
-    if chosen is not None:
+    if estimate is not None and chosen is not None:
         figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
-        for marker, is_used in zip(entry["markers"], chosen.views):
+        for marker, is_used in zip(entry["markers"], estimate.views):
             marker["used"] = bool(is_used)
             if is_used:
                 error, rms = next(figures)
@@ -187,8 +179,13 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
         "resolved": "planar ambiguity, decided by the neighbours",
         "unresolved": "planar ambiguity, not decided by the neighbours",
     }
+    pose = None
+    if choice.status in ("clear", "resolved"):
+        assert tracked.estimate is not None
+        assert choice.candidate is not None
+        pose = tracked.estimate.candidates[choice.candidate]
     reason = reasons.get(choice.status, "")
-    return replace(tracked, status=choice.status, choice=choice, reason=reason)
+    return replace(tracked, status=choice.status, choice=choice, reason=reason, pose=pose)
 
 
 # In units of negative log-likelihood: leaving a frame out is cheaper than two jumps round it, and a

@@ -31,13 +31,6 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
     return matrix
 
 
-def transform_from_quaternion(quaternion_xyzw: ArrayLike, translation: ArrayLike) -> FloatArray:
-    """(..., 4, 4) transforms of (..., 4) quaternions x, y, z, w and (..., 3) translations (m)."""
-    q = np.asarray(quaternion_xyzw, dtype=np.float64)
-    rotation = Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
-    return transform(rotation, translation)
-
-
 def quaternion_xyzw(transforms: ArrayLike) -> FloatArray:
     """(..., 4) unit quaternions x, y, z, w >= 0 of the rotations of (..., 4, 4) transforms."""
     t = np.asarray(transforms, dtype=np.float64)
@@ -96,13 +89,6 @@ def right_jacobian(tangent: ArrayLike) -> FloatArray:
     return np.asarray(expm(block)[:6, 6:])
 
 
-def rotation_angle(transforms: ArrayLike) -> FloatArray:
-    """(...) angles in [0, pi] (rad) of the rotations of (..., 4, 4) transforms."""
-    t = np.asarray(transforms, dtype=np.float64)
-    magnitude = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).magnitude()
-    return np.asarray(magnitude.reshape(t.shape[:-2]))
-
-
 def heading(transforms: ArrayLike) -> FloatArray:
     """(...) headings theta (rad): angles of the x axes of (..., 4, 4) poses in the world."""
     t = np.asarray(transforms, dtype=np.float64)
@@ -136,10 +122,7 @@ def composed_covariance(
     a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
 ) -> FloatArray:
     """(..., 6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
-    moved = adjoint(inverse(b_from_c))
-    return np.asarray(
-        moved @ a_covariance @ np.swapaxes(moved, -1, -2) + b_covariance, dtype=np.float64
-    )
+    return inverse_covariance(inverse(b_from_c), a_covariance) + b_covariance
 
 
 def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -281,12 +281,8 @@ class Dimension(NamedTuple):
     measured_m: float
 
 
-class FiducialDistance(NamedTuple):
-    """A measured distance between two fiducials."""
-
-    a: str
-    b: str
-    distance_m: float
+#: Two fiducials and the measured distance between them (m).
+FiducialDistance = tuple[str, str, float]
 
 
 class SurveyedFiducials(NamedTuple):
@@ -312,7 +308,7 @@ def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> lis
     found = []
     for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):
         a, b = (known_name(path, line, name, survey.fiducials) for name in names)
-        found.append(FiducialDistance(a, b, distance))
+        found.append((a, b, distance))
     return found
 
 
@@ -325,8 +321,8 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])
-    ends = np.array([(names.index(d.a), names.index(d.b)) for d in distances]).reshape(-1, 2)
-    measured = np.array([d.distance_m for d in distances])
+    ends = np.array([(names.index(a), names.index(b)) for a, b, _ in distances]).reshape(-1, 2)
+    measured = np.array([distance_m for _, _, distance_m in distances])
 
     def residuals(flat: FloatArray) -> FloatArray:
         apart = flat.reshape(-1, 2)[ends[:, 0]] - flat.reshape(-1, 2)[ends[:, 1]]

@@ -137,17 +137,13 @@ def sigma_of(values: FloatArray) -> float:
     return float(values.std(ddof=1)) if len(values) > 1 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Relations:
+class Relations(NamedTuple):
     """Poses of the robot at one time relative to another."""
 
     from_s: FloatArray  # (N,)
     to_s: FloatArray  # (N,): may be the earlier one
     # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
     from_to: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.from_s)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from redetect.array_types import IntArray
 from redetect.slam.association.compatibility import compatible
 from redetect.slam.filters.ekf_slam import EkfSlam
 from redetect.slam.filters.frames import FrameRows, frames_of
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 
 # A landmark that is unseen for longer is forgotten (frames); so is a disc whose position relative
@@ -78,8 +78,7 @@ def _labels(
     slots = ekf.line_slots if isinstance(rows, LineRows) else ekf.disc_slots
     names = np.array(list(slots), dtype=np.int64)
     landmark = compatible(setting.method, *ekf.compared(rows, names), setting.gate_probability)
-    found = np.full(len(rows), -1, dtype=np.int64)
-    found[landmark >= 0] = names[landmark[landmark >= 0]]
+    found = np.append(names, UNKNOWN_ID)[landmark]
     found[landmark < 0] = fresh + np.arange(np.count_nonzero(landmark < 0))
     return [int(label) for label in found]
 

@@ -98,12 +98,7 @@ def _best_motion(
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
     low_x, low_y, nearest = _nearest_by_cell(fixed)
     columns, rows = nearest.shape
-    squared_length = np.empty((m, m))
-    for c in range(m):
-        for d in range(m):
-            squared_length[c, d] = (fixed[d, 0] - fixed[c, 0]) ** 2 + (
-                fixed[d, 1] - fixed[c, 1]
-            ) ** 2
+    squared_length = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
     for a in range(n):
         for b in range(a + 1, min(a + 1 + _NEIGHBOURS, n)):
             ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]

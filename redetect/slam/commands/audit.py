@@ -19,7 +19,7 @@ from redetect.slam.mapping.audit import Audit, Group, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import Recording, landmark_files
-from redetect.storage import demand_free
+from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
@@ -136,7 +136,7 @@ def _draw(
         if crops:
             options.pictures.mkdir(parents=True, exist_ok=True)
             name = f"frame-{seen[group.rows[0]][0]:04d}-id-{group.id}.png"
-            title = f"ID {group.id}: {group.kind}"
-            draw_crops(options.pictures / name, crops, title=title, overwrite=options.force)
+            picture = draw_crops(crops, f"ID {group.id}: {group.kind}")
+            write_bytes(options.pictures / name, picture, overwrite=options.force)
             drawn += 1
     print(f"{options.pictures}: pictures of {drawn} of {len(audit.groups)} groups")

@@ -41,7 +41,7 @@ from redetect.slam.filters.localizer import Localizer
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
-from redetect.storage import demand_free
+from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 
 ERROR_PICTURE = "errors.png"
@@ -101,14 +101,13 @@ def perform(command: Localize | Ekf) -> int:
             )
     write_json(output / f"{name}.json", content, overwrite=command.force)
     print("\n".join([*_table(run, distance), *said]))
-    drawing: dict[str, Any] = {
-        "title": f"{command.run.name}: {title}",
-        "overwrite": command.force,
-        "interactive": command.interactive,
-    }
-    draw_map(output / MAP_PICTURE, landmark_map, run.path, reference=reference, **drawing)
+    title = f"{command.run.name}: {title}"
+    shown = command.interactive
+    drawn = draw_map(landmark_map, run.path, reference=reference, title=title, interactive=shown)
+    write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
     if reference is not None:
-        draw_errors(output / ERROR_PICTURE, run.path, reference.poses, **drawing)
+        drawn = draw_errors(run.path, reference.poses, title=title, interactive=shown)
+        write_bytes(output / ERROR_PICTURE, drawn, overwrite=command.force)
     if isinstance(command, Ekf):
         write_map(output / MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0

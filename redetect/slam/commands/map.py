@@ -38,7 +38,7 @@ from redetect.slam.mapping.run_map import (
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
-from redetect.storage import demand_free
+from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounds import ABOVE_0, FINITE, demand
 
 TABLE_NAME = "table.json"
@@ -85,15 +85,8 @@ def perform(command: Map) -> int:
             f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
             "localize` takes their errors to be independent"
         )
-    draw_map(
-        output / MAP_PICTURE,
-        final,
-        path,
-        before=mapped.before,
-        title=name,
-        overwrite=command.force,
-        interactive=command.interactive,
-    )
+    drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
+    write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
     print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE))}")
     return 0
 

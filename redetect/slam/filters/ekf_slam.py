@@ -35,6 +35,7 @@ from redetect.slam.filters.frames import (
     Filter,
     FilterRun,
     FrameRows,
+    numbers_from,
     run_filter,
 )
 from redetect.slam.models import tilt_jacobian
@@ -61,12 +62,8 @@ class EkfSlam(Filter):
 
     Parameters
     ----------
-    start : (3,) array_like
-        Pose at the start (m, m, rad).
-    start_covariance : (3, 3) array_like
-        Its covariance; none by default, as the start defines the map.
-    camera_xy : (2,) array_like
-        The camera's centre in the robot frame (m); only lines need it.
+    start, start_covariance, camera_xy : array_like
+        As of `Filter`.
     tilt_sigma_rad : float
         Standard deviation of the robot's sway about both axes of the floor, beyond what the rows'
         covariances say.
@@ -118,8 +115,8 @@ class EkfSlam(Filter):
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks whose place is known, with their covariances."""
-        of_discs = _numbers_of(self.disc_slots, 2)
-        of_lines = _numbers_of(self.line_slots, self.line_size)
+        of_discs = numbers_from([*self.disc_slots.values()], 2)
+        of_lines = numbers_from([*self.line_slots.values()], self.line_size)
         inverse = self._state[of_lines[:, 3]]
         variance = self._covariance[of_lines[:, 3], of_lines[:, 3]]
         placed = np.sqrt(variance) < LARGEST_RANGE_SIGMA * inverse
@@ -156,7 +153,7 @@ class EkfSlam(Filter):
         for slots, size, dropped in sizes:
             for number in dropped:
                 del slots[number]
-            kept.append(_numbers_of(slots, size).ravel())
+            kept.append(numbers_from([*slots.values()], size).ravel())
         index = np.concatenate(kept)
         at = POSE_SIZE
         for slots, size, _ in sizes:
@@ -174,7 +171,7 @@ class EkfSlam(Filter):
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
-            nearer = np.abs(change[_numbers_of(self.line_slots, self.line_size)[:, 3]])
+            nearer = np.abs(change[numbers_from([*self.line_slots.values()], self.line_size)[:, 3]])
             self._state += change * min(1.0, _LONGEST_STEP / max(nearer.max(initial=0.0), 1e-9))
             if np.max(np.abs(change)) < _CONVERGED:
                 break
@@ -227,11 +224,6 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
     chosen = np.zeros(len(ids), dtype=np.bool_)
     chosen[list(first.values())] = True
     return chosen
-
-
-def _numbers_of(slots: dict[int, int], size: int) -> IntArray:
-    """(n, size) where the numbers of landmarks are in the state."""
-    return np.array(list(slots.values()), dtype=np.int64)[:, None] + np.arange(size)
 
 
 def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:

@@ -202,8 +202,8 @@ class Filter(ABC):
 
     def predicted(self, discs: ArrayLike, lines: ArrayLike) -> Prediction:
         """How discs and lines are seen; takes where in the state they begin, (d,) and (e,)."""
-        of_discs = _numbers(discs, 2)
-        of_lines = _numbers(lines, self.line_size)
+        of_discs = numbers_from(discs, 2)
+        of_lines = numbers_from(lines, self.line_size)
         pose, turn, d, e = self._state[:3], rotation(self._state[2]), len(of_discs), len(of_lines)
         numbers = np.concatenate([_POSE, of_discs.ravel(), of_lines.ravel()])
         jacobian = np.zeros((2 * d + e, len(numbers)))
@@ -335,9 +335,9 @@ class Filter(ABC):
         self._linearised[own] = self._state[own] = value
 
 
-def _numbers(slots: ArrayLike, size: int) -> IntArray:
+def numbers_from(slots: ArrayLike, size: int) -> IntArray:
     """(n, size) numbers of the state from (n,) slots on."""
-    return np.asarray(slots, dtype=np.int64)[:, None] + np.arange(size)
+    return np.asarray(slots, dtype=np.int64).reshape(-1, 1) + np.arange(size)
 
 
 Association = Literal["known", "nearest", "joint"]
@@ -378,7 +378,7 @@ class Associator:
         if len(names):
             compared = estimate.compared(rows, names)
             landmark = compatible(self.method, *compared, self.gate_probability)
-            found[landmark >= 0] = names[landmark[landmark >= 0]]
+            found = np.append(names, UNKNOWN_ID)[landmark]
             closest = np.min(individual_distances(*compared), axis=1)
         if self.new_id is not None:
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]

@@ -27,12 +27,8 @@ class Localizer(Filter):
     ----------
     landmark_map : LandmarkMap
         Where the landmarks are.
-    start : (3,) array_like
-        Pose at the start, in the map (m, m, rad).
-    start_covariance : (3, 3) array_like
-        Its covariance; none by default, as the start of a run defines its map.
-    camera_xy : (2,) array_like
-        The camera's centre in the robot frame (m); only lines need it.
+    start, start_covariance, camera_xy : array_like
+        As of `Filter`; the pose is in the map.
     exact : bool
         Take the map for exact, whatever its covariances.
     """

@@ -1,66 +1,85 @@
-"""The normal equations of the disc fit against dense linear algebra."""
+"""The normal equations of the disc fit, and what its residuals say."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from detect.discs import least_squares as normal
-from detect.discs.model import ROWS
-from detect.discs.patch import PATCH
+from detect.discs import fit
+from detect.discs.patch import SECTORS
+from redetect.array_types import FloatArray
 
-FloatArray = NDArray[np.float64]
+TERMS = 12
 
 
-def patch(n: int, seed: int) -> tuple[NDArray[Any], FloatArray]:
-    """A patch, and the (n, 11) columns of its least-squares problem."""
+def rows_of(seed: int, n: int) -> tuple[NDArray[Any], NDArray[np.int64], FloatArray]:
+    """Working space, ends of sectors of some whole numbers of pixels, and its (n, 12) columns."""
     rng = np.random.default_rng(seed)
-    found = np.zeros(1, PATCH)
-    design = found["design"][0]
-    x, y = rng.uniform(-1.7, 1.7, (2, n))
-    design[:5, :n] = np.ones(n), x, y, x * x - y * y, x * y
-    design[5:10, :n] = rng.normal(0.0, 1.0, (5, n))
-    design[10, :n] = rng.normal(0.0, 80.0, n)
-    # Beyond the patch there is rubbish that must not count.
-    design[:, n:] = 1e6
-    return found, design[:, :n].T.astype(float)
+    work = np.zeros(1, fit.WORK)
+    work["rows"][0, :, :n] = rng.normal(0.0, 1.0, (TERMS, n))
+    work["rows"][0, -1, :n] *= 80.0
+    # Beyond the pixels there is rubbish that must not count.
+    work["rows"][0, :, n:] = 1e6
+    ends = np.append(0, np.sort(rng.integers(0, n // 8 + 1, SECTORS - 1)) * 8)
+    return work, np.append(ends, n), work["rows"][0, :, :n].T.astype(float)
 
 
-def test_sums_of_products() -> None:
-    found, columns = patch(333, 1)
-    products = np.zeros((ROWS, ROWS))
-    normal.background_products(found[0], 333, products)
-    normal.disc_products(found[0], 333, products)
-    expected = np.tril(columns.T @ columns)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(np.tril(products) / scale, expected / scale, atol=1e-5)
+@pytest.mark.parametrize("first", [0, 3])
+def test_products_are_those_of_each_sector(first: int) -> None:
+    work, ends, columns = rows_of(1, 400)
+    products = np.zeros((TERMS, TERMS, SECTORS))
+    fit._multiply(work["rows"][0], ends, first, products)
+    for s in range(SECTORS):
+        some = columns[ends[s] : ends[s + 1], first:]
+        found = np.tril(products[first:, first:, s])
+        np.testing.assert_allclose(found, np.tril(some.T @ some), atol=0.5)
+    if first == 0:
+        total = fit._sum_of(products)[..., 0]
+        np.testing.assert_allclose(np.tril(total), np.tril(columns.T @ columns), atol=2.0)
 
 
-def test_factor_tells_solutions_and_what_is_left() -> None:
-    """In two goes, as the fit does it: without the disc's steps, and with them."""
-    _, columns = patch(200, 2)
-    products = columns.T @ columns
-    factor = np.zeros_like(products)
-    values = np.zeros(ROWS)
-    assert normal.factor_rows(products, 0, 6, factor)
-    assert normal.factor_rows(products, 6, 10, factor)
-    for count in (5, 6, 10):
-        solution, residual, *_ = np.linalg.lstsq(columns[:, :count], columns[:, 10], rcond=None)
-        normal.solution(factor, 0, count, values)
-        np.testing.assert_allclose(values[:count], solution, rtol=1e-8)
-        assert abs(normal.left_over(products, factor, count) / residual[0] - 1.0) < 1e-9
-    # x and y come last, so their covariance can be read off the last two rows.
-    inverse = np.linalg.inv(products[:10, :10])[8:, 8:]
-    last = np.array([[1.0 / factor[8, 8], 0.0], [factor[9, 8], 1.0 / factor[9, 9]]])
-    np.testing.assert_allclose(np.linalg.inv(last @ last.T), inverse, rtol=1e-8)
+@pytest.mark.parametrize("first", [0, 6])
+def test_solutions_are_least_squares(first: int) -> None:
+    _, _, columns = rows_of(2, 400)
+    normal = (columns.T @ columns)[..., None].copy()
+    unknowns = np.zeros(TERMS)
+    fit._solve(normal, first, unknowns)
+    expected = np.linalg.lstsq(columns[:, first:-1], columns[:, -1], rcond=None)[0]
+    np.testing.assert_allclose(unknowns[first:-1], expected, rtol=1e-8)
 
 
-def test_dependent_columns_are_refused() -> None:
-    _, columns = patch(100, 3)
-    columns[:, 7] = columns[:, 6]
-    products = columns.T @ columns
-    factor = np.zeros_like(products)
-    assert normal.factor_rows(products, 0, 7, factor)
-    assert not normal.factor_rows(products, 7, 10, factor)
+def test_a_term_that_nothing_depends_on_is_left_out() -> None:
+    _, _, columns = rows_of(3, 200)
+    columns[:, 8] = 0.0
+    unknowns = np.zeros(TERMS)
+    fit._solve((columns.T @ columns)[..., None].copy(), 0, unknowns)
+    expected = np.linalg.lstsq(np.delete(columns, 8, 1)[:, :-1], columns[:, -1], rcond=None)[0]
+    np.testing.assert_allclose(np.delete(unknowns[:-1], 8), expected, rtol=1e-8)
+    assert unknowns[8] == 0.0
+
+
+def area_of(residual: FloatArray) -> float:
+    """The correlated area of residuals of a model whose terms are all zero."""
+    work = np.zeros(1, fit.WORK)
+    n = len(residual)
+    work["rows"][0, -1, :n] = residual
+    work["patch"]["pixel"][0, :n] = np.arange(n)
+    return float(fit._correlated_area(work["patch"][0], work["rows"][0], n, np.zeros(TERMS)))
+
+
+def test_correlated_residuals_say_less() -> None:
+    """White noise counts in full; a process of correlation c as (1 + c)^2 / (1 - c)^2.
+
+    Of the correlation, 1.5 standard deviations of its estimate are taken off.
+    """
+    rng, n = np.random.default_rng(2), 3400
+    assert area_of(rng.normal(0.0, 3.0, n)) == pytest.approx(1.0, abs=0.1)
+    walk = rng.normal(0.0, 1.0, n)
+    for k in range(1, n):
+        walk[k] = 0.5 * walk[k - 1] + np.sqrt(0.75) * walk[k]
+    c = 0.5 - 1.5 / np.sqrt(n)
+    assert area_of(walk) == pytest.approx(((1.0 + c) / (1.0 - c)) ** 2, rel=0.2)
+    assert area_of(np.zeros(n)) == 1.0

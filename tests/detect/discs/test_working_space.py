@@ -26,12 +26,12 @@ def test_what_is_left_in_the_memory_of_fits_does_not_matter(
     work = working_space()
     found = []
     for number in (0.0, left):
-        for name in ("products", "best", "damped", "factor", "values", "bare"):
-            work[name] = number
-        for name in ("weight", "row", "x", "y", "x1", "y2", "growth", "design", "residual"):
+        work["rows"] = number
+        for name in ("weight", "grey", "x", "y", "x1", "y2", "growth", "shares", "row_x", "row_y"):
             work["patch"][name] = number
         # Such as would be neighbours.
-        work["patch"]["pixel"] = work["patch"]["sector"] = np.arange(CAPACITY) if number else 0
+        for name in ("pixel", "sector", "taken"):
+            work["patch"][name] = np.arange(CAPACITY) if number else 0
         found.append(detect_circles(image, camera, table, settings))
     clean, dirty = found
     assert len(clean) > 0

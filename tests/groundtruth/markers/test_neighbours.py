@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.markers.poses import PoseCandidate, PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
+from redetect.groundtruth.markers.refinement import RefinedPose
 from redetect.groundtruth.markers.track import choose_candidates
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import exp_se3
@@ -21,10 +22,10 @@ FLIP = exp_se3(np.array([0.0, 0.0, 0.0, 0.5, 0.3, 0.0]))
 
 def estimate(*poses: FloatArray, odds: float = 0.5) -> PoseEstimate:
     candidates = tuple(
-        PoseCandidate(pose, COVARIANCE, 2.0, 2, np.ones(1), np.ones(1), np.ones(1, dtype=np.bool_))
-        for pose in poses
+        RefinedPose(pose, COVARIANCE, 2.0, 2, np.ones(1), np.ones(1)) for pose in poses
     )
-    return PoseEstimate(candidates, tuple(odds * i for i in range(len(poses))))
+    views = np.ones(1, dtype=np.bool_)
+    return PoseEstimate(candidates, views, tuple(odds * i for i in range(len(poses))))
 
 
 def driving(i: int) -> FloatArray:

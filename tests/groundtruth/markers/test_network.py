@@ -21,7 +21,6 @@ from redetect.groundtruth.markers.boards import (
     BoardsFile,
     BoardView,
     DoubleBoard,
-    checkerboard,
     find_boards,
     read_boards,
 )
@@ -37,8 +36,8 @@ from tests.groundtruth.markers.scene import hall_cameras, lens
 FloatArray = NDArray[np.float64]
 
 NAMES = ("a", "b", "c", "d")
-BOARD = checkerboard(7, 6, 0.08)
-BOARDS = {"first": BOARD, "second": BOARD, "world": checkerboard(9, 6, 0.12)}
+BOARD = Board("checkerboard", 7, 6, 0.08)
+BOARDS = {"first": BOARD, "second": BOARD, "world": Board("checkerboard", 9, 6, 0.12)}
 OFFSET = exp_se3(np.array([0.02, -0.01, -0.03, 0.02, 3.1, 0.03]))  # back to back
 WORLD = exp_se3(np.array([-0.6, -0.4, 0.0, 0.0, 0.0, 0.4]))
 
@@ -198,7 +197,7 @@ def test_corners_come_in_the_boards_order_however_it_is_held(
     turn_deg: float, tmp_path: Path
 ) -> None:
     camera = replace(lens(350.0), width=480, height=360, offset_x=240.0, offset_y=180.0)
-    board = checkerboard(7, 6, 0.08)
+    board = Board("checkerboard", 7, 6, 0.08)
     facing_camera = np.diag([1.0, -1.0, -1.0, 1.0])
     facing_camera[:3, 3] = [0.02, -0.03, 0.9]
     pose = facing_camera @ exp_se3(np.array([0, 0, 0, 0.3, -0.25, 0.0]))
@@ -211,18 +210,7 @@ def test_corners_come_in_the_boards_order_however_it_is_held(
     assert np.abs(corners - expected).max() < 0.3
     if turn_deg == 0.0:
         with pytest.raises(GroundTruthError, match="no checkerboard of 9 x 4"):
-            find_boards(image, checkerboard(9, 4, 0.08), camera)
-
-
-@pytest.mark.parametrize(
-    ("columns", "rows", "square", "problem"),
-    [(7, 5, 0.1, "turned by 180"), (2, 5, 0.1, "at least 3 x 3"), (7, 6, 0.0, "metres above 0")],
-)
-def test_boards_that_cannot_serve_are_refused(
-    columns: int, rows: int, square: float, problem: str
-) -> None:
-    with pytest.raises(GroundTruthError, match=problem):
-        checkerboard(columns, rows, square)
+            find_boards(image, Board("checkerboard", 9, 4, 0.08), camera)
 
 
 # -- boards.json ----------------------------------------------------------------------------
@@ -258,6 +246,8 @@ def test_a_boards_file_is_read(tmp_path: Path) -> None:
         (["boards", "third"], {"columns": 7, "rows": 6, "square_m": 1}, "expected world, and"),
         (["boards", "first"], {"columns": 7.5, "rows": 6, "square_m": 1}, "columns is 7.5"),
         (["boards", "first", "rows"], 7, "board first: board of 7 x 7"),
+        (["boards", "first", "columns"], 2, "board first: .* at least 3 x 3"),
+        (["boards", "first", "square_m"], 0.0, "board first: .* metres above 0"),
         (["world_from_board"], None, "world_from_board: expected"),
         (["images"], [], "images is \\[\\]: expected a list"),
         (["images", 0, "camera"], 5, "camera is 5: expected its name"),

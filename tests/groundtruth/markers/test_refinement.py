@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
-from redetect.groundtruth.markers.poses import SOLVERS, solve_camera, solve_robot
+from redetect.groundtruth.markers.poses import solve_camera, solve_robot
 from redetect.groundtruth.markers.refinement import (
     predicted_errors,
     refine_pose,
@@ -119,7 +120,7 @@ def test_covariances_of_composed_and_inverse_poses() -> None:
 
 @pytest.mark.parametrize(
     "solver",
-    [pytest.param(s, marks=pytest.mark.lowest) if s == "pycolmap" else s for s in SOLVERS],
+    [pytest.param(s, marks=pytest.mark.lowest) if s == "pycolmap" else s for s in get_args(Solver)],
 )
 @pytest.mark.parametrize("cameras", [1, 2, 4])
 @pytest.mark.parametrize("markers", [1, 3, 6])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.trajectories.streams import (
@@ -17,7 +18,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, transform_from_quaternion
+from redetect.groundtruth.trajectories.transforms import exp_se3, transform
 from redetect.storage import OutputExistsError
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
@@ -142,5 +143,6 @@ def test_tum_rows_are_the_pose(tmp_path: Path) -> None:
     ]
     for row, time, pose in zip(rows, (1.5, 2.0, 2.5), poses):
         assert row[0] == time
-        np.testing.assert_allclose(transform_from_quaternion(row[4:], row[1:4]), pose, atol=1e-6)
+        turn = Rotation.from_quat(row[4:]).as_matrix()
+        np.testing.assert_allclose(transform(turn, row[1:4]), pose, atol=1e-6)
     assert format_tum(np.zeros(0), np.zeros((0, 4, 4))) == ""

@@ -27,7 +27,7 @@ SURVEY = Survey({name: np.array(xy) for name, xy in PLACES.items()}, {}, 0.005)
 
 def measured(rng: np.random.Generator | None = None) -> list[FiducialDistance]:
     return [
-        FiducialDistance(a, b, math.dist(PLACES[a], PLACES[b]) + (
+        (a, b, math.dist(PLACES[a], PLACES[b]) + (
             0.0 if rng is None else rng.normal(0.0, SURVEY.sigma_m)))
         for a, b in combinations(PLACES, 2)
     ]  # fmt: skip

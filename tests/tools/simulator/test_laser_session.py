@@ -240,8 +240,8 @@ def test_the_tape_measures_the_building_not_the_drawing(session: tuple[Path, Ses
     folder, plan = session
     survey = read_survey(folder / "fiducials.json")
     between = read_fiducial_distances(folder / "fiducial_distances.csv", survey)
-    exact = [np.hypot(*(survey.fiducials[d.a] - survey.fiducials[d.b])) for d in between]
-    errors = np.subtract([d.distance_m for d in between], exact)
+    exact = [np.hypot(*(survey.fiducials[a] - survey.fiducials[b])) for a, b, _ in between]
+    errors = np.subtract([distance_m for _, _, distance_m in between], exact)
     assert len(errors) == 15
     assert 0.002 < errors.std() < 0.009
     drawn, measured = np.array([d[1:] for d in read_dimensions(folder / "dimensions.csv")]).T

@@ -9,18 +9,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from camera import parse_camera, read_camera
+from camera.boards.board import Board
 from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
-from redetect.groundtruth.markers.boards import BoardImage, checkerboard, find_boards
+from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.trajectories.transforms import (
     apply,
     inverse,
     log_se3,
-    transform_from_quaternion,
+    transform,
 )
 from redetect.landmarks.times import read_times
 from tools.simulator.__main__ import main
@@ -297,7 +299,9 @@ def test_calibration_set(tmp_path: Path) -> None:
 
 
 def _pose(entry: dict[str, list[float]]) -> np.ndarray:
-    return transform_from_quaternion(entry["quaternion_xyzw"], entry["translation_m"])
+    return transform(
+        Rotation.from_quat(entry["quaternion_xyzw"]).as_matrix(), entry["translation_m"]
+    )
 
 
 def test_every_pair_of_neighbours_sees_the_double_board(full_plan: SessionPlan) -> None:
@@ -338,7 +342,7 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(
 ) -> None:
     """What the simulator calls a board is what `groundtruth` finds in an image."""
     for board, pose in ((DOUBLE, 0.3), (WORLD, -0.4)):
-        same = checkerboard(board.columns, board.rows, board.square_m)
+        same = Board("checkerboard", board.columns, board.rows, board.square_m)
         np.testing.assert_allclose(board.points, same.points, atol=1e-12)
         camera = full_plan.network.cameras[0]
         camera_from_board = facing_pose(np.zeros(3), pose, 0.2, 0.5)

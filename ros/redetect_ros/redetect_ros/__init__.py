@@ -1,0 +1,1 @@
+"""Redetect as a node of ROS 2."""
