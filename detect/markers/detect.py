@@ -302,7 +302,7 @@ _LEAST_CELL_SIGMA = 0.08
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
 #: be bent to blurred cells, but none fits them to the noise unless it is the right one.
-_STRICT_FROM, _STRICT_AT = 0.35, 0.6
+_STRICT_FROM, _STRICT_AT = 0.3, 0.6
 #: What a fit may leave over beyond the noise (in contrasts), and least mean agreement of the cells,
 #: for clear cells; and for blurred ones.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
