@@ -87,21 +87,11 @@ def steep_gradient(image: NDArray[np.uint8], most_rows: int) -> float:
 
 
 def blank_margins(image: NDArray[np.uint8]) -> tuple[int, int]:
-    """How many columns at the left and right of an image show nothing.
+    """How many columns at the left and right of an image (H, W) show nothing; 0 for no margin.
 
     Digitized video often begins late in a line: the first columns have one grey value, from which
     the image begins at a sharp edge. A disc that is cut there must not be taken for one that ends
     there.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey image.
-
-    Returns
-    -------
-    left, right : int
-        Each 0 where there is no such margin.
     """
     rows = image[::_ROWS_APART]
     return _blank(rows), _blank(rows[:, ::-1])

@@ -31,7 +31,7 @@ from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
 from detect.verticals.tilt import with_error
-from detect.verticals.tracking import follow_edges
+from detect.verticals.tracking import NOTHING_BEFORE, Before, follow_edges
 from lut.verticals import VerticalTable
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
@@ -95,16 +95,16 @@ def detect_lines(
     strip, numbers = tools.strip, tools.numbers
     response = band_response(image, tools.band, settings.regulariser)
     starts = line_starts(response, tools.band, settings.threshold)
-    tracks = follow_edges(image, strip, tools.window, starts, numbers.tracking)
+    window, tracking = tools.window, numbers.tracking
+    tracks = follow_edges(image, strip, window, starts, tracking, NOTHING_BEFORE)
     judged = fit_and_judge(image, strip, tracks, tools.steps, numbers)
     sharpness = median_sharpness(judged.fits)
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
         tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
-        tracks = follow_edges(
-            image, strip, tools.window, starts, numbers.tracking, tracks, judged.doubtful, tilt
-        )
+        before = Before(tracks, judged.doubtful, tilt)
+        tracks = follow_edges(image, strip, window, starts, tracking, before)
         judged = fit_and_judge(image, strip, tracks, tools.steps, numbers, judged)
     if judged.tilt is not None:
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)

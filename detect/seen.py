@@ -15,6 +15,7 @@ from camera import Camera
 from camera.rotations import rotation_of
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
+from redetect.plane import chain_steps
 
 Tilt = tuple[float, float]
 
@@ -70,24 +71,9 @@ def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS
     return np.asarray(np.asarray(centre_xy, dtype=np.float64)[..., None, :] + ring)
 
 
-def ellipses(
-    centres: ArrayLike, covariance: ArrayLike, sigmas: float, points: int = _POINTS
-) -> FloatArray:
-    """(..., points, 2) outlines of `sigmas` standard deviations round centres (..., 2)."""
-    values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
-    roots = axes * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    circle = circle_on_floor((0.0, 0.0), sigmas, points)
-    return np.asarray(np.asarray(centres)[..., None, :] + circle @ roots.swapaxes(-1, -2))
-
-
 def summed_steps(steps: Iterable[Step]) -> FloatArray:
     """(N + 1, 3) poses along N steps, the start first: x, y (m), heading (rad) in its frame."""
-    dx, dy, dphi = np.array([(0.0, 0.0, 0.0), *((s.dx, s.dy, s.dphi) for s in steps)]).T
-    heading = np.cumsum(dphi)
-    before = heading - dphi
-    x = np.cumsum(np.cos(before) * dx - np.sin(before) * dy)
-    y = np.cumsum(np.sin(before) * dx + np.cos(before) * dy)
-    return np.column_stack([x, y, heading])
+    return chain_steps([(step.dx, step.dy, step.dphi) for step in steps])
 
 
 @dataclass(frozen=True)

@@ -177,8 +177,8 @@ class MarkerSettings:
     most_white: NotNegative = 3.0  #: Greatest such area (3 of 1/8 in the report).
     least_square: Share = 0.75  #: Area of the rough quadrangle over that of the convex hull.
     #: Least contrast of each edge, in standard deviations of the image's noise.
-    least_contrast: NotNegative = 2.0
-    edge_balance: Share = 0.3  #: Least contrast of an edge, in parts of the strongest edge's.
+    least_contrast: NotNegative = 1.4
+    edge_balance: Share = 0.2  #: Least contrast of an edge, in parts of the strongest edge's.
     #: Largest mean absolute difference between a marker's cells, rescaled to 0 to 1, and the
     #: pattern.
     largest_distance: Share = 0.3

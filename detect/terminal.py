@@ -28,25 +28,33 @@ _received = threading.Event()
 
 
 @contextmanager
-def interrupts_noted() -> Iterator[None]:
-    """Record interrupts during a block; whatever it raises after one becomes an interrupt."""
-    _received.clear()
+def interrupts_call(note: Callable[..., object]) -> Iterator[None]:
+    """Have interrupts call something during a block; in threads but the main one, nothing does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_noted() -> Iterator[None]:
+    """Record interrupts during a block; whatever it raises after one becomes an interrupt."""
+    _received.clear()
 
     def note(*_: object) -> NoReturn:
         _received.set()
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    except BaseException:
-        raise_if_interrupted()
-        raise
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with interrupts_call(note):
+        try:
+            yield
+        except BaseException:
+            raise_if_interrupted()
+            raise
 
 
 @contextmanager

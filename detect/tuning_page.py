@@ -28,13 +28,14 @@ from detect.drawing.frame import png_of
 from detect.errors import DetectError
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import circle_on_floor, ellipses
+from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
 from redetect.array_types import GreyImage
 from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
+from redetect.plane import ellipses
 from redetect.storage import OutputExistsError, write_bytes
 from redetect.storage.messages import OneLineError
 

@@ -32,7 +32,7 @@ from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 15
+TABLE_VERSION = 16
 
 Table = TypeVar("Table", DiscTable, VerticalTable, VoteTable)
 

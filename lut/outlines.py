@@ -52,9 +52,8 @@ class DiscShape:
     #: Samples of a pair that fall on the same pixel are moved inwards and outwards by the length on
     #: the floor of this many pixels down the image.
     apart_px: NotNegative = 0.0
-    #: Centres along a row are left out as long as none is farther than half of this from one that
-    #: is tested. If samples are counted in pairs, those are left out that are nearer than this to a
-    #: usable one, in pixels as long as one down the image, rounded up. 0: none is.
+    #: Centres along a row are left out that are nearer than this to a usable one, in pixels as long
+    #: as one down the image, rounded up. 0: none is.
     stride_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:
@@ -140,7 +139,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     floor_xy = floor_positions(camera)
     down = _size_down(camera, floor_xy, shape)
     candidate = pixels_within(down, shape.border_px, shape.far_limit_m_per_px)
-    step = _columns_apart(floor_xy, down, shape)
+    step = np.fmax(np.ceil(shape.stride_m / down), 1.0)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
     samples, pixels = [np.zeros((0, shape.samples, 2), np.uint32)], [np.zeros((0, 2), np.int32)]
     for row in np.flatnonzero(candidate.any(axis=1)).tolist():
@@ -257,15 +256,10 @@ def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatA
 
 def size_down(floor_xy: FloatArray) -> FloatArray:
     """(H, W) how far the floor moves per image row, metres, from (H, W, 2) positions."""
-    by_row = _gradient(floor_xy, 0)
+    if len(floor_xy) == 1:
+        return np.full(floor_xy.shape[:2], np.nan)
+    by_row = np.gradient(floor_xy, axis=0)
     return np.hypot(by_row[..., 0], by_row[..., 1])
-
-
-def _gradient(floor_xy: FloatArray, axis: int) -> FloatArray:
-    """Central differences along an axis of the image; one-sided at the border."""
-    if floor_xy.shape[axis] == 1:
-        return np.full(floor_xy.shape, np.nan)
-    return np.asarray(np.gradient(floor_xy, axis=axis))
 
 
 def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> BoolArray:
@@ -278,18 +272,7 @@ def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> B
     return np.asarray(near & inside_v[:, None] & inside_u[None, :])
 
 
-def _columns_apart(floor_xy: FloatArray, down: FloatArray, shape: DiscShape) -> IntArray:
-    """(H, W) pixels along the row from each centre to the next one that is tested."""
-    if shape.least_pairs:
-        step = np.ceil(shape.stride_m / down)
-    else:
-        by_column = _gradient(floor_xy, 1)
-        size = np.hypot(by_column[..., 0], by_column[..., 1])
-        step = 1.0 + 2.0 * np.floor(0.5 * shape.stride_m / size)
-    return np.where(step > 1.0, step, 1.0).astype(np.int64)
-
-
-def _strided(columns: IntArray, step: IntArray) -> list[int]:
+def _strided(columns: IntArray, step: FloatArray) -> list[int]:
     """Which of some columns keep the distance that the one before them asks for.
 
     Where pixels grow fast along a row, in a very wide lens, twice the distance that they themselves

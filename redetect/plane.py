@@ -1,4 +1,4 @@
-"""Rigid motions of the plane as (x, y, theta): composition, inverse, points, fits.
+"""Rigid motions of the plane as (x, y, theta): composition, inverse, points, fits; ellipses.
 
 A pose `a_from_b` takes points of frame b to frame a. Metres and radians; stacks of any leading
 shape. Covariances are those of (x, y, theta) themselves, as in the streams of poses.
@@ -49,6 +49,19 @@ def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
     return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
 
 
+def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Poses that odometry alone leads to: the start, and that after each step.
+
+    Takes `steps` (N, 3), `start` (3,); returns (N + 1, 3), theta not wrapped.
+    """
+    step = np.asarray(steps, dtype=np.float64).reshape(-1, 3)
+    first = np.asarray(start, dtype=np.float64)
+    theta = first[2] + np.concatenate([[0.0], np.cumsum(step[:, 2])])
+    offset = np.einsum("nij,nj->ni", rotation(theta[:-1]), step[:, :2])
+    xy = first[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(offset, axis=0)])
+    return np.concatenate([xy, theta[:, None]], axis=1)
+
+
 def log_motion(a_from_b: ArrayLike) -> FloatArray:
     """(..., 3) constant rates vx, vy, turn that lead from a to b within one unit of time.
 
@@ -83,3 +96,14 @@ def fitted(points: FloatArray, target: FloatArray) -> FloatArray:
     across = from_points[:, 0] * from_target[:, 1] - from_points[:, 1] * from_target[:, 0]
     turn = float(np.arctan2(np.sum(across), np.sum(from_points * from_target)))
     return np.array([*(target.mean(axis=0) - rotation(turn) @ points.mean(axis=0)), turn])
+
+
+def ellipses(
+    centres: ArrayLike, covariance: ArrayLike, sigmas: float, points: int = 64
+) -> FloatArray:
+    """(..., points, 2) outlines of `sigmas` standard deviations round centres (..., 2)."""
+    values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    roots = axes * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    angle = 2.0 * np.pi * np.arange(points) / points
+    circle = sigmas * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.asarray(np.asarray(centres)[..., None, :] + circle @ roots.swapaxes(-1, -2))

@@ -25,7 +25,7 @@ from detect.drawing.inputs import SeenRows
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
-from detect.seen import Sight, circle_on_floor, ellipses
+from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
@@ -33,6 +33,7 @@ from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
 from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
+from redetect.plane import ellipses
 
 _POINTS = 33
 #: Size of the ellipses of markers' corners, in standard deviations.

@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 from camera import Camera
 from detect.markers.candidates import candidate_regions
 from detect.markers.dictionaries import Templates, templates_of
-from detect.markers.edges import NO_EDGE, RefinedQuadrangle, refine_quadrangle
+from detect.markers.edges import RefinedQuadrangle, refine_quadrangle
 from detect.markers.geometry import (
     NO_QUADRANGLE,
     NOT_FOUR_CORNERS,
@@ -53,10 +53,10 @@ _CAPTURE_LAYER_PX, _CAPTURE_PX, _CAPTURE_WIDTHS = 1.5, 0.7, 0.02
 _HOPELESS_BLUR_CELLS = 0.75
 #: A first look may explain less than the full fit has to, by this much.
 _FIRST_LOOK_SLACK = 0.1
-#: Where edges and whole marker disagree by more than this (mean normalised squared difference; the
-#: edges' systematic error included), the marker is not what the fit takes it for: not flat, or
-#: bent by an uncalibrated lens. Its edges are then where they are seen.
-_MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX = 6.0, 0.02
+#: Where the edges of a marker and its fit disagree by more than this (mean normalised squared
+#: difference; the edges' systematic error included), the marker is not flat, or bent by an
+#: uncalibrated lens. Its edges are then where they are seen, in this number of parts.
+_MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX, _PARTS = 6.0, 0.02, 8
 #: Smaller markers are flat. What is white within the border, or round the quiet zone, shines into
 #: edges that are softer than this part of the border: these are not used.
 _LEAST_BENT_PX, _SHARP_BLURS = 40.0, 0.14
@@ -163,17 +163,12 @@ def detect_markers(
         tried = np.concatenate([tried, rough[None]])
         side = math.sqrt(signed_area(rough))
         capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
-        refined = refine_quadrangle(
-            picture, rough, outline, templates.border, capture_px, quick=True
-        )
-        found = NO_EDGE if refined is None else _identified(picture, refined, templates, settings)
+        found = _marker_at(picture, rough, capture_px, templates, settings)
         if isinstance(found, str):
-            fate = found
-            rejected[fate] += 1
+            rejected[found] += 1
         else:
-            fate = ACCEPTED
             markers.append(found)
-        candidates.append(Candidate(outline, fate))
+        candidates.append(Candidate(outline, found if isinstance(found, str) else ACCEPTED))
 
     # Back to the image as it is.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
@@ -200,22 +195,24 @@ def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray 
     return corners
 
 
-def _identified(
-    picture: Picture, refined: RefinedQuadrangle, templates: Templates, settings: MarkerSettings
+def _marker_at(
+    picture: Picture,
+    rough: FloatArray,
+    capture_px: float,
+    templates: Templates,
+    settings: MarkerSettings,
 ) -> _Marker | str:
-    """The marker in a refined quadrangle, or the cause of there being none."""
-    contrast = refined.light - refined.dark
-    strongest = float(contrast.max())
-    least = max(settings.least_contrast * picture.noise, settings.edge_balance * strongest)
-    if strongest <= 0.0 or contrast.min() < least:
-        return NO_WHITE
+    """The marker in a rough quadrangle (4, 2), or the cause of there being none."""
+    refined = refine_quadrangle(picture, rough, templates.border, capture_px, settings)
+    if isinstance(refined, str):
+        return refined
     cells = sampled_cells(picture, refined.corners, templates)
     if cells is None:
         return OUTSIDE
 
     # The whole marker, fitted to the likely patterns.
     side = math.sqrt(signed_area(refined.corners))
-    blur_cells = float(np.median(refined.blur)) / (templates.dictionary.cell * side)
+    blur_cells = refined.blur_px / (templates.dictionary.cell * side)
     if blur_cells > _HOPELESS_BLUR_CELLS:
         return TOO_SMALL
     likely = likely_patterns(cells, templates, blur_cells)
@@ -241,23 +238,24 @@ def _identified(
     best: RefinedQuadrangle | PatternFit = fit
     if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
-        outline = picture.bend(fit.corners)
-        again = refine_quadrangle(picture, fit.corners, outline, templates.border, capture_px)
-        if again is not None and _contradicts(again, fit):
-            best = again
+        edges = refine_quadrangle(
+            picture, fit.corners, templates.border, capture_px, settings, _PARTS
+        )
+        if not isinstance(edges, str) and _contradicts(edges, fit):
+            best = edges
     number, turns = templates.turned_id(template)
     printed = (np.arange(4) - turns) % 4
     corners, covariance = best.corners[printed], best.covariance[printed]
     return _Marker(number, corners, covariance, quality, fit.blur_px)
 
 
-def _contradicts(refined: RefinedQuadrangle, fit: PatternFit) -> bool:
+def _contradicts(edges: RefinedQuadrangle, fit: PatternFit) -> bool:
     """Whether edges that are wholly seen and not clipped are not those of the fit."""
-    clipped = refined.dark.min() <= _UNCLIPPED[0] or refined.light.max() >= _UNCLIPPED[1]
-    if clipped or refined.support.min() < 1.0:
+    clipped = edges.dark.min() <= _UNCLIPPED[0] or edges.light.max() >= _UNCLIPPED[1]
+    if clipped or edges.support < 0.5:
         return False
-    apart = fit.corners - refined.corners
-    spread = refined.covariance + fit.covariance + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
+    apart = fit.corners - edges.corners
+    spread = edges.covariance + fit.covariance + _EDGE_SYSTEMATIC_PX**2 * np.eye(2)
     solved = np.linalg.solve(spread, apart[..., None])[..., 0]
     return float(np.mean(apart * solved)) > _MOST_DISAGREEMENT
 
@@ -285,7 +283,6 @@ UNEXPLAINED = "grey values unexplained"
 WRONG_CELLS = "wrong cells"
 TOO_SMALL = "cells too small for the blur"
 NO_MARKER = "like a pattern that is no marker"
-NO_WHITE = "edges without contrast"
 
 #: Samples of a cell are this far apart, in cells.
 _SPREAD_CELLS = 0.25
@@ -305,7 +302,7 @@ _LEAST_CELL_SIGMA = 0.08
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
 #: be bent to blurred cells, but none fits them to the noise unless it is the right one.
-_STRICT_FROM, _STRICT_AT = 0.35, 0.6
+_STRICT_FROM, _STRICT_AT = 0.3, 0.6
 #: What a fit may leave over beyond the noise (in contrasts), and least mean agreement of the cells,
 #: for clear cells; and for blurred ones.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
@@ -350,11 +347,11 @@ def verified_quality(
 ) -> float | str:
     """The quality of a fitted template, or the cause of its rejection by its cells."""
     weakness = templates.weakness
-    if fit.blur_cells > _between(_LARGEST_BLUR_CELLS, weakness):
+    if fit.blur_cells > _between(weakness, *_LARGEST_BLUR_CELLS):
         return TOO_SMALL
     strict = (fit.blur_cells - _STRICT_FROM) / (_STRICT_AT - _STRICT_FROM)
-    misfit = _between((_CLEAR_MISFIT, _between(_BLURRED_MISFIT, weakness)), strict)
-    agreement = _between((_CLEAR_AGREEMENT, _between(_BLURRED_AGREEMENT, weakness)), strict)
+    misfit = _between(strict, _CLEAR_MISFIT, _between(weakness, *_BLURRED_MISFIT))
+    agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
     allowed = settings.largest_cell_error
     if templates.plain[template]:
         misfit = min(misfit, _PLAIN_LARGEST_MISFIT)
@@ -378,10 +375,9 @@ def verified_quality(
     return max(0.0, 1.0 - distance)
 
 
-def _between(pair: tuple[float, float], share: float) -> float:
+def _between(share: float, first: float, second: float) -> float:
     """From the first number to the second as the share goes from 0 to 1."""
-    share = min(max(share, 0.0), 1.0)
-    return (1.0 - share) * pair[0] + share * pair[1]
+    return float(np.interp(share, (0.0, 1.0), (first, second)))
 
 
 def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, float]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.errors import FrameError
 from detect.grey_values import estimate_noise
-from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.array_types import BoolArray, FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Rows of the image that its noise is estimated from.
@@ -106,18 +106,16 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
     """
     if len(hull) < 4:
         return None
-    corners = hull[largest_quadrangle(hull)]
+    corners = hull[list(largest_quadrangle(hull))]
     return np.ascontiguousarray(corners if signed_area(corners) > 0.0 else corners[::-1])
 
 
-def largest_quadrangle(points: FloatArray) -> IntArray:
-    """Indices (4,) of the largest quadrangle among points (N, 2), in the order of the points."""
-    return np.sort(_largest_quadrangle(points))
-
-
 @kernel()
-def _largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
-    """Over each diagonal the highest triangles on both sides."""
+def largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
+    """Indices of the largest quadrangle among points (N, 2), in turn.
+
+    Over each diagonal the highest triangles on both sides.
+    """
     n = len(points)
     largest, best = -1.0, (0, 0, 0, 0)
     for i in range(n - 2):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from detect.markers.dictionaries import Templates
-from detect.markers.edges import LEAST_NOISE, OUTLIER, RefinedQuadrangle, robust_sigma
+from detect.markers.edges import RefinedQuadrangle
 from detect.markers.geometry import (
     Picture,
     corners_by_homography,
@@ -50,6 +50,10 @@ _SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _LARGEST_TONE = 0.3, 0.15, 0.15, 0.6
 #: Variance of the blur along any direction, px^2: what a pixel does, and what is still an image.
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 0.07, 60.0
 _CLOSE_ENOUGH_PX = 2e-3
+#: Residuals beyond this many standard deviations lose weight.
+_OUTLIER = 3.0
+#: Grey values are rounded: noise is never below this, grey levels.
+_LEAST_NOISE = 0.3
 #: Pixels that are needed beyond one for each parameter.
 _SPARE_PIXELS = 12
 
@@ -90,7 +94,7 @@ def fit_marker(
 
     None if there is no such marker nearby.
     """
-    corners, blur_px = start.corners, float(np.median(start.blur))
+    corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
     cell_px = templates.dictionary.cell * float(np.hypot(*(middles[:2] - middles[2:]).T).min())
     pattern = pattern_of(templates.lines, templates.blackness(template))
@@ -99,7 +103,7 @@ def fit_marker(
     samples = _samples(picture, corners, pattern.lines, reach, near, effort.pixels)
     if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
         return None
-    noise = max(picture.noise, LEAST_NOISE)
+    noise = max(picture.noise, _LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
     start = start._replace(corners=corners - centre)
@@ -151,8 +155,8 @@ def _solved(
     Weak prior knowledge: light changes little over a marker, the blur is round and about what was
     guessed, the tone curve nearly straight.
     """
-    corners, blur_px = start.corners, float(np.median(start.blur))
-    blur_guess = min(max(blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
+    corners = start.corners
+    blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
     p = np.zeros(PARAMETERS)
     p[BLUR] = blur_guess, 0.0, blur_guess
     expected = p.copy()
@@ -167,7 +171,7 @@ def _solved(
         homography = _homography_of(p)
         left = linearise(samples, pattern, p, _inverse(homography), outlier)
         scale = robust_sigma(left.residual, noise)
-        outlier = OUTLIER * scale
+        outlier = _OUTLIER * scale
         sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
         prior = (scale / sigma) ** 2
         weighted = left.jacobian * left.weight
@@ -184,6 +188,11 @@ def _solved(
         p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
         p[BLUR] = _confined(p[BLUR], min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE))
     return p, left, inverse
+
+
+def robust_sigma(residual: FloatArray, least: float) -> float:
+    """Standard deviation of residuals (N,) by the median of their magnitudes, at least `least`."""
+    return max(least, float(np.median(np.abs(residual))) / 0.6745)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

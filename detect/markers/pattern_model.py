@@ -65,17 +65,6 @@ class Places(NamedTuple):
     correlation: FloatArray
 
 
-class Blackness(NamedTuple):
-    """The blurred pattern at N places, 1 for black, and its derivatives."""
-
-    value: FloatArray  # (N,)
-    by_x: FloatArray
-    by_y: FloatArray
-    by_sigma_x: FloatArray
-    by_sigma_y: FloatArray
-    by_correlation: FloatArray
-
-
 class Linearised(NamedTuple):
     """A model at N pixels."""
 
@@ -127,13 +116,10 @@ def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: 
 
 
 @kernel()
-def blurred_blackness(at: Places, pattern: Pattern) -> Blackness:
-    """Blurred pattern at some places."""
+def blurred_blackness(at: Places, pattern: Pattern) -> FloatArray:
+    """(6, N) the blurred pattern at N places, 1 for black, and its derivatives by these."""
     count, n = len(at.x), len(pattern.lines)
-    result = Blackness(
-        np.zeros(count), np.zeros(count), np.zeros(count),
-        np.zeros(count), np.zeros(count), np.zeros(count),
-    )  # fmt: skip
+    result = np.empty((6, count))
     zx, cx, px, zy, cy, py = (
         np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     )  # fmt: skip
@@ -178,8 +164,8 @@ def blurred_blackness(at: Places, pattern: Pattern) -> Blackness:
                     by_sx -= by_h * h / sx
                     by_sy -= by_k * k / sy
                     by_rho += sign * px[i] * math.exp(-0.5 * beside_k**2) / (_ROOT_2PI * root)
-        result.value[m], result.by_x[m], result.by_y[m] = value, by_x, by_y
-        result.by_sigma_x[m], result.by_sigma_y[m], result.by_correlation[m] = by_sx, by_sy, by_rho
+        result[0, m], result[1, m], result[2, m] = value, by_x, by_y
+        result[3, m], result[4, m], result[5, m] = by_sx, by_sy, by_rho
     return result
 
 
@@ -201,13 +187,13 @@ def linearise(
     sy = np.sqrt(y_u * y_u * uu + 2.0 * y_u * y_v * uv + y_v * y_v * vv)
     rho = (x_u * y_u * uu + (x_u * y_v + x_v * y_u) * uv + x_v * y_v * vv) / (sx * sy)
     at = Places(x, y, sx, sy, rho)
-    d = blurred_blackness(at, pattern)
+    black, by_x, by_y, by_sx, by_sy, by_rho = blurred_blackness(at, pattern)
 
     terms = samples.light
     dark = p[BLACK] @ terms
     contrast = p[WHITE] @ terms - dark
-    light = 1.0 - d.value
-    toned = light + p[TONE] * light * d.value
+    light = 1.0 - black
+    toned = light + p[TONE] * light * black
     seen, grey = dark + contrast * toned, samples.grey
     residual = grey - seen
     with np.errstate(divide="ignore"):
@@ -215,12 +201,12 @@ def linearise(
 
     # d(value)/d(blackness), and from there on by the chain rule.
     slope = -contrast * (1.0 + p[TONE] * (1.0 - 2.0 * light))
-    gu = slope * (d.by_x * x_u + d.by_y * y_u)
-    gv = slope * (d.by_x * x_v + d.by_y * y_v)
+    gu = slope * (by_x * x_u + by_y * y_u)
+    gv = slope * (by_x * x_v + by_y * y_v)
     # sigma_x^2, sigma_y^2 and their covariance are linear in the blur's.
-    fx = slope * (d.by_sigma_x - d.by_correlation * rho / sx) / (2.0 * sx)
-    fy = slope * (d.by_sigma_y - d.by_correlation * rho / sy) / (2.0 * sy)
-    fxy = slope * d.by_correlation / (sx * sy)
+    fx = slope * (by_sx - by_rho * rho / sx) / (2.0 * sx)
+    fy = slope * (by_sy - by_rho * rho / sy) / (2.0 * sy)
+    fxy = slope * by_rho / (sx * sy)
     # The pattern moves with the homography: against its own gradient.
     gu, gv = gu / (p[6] * x + p[7] * y + 1.0), gv / (p[6] * x + p[7] * y + 1.0)
     moved = gu * u + gv * v
@@ -233,7 +219,7 @@ def linearise(
         2.0 * (fx * x_u * x_v + fy * y_u * y_v) + fxy * (x_u * y_v + x_v * y_u),
         fx * x_v**2 + fy * y_v**2 + fxy * x_v * y_v,
     )
-    jacobian[TONE] = contrast * light * d.value
+    jacobian[TONE] = contrast * light * black
     # A clipped grey value says no more than that the light was at least (at most) that.
     clipped = (grey > 254.5) & (seen > 255.0 - _CLIP_ZONE) | (grey < 0.5) & (seen < _CLIP_ZONE)
     residual[clipped], weight[clipped], jacobian[:, clipped] = 0.0, 1.0, 0.0

@@ -16,9 +16,10 @@ from detect.comparison.result import (
     LinePairs,
 )
 from detect.drawing.inputs import SeenRows
-from detect.seen import ellipses, summed_steps
+from detect.seen import summed_steps
 from redetect.array_types import FloatArray
 from redetect.landmarks import circle_arrays, is_positive_definite
+from redetect.plane import apply, ellipses
 from redetect.reporting.page import Part, figure_file, image_part
 
 if TYPE_CHECKING:
@@ -191,9 +192,9 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     outlines, true = [], [np.zeros((0, 2))]
     for (found, reference), pose in zip(seen, poses[1:]):
         discs = circle_arrays(found.circles)
-        outlines.append(_from_pose(ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS), pose))
+        outlines.append(apply(pose, ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS)))
         if reference is not None:
-            true.append(_from_pose(circle_arrays(reference.circles).xy, pose))
+            true.append(apply(pose, circle_arrays(reference.circles).xy))
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
     with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
@@ -213,12 +214,6 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
         "each frame, along the path that the odometry sums up to."
     )
     return _part(words, content, _WIDE)
-
-
-def _from_pose(xy: FloatArray, pose: FloatArray) -> FloatArray:
-    """Places (..., 2) in the frame of a robot at a pose, as those in the frame of its start."""
-    sine, cosine = np.sin(pose[2]), np.cos(pose[2])
-    return np.asarray(xy @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2])
 
 
 class RateCurve(NamedTuple):

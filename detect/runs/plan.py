@@ -35,6 +35,7 @@ from redetect.landmarks import (
 )
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.landmarks.times import format_time
+from redetect.plane import rotation
 
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
@@ -128,8 +129,7 @@ class MapByImage:
         pose = self._poses.get(image_name(prefix))
         if pose is None:
             return None
-        cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-        robot_from_map = np.array([[cosine, sine], [-sine, cosine]])
+        robot_from_map = rotation(-pose[2])
         xy = (self._discs.xy - pose[:2]) @ robot_from_map.T
         near = np.flatnonzero(np.hypot(*xy.T) <= _REACH_M)
         spread = robot_from_map @ self._discs.covariance[near] @ robot_from_map.T

@@ -171,18 +171,8 @@ _BYTES_BESIDE = 1 << 23
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    Parameters
-    ----------
-    content : bytes
-    name : object
-        The image's name in messages.
-    size : (int, int) or None
-        Width and height that are expected: an image that claims others is not decoded.
-
-    Raises
-    ------
-    FrameError
-        If there is no image in it, or it is cut off.
+    An image that claims another width and height than `size` is not decoded. Raises FrameError,
+    which calls the image `name`, if there is no image in it, or it is cut off.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")

@@ -17,13 +17,13 @@ import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import cv2
 
 from detect.errors import DetectError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
+from detect.terminal import interrupts_call
 
 _log = logging.getLogger("redetect")
 
@@ -100,7 +100,14 @@ class LiveCamera(Source):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         capture = _open_camera(self._index)
         try:
-            with _stoppable() as stop:
+            stop = threading.Event()
+            before = signal.getsignal(signal.SIGINT)
+
+            def end_stream(*_: object) -> None:
+                stop.set()
+                signal.signal(signal.SIGINT, before)  # the next one interrupts the program
+
+            with interrupts_call(end_stream):
                 for number in itertools.count():
                     there, pixels = capture.read()
                     time_s = time.time()
@@ -114,26 +121,6 @@ class LiveCamera(Source):
                     yield RunFrame(still(prefix), None, gray, time_s)
         finally:
             capture.release()
-
-
-@contextmanager
-def _stoppable() -> Iterator[threading.Event]:
-    """Take an interrupt as the wish to stop, for the time of a block."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def note(_: int, __: FrameType | None) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, before)  # the next one interrupts the program
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _open_camera(index: int) -> cv2.VideoCapture:

@@ -15,8 +15,6 @@ import numpy as np
 
 from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits
-from detect.verticals.tilt import strongest_first
-from redetect.compiled import kernel
 
 #: A filter of this share of the blur's width is wide enough.
 _WIDE_ENOUGH = 0.68
@@ -69,17 +67,10 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
     return dataclasses.replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
 
 
-@kernel()
 def median_sharpness(fits: LineFits) -> float:
     """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
 
     Of an even number the lower of the two in the middle.
     """
-    sharpness, count = np.empty(len(fits.contrast)), 0
-    for t in range(len(sharpness)):
-        if not math.isnan(fits.contrast[t]):
-            sharpness[count] = fits.sharpness[t]
-            count += 1
-    if count < _LEAST_EDGES:
-        return 1.0
-    return float(sharpness[strongest_first(sharpness[:count])[count // 2]])
+    sharpness = np.sort(fits.sharpness[~np.isnan(fits.contrast)])
+    return 1.0 if len(sharpness) < _LEAST_EDGES else float(sharpness[(len(sharpness) - 1) // 2])

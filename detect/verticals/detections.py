@@ -21,24 +21,12 @@ _SAME_LINE_RAD = np.radians(0.5)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LineDetections:
-    """Detections in one image.
+    """Detections in one image."""
 
-    Parameters
-    ----------
-    lines : Lines
-        The lines; the leftmost is the first, here and elsewhere.
-    tracks : LineTracks
-        All tracks.
-    judged : Judgement
-        Lines through all of them, and their fates.
-    sharpness : float
-        Median sharpness of the edges (`detect.verticals.blur.median_sharpness`).
-    """
-
-    lines: Lines
+    lines: Lines  # the leftmost is the first, here and elsewhere
     tracks: LineTracks
-    judged: Judgement
-    sharpness: float
+    judged: Judgement  # lines through all tracks, and their fates
+    sharpness: float  # median sharpness of the edges (`detect.verticals.blur.median_sharpness`)
 
     def __len__(self) -> int:
         return len(self.lines.alpha_rad)
@@ -74,22 +62,11 @@ class LineDetections:
 def carry_ids(
     rows: Sequence[LineLandmark], reference: Sequence[LineLandmark]
 ) -> tuple[LineLandmark, ...]:
-    """Give detected lines the IDs of the reference rows that are theirs beyond doubt.
+    """Detected lines of a frame with the IDs of the reference rows that are theirs beyond doubt.
 
     A reference row whose bearing fits exactly one detected line (within half a degree or two
-    standard deviations) gives that line its IDs; a joined line can get several.
-
-    Parameters
-    ----------
-    rows : sequence of LineLandmark
-        Detected lines of one frame.
-    reference : sequence of LineLandmark
-        The same frame's rows with IDs.
-
-    Returns
-    -------
-    tuple of LineLandmark
-        In the order of `rows`; without an ID (-1) where none fits.
+    standard deviations) gives that line its IDs; a joined line can get several, and one that none
+    fits has -1.
     """
     if not rows or not reference:
         return tuple(rows)

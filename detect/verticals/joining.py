@@ -36,29 +36,15 @@ from redetect.compiled import kernel
 
 
 class Lines(NamedTuple):
-    """The lines of an image, the leftmost first.
+    """The lines of an image, the leftmost first."""
 
-    Attributes
-    ----------
-    ends : (N, 4) float64
-        xtop, ytop, xbottom, ybottom: undistorted normalised coordinates.
-    alpha_rad, beta_rad : (N,) float64
-        Bearings, and inclinations of the normals of their planes.
-    sigma_rad, noise_rad : (N,) float64
-        Standard deviations of the bearings, and the part of them due to noise.
-    members : (M,) int64
-        Tracks, line by line; the strongest of each line first.
-    bounds : (N + 1,) int64
-        Line n's members are ``bounds[n] : bounds[n + 1]``.
-    """
-
-    ends: FloatArray
+    ends: FloatArray  # (N, 4) xtop, ytop, xbottom, ybottom: undistorted normalised coordinates
+    #: (N,) bearings, and inclinations of the normals of their planes
     alpha_rad: FloatArray
     beta_rad: FloatArray
-    sigma_rad: FloatArray
-    noise_rad: FloatArray
-    members: NDArray[np.int64]
-    bounds: NDArray[np.int64]
+    sigma_rad: FloatArray  # (N,) standard deviations of the bearings
+    members: NDArray[np.int64]  # (M,) tracks, line by line; the strongest of each line first
+    bounds: NDArray[np.int64]  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
 
 
 def lines_of_tracks(
@@ -113,10 +99,9 @@ def _join(
         if not numbers.joined_equally:
             weight[n] = evidence[t]
     joined, sigma = join_mixtures(bearing, deviation, weight, bounds)
-    ends, beta, own_noise = np.zeros((lines, 4)), np.zeros(lines), np.empty(lines)
+    ends, beta = np.zeros((lines, 4)), np.zeros(lines)
     for n in range(lines):
         first = bounds[n]
-        own_noise[n] = noise[members[first]]
         after = bounds[n + 1] if numbers.joined_equally else first + 1
         for k in range(first, after):
             t, share = members[k], 1.0 / (after - first)
@@ -125,7 +110,7 @@ def _join(
                 right, down = _end_of_line(strip, tracks, fits, t, end)
                 ends[n, 2 * end] += share * right
                 ends[n, 2 * end + 1] += share * down
-    return Lines(ends, joined, beta, sigma, own_noise, members, bounds)
+    return Lines(ends, joined, beta, sigma, members, bounds)
 
 
 @kernel()
@@ -184,19 +169,9 @@ def _leave_out(
 
 @kernel()
 def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
-    """Number the groups of bearings whose neighbours are close.
+    """(N,) groups of bearings (N,), counted from 0 at the largest one (leftmost in the image).
 
-    Parameters
-    ----------
-    alpha : (N,) float64
-        Bearings (rad).
-    distance : (N,) float64
-        Two neighbours belong together if they are closer than the smaller of their two distances.
-
-    Returns
-    -------
-    (N,) int64
-        The group of each, counted from 0 at the largest bearing (leftmost in the image).
+    Two neighbours belong together if they are closer than the smaller of their distances (N,).
     """
     group, order = np.zeros(len(alpha), np.int64), strongest_first(alpha)
     for k in range(1, len(order)):
@@ -210,22 +185,10 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
 def join_mixtures(
     alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Means and standard deviations of mixtures of Gaussians of bearings.
+    """(N,) means and standard deviations of mixtures of Gaussians of bearings (rad).
 
-    Parameters
-    ----------
-    alpha, sigma : (M,) float64
-        Means and standard deviations of the components (rad), one mixture after the other; all
-        means of one are within half a turn.
-    weight : (M,) float64
-        Their weights, not negative, of any sum.
-    bounds : (N + 1,) int64
-        Components of mixture n are ``bounds[n] : bounds[n + 1]``.
-
-    Returns
-    -------
-    alpha, sigma : (N,) float64
-        Of the mixtures (rad).
+    Of the (M,) components, ``bounds[n] : bounds[n + 1]`` are those of mixture n; their means are
+    within half a turn, their weights not negative, of any sum.
     """
     mean, deviation = np.empty(len(bounds) - 1), np.empty(len(bounds) - 1)
     for n in range(len(mean)):

@@ -65,34 +65,20 @@ _NEARLY = 0.7
 
 
 class Judgement(NamedTuple):
-    """Lines through tracks, and their fates.
+    """Lines through tracks, and their fates."""
 
-    Attributes
-    ----------
-    fits : LineFits
-        A line for each track; those too short or too faint to be lines have none.
-    evidence : (T,) float64
-        Response summed over the track's length in pixel widths, weakened by the square of its
-        sharpness.
-    fate : (T,) int8
-        Places in `FATES`; lines that disagree with the tilt are "not vertical".
-    doubtful : (T,) bool
-        Tracks that are no lines, but may have gone on beyond the edge's end or lost it early.
-    tilt : TiltEstimate or None
-        That most lines agree with; None where too few do. Its covariance is that of least squares.
-    verticals : Verticals
-        What the lines that may be verticals by themselves say about the tilt.
-    edge : (N,) int64
-        The first of these that is of the same edge, for each.
-    """
-
-    fits: LineFits
+    fits: LineFits  # a line for each track; those too short or too faint to be lines have none
+    #: (T,) response summed over the track's length in pixel widths, weakened by the square of its
+    #: sharpness
     evidence: FloatArray
+    #: (T,) places in `FATES`; lines that disagree with the tilt are "not vertical"
     fate: NDArray[np.int8]
+    #: (T,) tracks that are no lines, but may have gone on beyond the edge's end or lost it early
     doubtful: NDArray[np.bool_]
+    #: That most lines agree with; None where too few do. Its covariance is that of least squares.
     tilt: TiltEstimate | None
-    verticals: Verticals
-    edge: NDArray[np.int64]
+    verticals: Verticals  # what the lines that may be verticals by themselves say about the tilt
+    edge: NDArray[np.int64]  # (N,) the first of these that is of the same edge, for each
 
 
 def fit_and_judge(

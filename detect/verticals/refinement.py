@@ -35,65 +35,36 @@ _STILL_PX = 0.02
 
 
 class LineFits(NamedTuple):
-    """Straight lines through tracks, each in the chart round a reference bearing.
+    """Straight lines through tracks, each in the chart round a reference bearing."""
 
-    Attributes
-    ----------
-    reference_rad : (T,) float64
-        Bearing of the chart's origin.
-    pixel_rad : (T,) float64
-        Width of a pixel's column at the horizon there.
-    line : (T, 2) float64
-        a, b; NaN where there is no line.
-    covariance : (T, 2, 2) float64
-        Covariance of a, b, due to noise.
-    scatter_px : (T,) float64
-        Root-mean-square distance of the tracked points from their straight line, pixels.
-    shift_px : (T,) float64
-        How far the refinement took the line's middle, pixels.
-    spread : (T,) float64
-        Variance of the points' Z.
-    contrast : (T,) float64
-        Height of the step in grey values, as the fine filter sees it; NaN without refinement.
-    sharpness : (T,) float64
-        Contrast at the fine scale relative to the coarse one, at most 1; 1 without refinement.
-    """
-
-    reference_rad: FloatArray
-    pixel_rad: FloatArray
-    line: FloatArray
-    covariance: FloatArray
+    reference_rad: FloatArray  # (T,) bearing of the chart's origin
+    pixel_rad: FloatArray  # (T,) width of a pixel's column at the horizon there
+    line: FloatArray  # (T, 2) a, b; NaN where there is no line
+    covariance: FloatArray  # (T, 2, 2) covariance of a, b, due to noise
+    #: (T,) root-mean-square distance of the tracked points from their straight line, pixels
     scatter_px: FloatArray
-    shift_px: FloatArray
-    spread: FloatArray
+    shift_px: FloatArray  # (T,) how far the refinement took the line's middle, pixels
+    spread: FloatArray  # (T,) variance of the points' Z
+    #: (T,) height of the step in grey values, as the fine filter sees it; NaN without refinement
     contrast: FloatArray
+    #: (T,) contrast at the fine scale relative to the coarse one, at most 1; 1 without refinement
     sharpness: FloatArray
 
 
 class StepFilters(NamedTuple):
-    """The K steps of the refinement, and tables of their filters.
+    """The K steps of the refinement, and tables of their filters."""
 
-    Attributes
-    ----------
-    half : (K,) int64
-        The filter at a place in pixels i to i + 1 covers 2 half pixels, from i - half + 1.
-    weights : (K, 2, SUBPIXELS, N) float32
-        Of the first and the second derivative of the step's height, times sigma^2, at places in
-        the pixel; of N those of the 2 half pixels come first.
-    heights : (2, SUBPIXELS, M) float32
-        Of the height itself, at the fine and the coarse scale that are compared.
-    farthest : (K,) float64
-        Largest displacement of the middle of a line by a step, pixels; a larger step is not made,
-        nor any after it. Without steps the lines stay as tracked.
-    same : (K,) bool
-        Whether a step has the filter of the one before it.
-    """
-
+    #: (K,) the filter at a place in pixels i to i + 1 covers 2 half pixels, from i - half + 1
     half: NDArray[np.int64]
+    #: (K, 2, SUBPIXELS, N) of the first and the second derivative of the step's height, times
+    #: sigma^2, at places in the pixel; of N those of the 2 half pixels come first
     weights: SingleArray
+    #: (2, SUBPIXELS, M) of the height itself, at the fine and the coarse scale that are compared
     heights: SingleArray
+    #: (K,) largest displacement of the middle of a line by a step, pixels; a larger step is not
+    #: made, nor any after it. Without steps the lines stay as tracked.
     farthest: FloatArray
-    same: NDArray[np.bool_]
+    same: NDArray[np.bool_]  # (K,) whether a step has the filter of the one before it
 
 
 def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilters:
@@ -225,16 +196,7 @@ def fit_lines(
 ) -> LineFits:  # fmt: skip
     """Fit lines to tracks from the `first` on, and refine them on the grey values in some steps.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    strip, tracks, filters
-        The table, the tracks, the steps.
-    least : int, float
-        Tracks of fewer points or a lower sum of scores have no line.
-    first : int
-        Tracks before this one are left out.
+    Tracks of fewer points or a lower sum of scores than `least` have no line.
     """
     fits = _no_fits(len(tracks.polarity) - first)
     height = image.shape[0]
@@ -371,21 +333,8 @@ def newton_step(
 ) -> NewtonStep:
     """The step to where a line's rows have the largest response together.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    crossings : Crossings
-        Where the line crosses its rows.
-    weights, half
-        See `StepFilters`.
-    sign : float
-        1 where the image is brighter on the right, else -1.
-
-    Returns
-    -------
-    NewtonStep
-        NaN where there is no maximum at this scale.
+    `weights` and `half` are those of a step in `StepFilters`, the sign is 1 where the image is
+    brighter on the right, else -1. NaN where there is no maximum at this scale.
     """
     # Numba counts references to arrays in tuples wherever they are taken out of these.
     row, column, to_a, to_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b

@@ -40,50 +40,28 @@ _TOGETHER = 7
 
 
 class LineFilter(NamedTuple):
-    """Weights of the filter.
+    """Weights of the filter."""
 
-    Attributes
-    ----------
-    reach : int
-        r: the window across the line covers r pixels on either side.
-    across : (2, T) float32
-        Across the line: 2r + 1 weights of sum 1, and the same times h; behind them zeros.
-    half_length : int
-        s: the window along the line covers s rows on either side.
-    along : (L,) float32
-        Along the line: 2s + 1 weights of sum 1, and behind them zeros.
-    regulariser : float32
-        Added to the variance in the window (grey values squared).
-    """
-
-    reach: int
+    reach: int  # r: the window across the line covers r pixels on either side
+    #: (2, T) across the line: 2r + 1 weights of sum 1, and the same times h; behind them zeros
     across: SingleArray
-    half_length: int
-    along: SingleArray
-    regulariser: np.float32
+    half_length: int  # s: the window along the line covers s rows on either side
+    along: SingleArray  # (L,) along the line: 2s + 1 weights of sum 1, and behind them zeros
+    regulariser: np.float32  # added to the variance in the window (grey values squared)
 
 
 class Strip(NamedTuple):
-    """A table of verticals as compiled code reads it, vertical by vertical.
+    """A table of verticals as compiled code reads it, vertical by vertical."""
 
-    Attributes
-    ----------
-    column, rise : (W, H) float32
-        Column at which each vertical crosses each row, and the tangent of the elevation there; NaN
-        where it is not seen.
-    sine, cosine : (W,) float64
-        Of their bearings.
-    columns_per_rad : (W,) float64
-        Columns per bearing there; NaN at the ends.
-    bearing, anchor_row, robot_from_camera, row_aspect
-        See `lut.verticals.VerticalTable`.
-    """
-
+    #: (W, H) column at which each vertical crosses each row, and the tangent of the elevation
+    #: there; NaN where it is not seen
     column: SingleArray
     rise: SingleArray
+    #: (W,) of their bearings
     sine: FloatArray
     cosine: FloatArray
-    columns_per_rad: FloatArray
+    columns_per_rad: FloatArray  # (W,) columns per bearing there; NaN at the ends
+    # As of `lut.verticals.VerticalTable`:
     bearing: FloatArray
     anchor_row: FloatArray
     robot_from_camera: FloatArray
@@ -91,34 +69,19 @@ class Strip(NamedTuple):
 
 
 class Stripe(NamedTuple):
-    """A stripe of C columns and B rows, and what is behind it.
-
-    Attributes
-    ----------
-    window : LineFilter
-        The filter.
-    path : (B + 2s,) float64
-        Columns of the image at which the path crosses rows, from s rows above the first one on; NaN
-        where it is not seen.
-    samples : (2, (B + L) C) float32
-        Grey values about the middle one and their squares, row by row.
-    means : (2, B C + T) float32
-        Averages of these along the path.
-    moments : (3, B C) float32
-        Mean, covariance and mean square in windows across it.
-    response : (B, C) float32
-        From the left, those r pixels inside the stripe; the last 2r columns mean nothing.
-    middle : int
-        The column of the response that is on the path.
-    """
+    """A stripe of C columns and B rows, and what is behind it."""
 
     window: LineFilter
+    #: (B + 2s,) columns of the image at which the path crosses rows, from s rows above the first
+    #: one on; NaN where it is not seen
     path: FloatArray
+    #: (2, (B + L) C) grey values about the middle one and their squares, row by row
     samples: SingleArray
-    means: SingleArray
-    moments: SingleArray
+    means: SingleArray  # (2, B C + T) averages of these along the path
+    moments: SingleArray  # (3, B C) mean, covariance and mean square in windows across it
+    #: (B, C) from the left, those r pixels inside the stripe; the last 2r columns mean nothing
     response: SingleArray
-    middle: int
+    middle: int  # the column of the response that is on the path
 
 
 def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
@@ -169,22 +132,10 @@ def strip_of(table: VerticalTable) -> Strip:
 def line_response(
     image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
 ) -> SingleArray:
-    """The response along the verticals of a table.
+    """(H, W) responses in an image (H, W) along the verticals of its camera's table.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    table : VerticalTable
-        Of the image's camera.
-    settings : LineSettings
-        Widths of the filter, regulariser.
-
-    Returns
-    -------
-    (H, W) float32
-        At (v, c) that of row v of the vertical that crosses the horizon at column c: in [-1, 1],
-        positive where the image is brighter on the right; 0 where it is not defined.
+    At (v, c) that of row v of the vertical that crosses the horizon at column c: in [-1, 1],
+    positive where the image is brighter on the right; 0 where it is not defined.
     """
     column = np.ascontiguousarray(table.column.T)
     return _respond_everywhere(np.ascontiguousarray(image), column, line_filter(settings)).T

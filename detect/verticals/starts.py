@@ -43,68 +43,40 @@ class StartBand(NamedTuple):
     """The K rows parallel to the anchor on which tracks start, and the filter's tables for them.
 
     The filter is evaluated on row s (half its length) of R rows, and every `spacing` rows after it.
-
-    Attributes
-    ----------
-    row : (K, W) int32
-        Image row of each position at which the filter is evaluated; -1 where tracks may not start.
-    pixel : (R, W) int32
-        Index into the flat image of the pixel on the left of each pixel of the band.
-    left, right : (R, W) float32
-        Weights of this pixel and of the one on its right: of linear interpolation, and 0 beyond the
-        ends of the vertical.
-    scale : (K, W) float32
-        One over the sum of the weights that are on the vertical; 0 where there are none.
-    across : (K, 2, T) float32
-        The filter's weights across the vertical, for the strip's columns, which are a pixel apart
-        on the horizon only.
-    along : (L,) float32
-        Those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
-    reach : int
-        r, pixels.
-    spacing : int
-        See above.
-    chained : bool
-        Whether each line crosses several of these rows, so that starts must be on chains.
-    height_px : float
-        From the first to the last of these rows, in widths of a pixel.
     """
 
+    #: (K, W) image row of each position at which the filter is evaluated; -1 where tracks may not
+    #: start
     row: NDArray[np.int32]
+    #: (R, W) index into the flat image of the pixel on the left of each pixel of the band
     pixel: NDArray[np.int32]
+    #: (R, W) weights of this pixel and of the one on its right: of linear interpolation, and 0
+    #: beyond the ends of the vertical
     left: SingleArray
     right: SingleArray
+    #: (K, W) one over the sum of the weights that are on the vertical; 0 where there are none
     scale: SingleArray
+    #: (K, 2, T) the filter's weights across the vertical, for the strip's columns, which are a
+    #: pixel apart on the horizon only
     across: SingleArray
+    #: (L,) those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
     along: SingleArray
-    reach: int
+    reach: int  # r, pixels
     spacing: int
+    #: Whether each line crosses several of these rows, so that starts must be on chains
     chained: bool
-    height_px: float
 
 
 class LineStarts(NamedTuple):
-    """Chains of maxima of the response, from which tracks start.
+    """Chains of maxima of the response, from which tracks start."""
 
-    Attributes
-    ----------
-    first : (N,) int64
-        The uppermost maximum of each chain, the chain of the highest response first.
-    row : (M,) int64
-        Image row of each maximum.
-    column : (M,) float64
-        Top of the parabola through the maximum and its neighbours, columns of the strip.
-    value : (M,) float32
-        Signed response.
-    below : (M,) int64
-        The next maximum of the chain; -1 for none.
-    """
-
+    #: (N,) the uppermost maximum of each chain, the chain of the highest response first
     first: NDArray[np.int64]
-    row: NDArray[np.int64]
+    row: NDArray[np.int64]  # (M,) image row of each maximum
+    #: (M,) top of the parabola through the maximum and its neighbours, columns of the strip
     column: FloatArray
-    value: SingleArray
-    below: NDArray[np.int64]
+    value: SingleArray  # (M,) signed response
+    below: NDArray[np.int64]  # (M,) the next maximum of the chain; -1 for none
 
 
 def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
@@ -146,7 +118,6 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
         reach=r,
         spacing=spacing,
         chained=steps > 0 and long_enough,
-        height_px=2.0 * settings.start_band_rows * table.row_aspect,
     )
 
 
@@ -224,25 +195,13 @@ def _interpolate(
         square[c] = left[c] * (a * a) + right[c] * (b * b)
 
 
-def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
-    """Chains of maxima of the response on the rows of the band.
-
-    Parameters
-    ----------
-    response : (K, W) float32
-        See `band_response`.
-    band : StartBand
-        The rows. Where each line crosses several of them, a chain has at least two maxima.
-    threshold : float
-        Least absolute response.
-    """
-    return _chains(response, band.row, threshold, _LEAST if band.chained else 1)
-
-
 @kernel()
-def _chains(
-    response: SingleArray, rows: NDArray[np.int32], threshold: float, least: int
-) -> LineStarts:
+def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
+    """Chains of maxima of the response (K, W) of at least a threshold on the rows of the band.
+
+    Where each line crosses several of these, a chain has at least two maxima.
+    """
+    rows, least = band.row, _LEAST if band.chained else 1
     levels, width = response.shape
     size = response.size
     row, column, value = np.empty(size, np.int64), np.empty(size), np.empty(size, np.float32)

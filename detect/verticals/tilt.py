@@ -74,44 +74,26 @@ _SLENDEREST = 0.1
 
 
 class TiltEstimate(NamedTuple):
-    """Pitch and roll of one frame.
+    """Pitch and roll of one frame."""
 
-    Attributes
-    ----------
-    pitch_rad, roll_rad : float
-        Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
-        level.
-    covariance : (2, 2) float64
-        Of (pitch, roll) (rad^2).
-    lines : int
-        How many verticals agree with it.
-    """
-
+    #: Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
+    #: level
     pitch_rad: float
     roll_rad: float
-    covariance: FloatArray
-    lines: int
+    covariance: FloatArray  # (2, 2) of (pitch, roll) (rad^2)
+    lines: int  # how many verticals agree with it
 
 
 class Verticals(NamedTuple):
-    """Constraints of the tilt by lines that may be verticals.
+    """Constraints of the tilt by lines that may be verticals."""
 
-    Attributes
-    ----------
-    normal : (N, 3) float64
-        Unit normals, in the calibrated robot frame, of the planes through the camera and each line.
-    variance : (N,) float64
-        Of the normals' inclinations that verticals show (rad^2).
-    tolerance : (N,) float64
-        Largest inclinations that the lines may have and be verticals (rad).
-    weight : (N,) float64
-        Votes of each line, at least 0.
-    """
-
+    #: (N, 3) unit normals, in the calibrated robot frame, of the planes through the camera and each
+    #: line
     normal: FloatArray
-    variance: FloatArray
+    variance: FloatArray  # (N,) of the normals' inclinations that verticals show (rad^2)
+    #: (N,) largest inclinations that the lines may have and be verticals (rad)
     tolerance: FloatArray
-    weight: FloatArray
+    weight: FloatArray  # (N,) votes of each line, at least 0
 
 
 def with_error(
@@ -146,19 +128,8 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
     """Estimate the tilt from the largest consistent set of lines.
 
-    Parameters
-    ----------
-    lines : Verticals
-        The lines.
-    numbers : TiltNumbers
-        Largest tilt, its prior, number of lines that propose and that must agree.
-
-    Returns
-    -------
-    tilt : TiltEstimate
-        Its covariance is that of least squares; of 0 lines where too few agree.
-    agrees : (N,) bool
-        Lines that are vertical under that tilt; without an estimate, under no tilt.
+    Its covariance is that of least squares; it is of 0 lines where too few agree. Returns as well
+    (N,) whether lines are vertical under that tilt; without an estimate, under no tilt.
     """
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
     pitch, roll = _vote_for_tilt(lines, numbers)
@@ -279,16 +250,8 @@ def gather(
 ) -> NDArray[np.int64]:
     """Groups of lines of one kind near the strongest of those that are in no group yet.
 
-    Parameters
-    ----------
-    place, reach, strength, kind : (N,) float64
-        Where each is, how near others belong to it, how strong it is; only lines of equal kind are
-        gathered.
-
-    Returns
-    -------
-    (N,) int64
-        The first line of the group of each.
+    Of (N,) places, how near others belong to each, strengths and kinds, returns (N,) the first line
+    of the group of each.
     """
     group = np.full(len(place), -1)
     for strongest in strongest_first(strength):

@@ -50,33 +50,30 @@ class LineTracks(NamedTuple):
     """Edges followed through the strip image.
 
     Track t's points are ``bounds[t] : bounds[t + 1]`` of the point arrays, from top to bottom.
-
-    Attributes
-    ----------
-    polarity : (T,) float64
-        1 where the image is brighter on the right of the edge, -1 on the left.
-    bounds : (T + 1,) int64
-        See above.
-    row : (P,) int32
-        Image row of each point.
-    column : (P,) float64
-        Column in the strip: of the horizon, where the vertical through the point crosses it.
-    score : (P,) float32
-        Absolute response at the point.
     """
 
+    #: (T,) 1 where the image is brighter on the right of the edge, -1 on the left
     polarity: FloatArray
-    bounds: NDArray[np.int64]
-    row: NDArray[np.int32]
+    bounds: NDArray[np.int64]  # (T + 1,)
+    row: NDArray[np.int32]  # (P,) image row of each point
+    #: (P,) column in the strip: of the horizon, where the vertical through the point crosses it
     column: FloatArray
-    score: SingleArray
+    score: SingleArray  # (P,) absolute response at the point
+
+
+class Before(NamedTuple):
+    """Tracks that were followed before, and how some of them are followed again."""
+
+    tracks: LineTracks
+    again: NDArray[np.bool_]  # (T,) which of them are followed again
+    #: Pitch and roll (rad) along whose verticals these are followed; NaN: leans are to be found
+    tilt: tuple[float, float]
 
 
 _NO_TRACKS = LineTracks(
     np.empty(0), np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty(0, np.float32)
 )
-_NONE = np.empty(0, np.bool_)
-_NO_TILT = math.nan, math.nan
+NOTHING_BEFORE = Before(_NO_TRACKS, np.empty(0, np.bool_), (math.nan, math.nan))
 
 
 class _Path(NamedTuple):
@@ -105,40 +102,16 @@ class _Edge(NamedTuple):
     vertical: bool
 
 
+@kernel()
 def follow_edges(
     image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, tracks: LineTracks = _NO_TRACKS,
-    again: NDArray[np.bool_] = _NONE, tilt: tuple[float, float] = _NO_TILT,
+    numbers: TrackingNumbers, before: Before,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey values.
-    strip, window
-        The table, the filter.
-    starts : LineStarts
-        Where to start, in this order.
-    numbers : TrackingNumbers
-        Threshold, gaps, border, and how a track is guided.
-    tracks : LineTracks
-        Those that were followed before.
-    again : (T,) bool
-        Which of these are followed again; the others come first in the result.
-    tilt : float, float
-        Pitch and roll (rad) along whose verticals edges are followed; NaN if their leans are to be
-        found along the way.
+    Tracks that were followed before, and are not again, come first in the result.
     """
-    return _follow_edges(image, strip, window, starts, numbers, tracks, again, tilt)
-
-
-@kernel()
-def _follow_edges(
-    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, tracks: LineTracks, again: NDArray[np.bool_],
-    tilt: tuple[float, float],
-) -> LineTracks:  # fmt: skip
+    tracks, again, tilt = before
     height, width = image.shape
     lowest, highest = height, -1
     for v in starts.row:

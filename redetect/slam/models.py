@@ -94,19 +94,6 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
     return by_first, by_second
 
 
-def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
-    """Poses that odometry alone leads to: the start, and that after each step.
-
-    Takes `steps` (N, 3), `start` (3,); returns (N + 1, 3), theta not wrapped.
-    """
-    step = np.asarray(steps, dtype=np.float64).reshape(-1, 3)
-    first = np.asarray(start, dtype=np.float64)
-    theta = first[2] + np.concatenate([[0.0], np.cumsum(step[:, 2])])
-    offset = np.einsum("nij,nj->ni", rotation(theta[:-1]), step[:, :2])
-    xy = first[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(offset, axis=0)])
-    return np.concatenate([xy, theta[:, None]], axis=1)
-
-
 def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
     """Measurement model of a disc: its centre in the robot frame.
 

@@ -19,8 +19,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from numpy.typing import ArrayLike
 
+from redetect import plane
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
@@ -79,21 +79,6 @@ def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatA
     usable = is_positive_definite(path.covariance)
     nees[usable] = squared_mahalanobis(error[usable], path.covariance[usable])
     return error, np.sqrt(np.clip(variance, 0.0, None)), nees
-
-
-def ellipse_outlines(xy: ArrayLike, covariance: ArrayLike, sigmas: float = 3.0) -> FloatArray:
-    """Outlines of covariance ellipses.
-
-    Takes `xy` (M, 2), `covariance` (M, 2, 2); returns (M, K, 2).
-    """
-    centre = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
-    spread, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64).reshape(-1, 2, 2))
-    # The root of the covariance: axes scaled by the standard deviations along them.
-    root = axes * np.sqrt(np.clip(spread, 0.0, None))[:, None, :]
-    angle = np.linspace(0.0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    offset = sigmas * np.einsum("mij,kj->mki", root, circle)
-    return np.asarray(centre[:, None, :] + offset)
 
 
 def draw_map(
@@ -299,7 +284,7 @@ def _draw_landmarks(
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any() and ellipses:
         patches = PolyCollection(
-            list(ellipse_outlines(some.xy[known], some.covariance[known])),
+            list(plane.ellipses(some.xy[known], some.covariance[known], 3.0, _ELLIPSE_POINTS)),
             facecolors=(*to_rgb(colour), 0.1),
             edgecolors=colour,
             linewidths=0.7,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.plane import between
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.plane import between, chain_steps
+from redetect.slam.models import bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 CAMERA_XY = np.array([0.018, -0.081])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.plane import apply, between, fitted, rotation
+from redetect.plane import apply, between, chain_steps, fitted, rotation
 from redetect.slam.association.loop_closing import (
     closed_path,
     in_order,
@@ -29,7 +29,7 @@ from redetect.slam.association.loops import (
     mutual_pairs,
     stretches_of,
 )
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot
+from redetect.slam.models import bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 

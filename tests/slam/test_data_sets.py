@@ -12,9 +12,9 @@ from scipy.io import savemat
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.plane import chain_steps
 from redetect.slam.cli import main
 from redetect.slam.formats.data_sets import discs_of_ranges, trees_of
-from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 
 RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01

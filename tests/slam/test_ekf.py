@@ -119,8 +119,8 @@ def test_the_filter_is_the_plain_dense_one(seed: int) -> None:
 def batch_solution(recording: Recording, size: int) -> tuple[FloatArray, FloatArray]:
     """Last pose and discs by Gauss-Newton on all poses and discs, and their covariance."""
     steps, circles = len(recording), recording.circles
-    from redetect.plane import between
-    from redetect.slam.models import between_jacobians, chain_steps
+    from redetect.plane import between, chain_steps
+    from redetect.slam.models import between_jacobians
 
     poses = chain_steps(recording.steps)
     discs = np.zeros((size, 2))

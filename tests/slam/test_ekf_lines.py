@@ -92,8 +92,8 @@ def test_lines_are_batch_least_squares() -> None:
     ekf = EkfSlam(camera_xy=CAMERA_XY)
     run = run_ekf(recording, ekf)
     assert run.count.lines == len(rows)
-    from redetect.plane import between
-    from redetect.slam.models import between_jacobians, chain_steps
+    from redetect.plane import between, chain_steps
+    from redetect.slam.models import between_jacobians
 
     poses, places = chain_steps(recording.steps), lines.copy()
     unknowns = 3 * steps + 6

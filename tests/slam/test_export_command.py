@@ -10,8 +10,8 @@ import pytest
 
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import Path2D, read_path, write_path
+from redetect.plane import chain_steps
 from redetect.slam.cli import main
-from redetect.slam.models import chain_steps
 from redetect.slam.recording import read_recording
 
 DEMO = Path(__file__).parents[2] / "images" / "e"

@@ -9,6 +9,7 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
+from redetect.plane import chain_steps
 from redetect.slam.association.line_points import (
     Rays,
     find_points,
@@ -16,7 +17,7 @@ from redetect.slam.association.line_points import (
     rays_of,
 )
 from redetect.slam.association.score import score_association
-from redetect.slam.models import bearing_of_vertical, chain_steps
+from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
 CAMERA_XY = (0.02, -0.08)

@@ -9,12 +9,11 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, between, rotation
+from redetect.plane import apply, between, chain_steps, rotation
 from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,
     between_jacobians,
-    chain_steps,
     disc_in_robot,
     disc_jacobians,
     move,

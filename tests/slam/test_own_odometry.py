@@ -14,9 +14,9 @@ from detect.cli import main as detect
 from redetect.array_types import FloatArray
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import read_path
-from redetect.plane import between
+from redetect.plane import between, chain_steps
 from redetect.slam.cli import main as slam
-from redetect.slam.models import OdometryNoise, chain_steps
+from redetect.slam.models import OdometryNoise
 from tests.detect.recordings import Ros, Said
 
 FRAMES = 40

@@ -11,8 +11,9 @@ import pytest
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.plane import ellipses
 from redetect.slam.errors import SlamError
-from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, ellipse_outlines, pose_errors
+from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, pose_errors
 
 DISC_BGR = (0x1E, 0x50, 0xC8)
 
@@ -40,7 +41,7 @@ def test_an_outline_has_the_mahalanobis_distance_asked_for() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(30, 2, 2))
     covariance, centre = root @ np.swapaxes(root, 1, 2), rng.normal(size=(30, 2))
-    offset = ellipse_outlines(centre, covariance, 3.0) - centre[:, None]
+    offset = ellipses(centre, covariance, 3.0) - centre[:, None]
     squared = np.einsum("mki,mij,mkj->mk", offset, np.linalg.inv(covariance), offset)
     np.testing.assert_allclose(squared, 9.0, rtol=1e-9)
 

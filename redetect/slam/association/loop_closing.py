@@ -21,7 +21,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
-from redetect.plane import apply, between, compose, invert, log_motion, rotation
+from redetect.plane import apply, between, chain_steps, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     Match,
@@ -33,7 +33,6 @@ from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
-from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
 
 # Lines whose places are less certain have none.

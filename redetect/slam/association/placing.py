@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, rotation
+from redetect.plane import apply, chain_steps, rotation
 from redetect.slam.association.loops import (
     Search,
     Stretch,
@@ -31,7 +31,6 @@ from redetect.slam.association.loops import (
     motion_onto,
     settled,
 )
-from redetect.slam.models import chain_steps
 from redetect.slam.recording import Recording
 
 #: Frames that are tried, and by how much more each time.

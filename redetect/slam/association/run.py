@@ -26,7 +26,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
-from redetect.plane import compose, rotation
+from redetect.plane import chain_steps, compose, rotation
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -50,7 +50,7 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.association.placing import ANYWHERE, lay_together
 from redetect.slam.errors import SlamError
-from redetect.slam.models import bearing_of_vertical, chain_steps, disc_in_robot, tilt_jacobian
+from redetect.slam.models import bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 

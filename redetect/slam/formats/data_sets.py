@@ -26,9 +26,8 @@ from scipy.io.matlab import MatReadError
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.axes import to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from redetect.plane import between
+from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
-from redetect.slam.models import chain_steps
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
 

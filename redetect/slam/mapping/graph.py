@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import whitening
-from redetect.plane import apply
-from redetect.slam.models import chain_steps
+from redetect.plane import apply, chain_steps
 from redetect.slam.recording import LineRows, Recording
 
 

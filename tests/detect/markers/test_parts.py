@@ -17,7 +17,6 @@ from detect.markers import pattern_model as model
 from detect.markers.candidates import closing, dark_pixels, pixel_area
 from detect.markers.detect import detect_markers
 from detect.markers.dictionaries import templates_of
-from detect.markers.edges import robust_sigma
 from detect.markers.geometry import (
     corners_by_homography,
     corners_of,
@@ -29,6 +28,7 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
+from detect.markers.pattern_fit import robust_sigma
 from detect.positive_definite import invert_positive, solve_positive
 from detect.settings import MarkerSettings
 
@@ -86,7 +86,7 @@ def test_the_quadrangle_is_the_largest(seed: int) -> None:
         for four in itertools.combinations(range(len(points)), 4)
     ]
     best = max(areas)
-    found = abs(signed_area(points[largest_quadrangle(points)]))
+    found = abs(signed_area(points[list(largest_quadrangle(points))]))
     assert found == pytest.approx(best, rel=1e-9)
 
 
@@ -202,8 +202,7 @@ def test_the_blurred_patterns_derivatives(rho: float) -> None:
     pattern = model.pattern_of(templates.lines, templates.blackness(0))
 
     def value(at: FloatArray) -> FloatArray:
-        numbers = model.blurred_blackness(model.Places(*at[:, None]), pattern)
-        return np.concatenate(numbers)
+        return model.blurred_blackness(model.Places(*at[:, None]), pattern)[:, 0]
 
     rng = np.random.default_rng(4)
     for _ in range(50):

@@ -12,7 +12,7 @@ from detect.verticals.refinement import step_filters
 from detect.verticals.response import line_filter, strip_of
 from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
 from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, with_error
-from detect.verticals.tracking import LineTracks, follow_edges
+from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow_edges
 from lut.verticals import VerticalTable
 
 
@@ -37,7 +37,9 @@ def line_tracks(
 ) -> LineTracks:
     """Edges followed from starts."""
     numbers = LineNumbers.of(settings, table.row_aspect).tracking
-    return follow_edges(image, strip_of(table), line_filter(settings), starts, numbers)
+    return follow_edges(
+        image, strip_of(table), line_filter(settings), starts, numbers, NOTHING_BEFORE
+    )
 
 
 def tracks_again(
@@ -47,7 +49,7 @@ def tracks_again(
     """Some of the tracks followed again along the verticals of a tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect).tracking
     window, strip = line_filter(settings), strip_of(table)
-    return follow_edges(image, strip, window, starts, numbers, tracks, again, tilt_rad)
+    return follow_edges(image, strip, window, starts, numbers, Before(tracks, again, tilt_rad))
 
 
 def judge_tracks(
