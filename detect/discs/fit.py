@@ -300,7 +300,7 @@ def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
     return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
 
 
-@kernel(fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _write_rows(
     patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: NDArray[np.float32]
 ) -> None:
@@ -326,7 +326,7 @@ def _write_rows(
         rows[_GREY, i] = weight * grey
 
 
-@kernel(fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _multiply(
     rows: NDArray[np.float32], ends: NDArray[np.int64], first: int, products: FloatArray
 ) -> None:
@@ -529,7 +529,7 @@ def _covariance_of_whole(
     return area * xx, area * xy, area * yy
 
 
-@kernel(fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: FloatArray) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 

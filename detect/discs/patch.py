@@ -211,7 +211,7 @@ def sector_of(x: float, y: float) -> Any:
     return np.int32(15) - k if y < F32(0.0) else k
 
 
-@kernel(fastmath=FASTMATH)
+@kernel(forceinline=True, fastmath=FASTMATH)
 def _sort_by_sector(
     floor_xy: NDArray[np.float32],
     candidate: Candidate,
