@@ -7,28 +7,31 @@ principal point is moved by half a pixel on the way in and out. For programs tha
 
 from __future__ import annotations
 
-import pycolmap
+from typing import TYPE_CHECKING
 
 from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import foreign, name_of_one
 from redetect.storage.messages import excerpt, one_line
 
+if TYPE_CHECKING:
+    import pycolmap
+
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
 
-#: COLMAP's models that have one of ours, and their numbers of focal lengths. Then come two numbers
-#: of the principal point, and the first coefficients of ours.
-_MODELS: dict[str, tuple[Model, int]] = {
-    "SIMPLE_PINHOLE": ("radtan", 1),
-    "PINHOLE": ("radtan", 2),
-    "SIMPLE_RADIAL": ("radtan", 1),
-    "RADIAL": ("radtan", 1),
-    "OPENCV": ("radtan", 2),
-    "FULL_OPENCV": ("rational", 2),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1),
-    "RADIAL_FISHEYE": ("fisheye", 1),
-    "OPENCV_FISHEYE": ("fisheye", 2),
+#: COLMAP's models that have one of ours, and their numbers of focal lengths and of coefficients.
+#: Between these are two numbers of the principal point; coefficients are the first of ours.
+MODELS: dict[str, tuple[Model, int, int]] = {
+    "SIMPLE_PINHOLE": ("radtan", 1, 0),
+    "PINHOLE": ("radtan", 2, 0),
+    "SIMPLE_RADIAL": ("radtan", 1, 1),
+    "RADIAL": ("radtan", 1, 2),
+    "OPENCV": ("radtan", 2, 4),
+    "FULL_OPENCV": ("rational", 2, 8),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, 1),
+    "RADIAL_FISHEYE": ("fisheye", 1, 2),
+    "OPENCV_FISHEYE": ("fisheye", 2, 4),
 }
 _WRITTEN: dict[Model, str] = {
     "radtan": "OPENCV",
@@ -73,12 +76,10 @@ def camera_from_pycolmap(camera: pycolmap.Camera) -> ForeignCamera:
 def _from_parameters(
     where: str, model_name: str, width: int, height: int, parameters: list[float]
 ) -> ForeignCamera:
-    if model_name not in _MODELS:
-        raise ConversionError(
-            f"{where}: model {excerpt(model_name)}: expected {', '.join(_MODELS)}"
-        )
-    model, focals = _MODELS[model_name]
-    count = _parameter_count(model_name)
+    if model_name not in MODELS:
+        raise ConversionError(f"{where}: model {excerpt(model_name)}: expected {', '.join(MODELS)}")
+    model, focals, coefficient_count = MODELS[model_name]
+    count = focals + 2 + coefficient_count
     if len(parameters) != count:
         raise ConversionError(
             f"{where}: {len(parameters)} parameters of {model_name}: expected {count}"
@@ -89,11 +90,6 @@ def _from_parameters(
     return foreign(where, model, width, height, (fx, fy, cx, cy), coefficients)
 
 
-def _parameter_count(model: str) -> int:
-    """How many parameters a model has."""
-    return len(pycolmap.Camera(model=model).params_info.split(","))
-
-
 def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
     """COLMAP's name of the model, and its parameters."""
     model, d = camera.model, camera.distortion
@@ -101,7 +97,7 @@ def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:
         model, d = "rational", (*d, *(0.0,) * 3)
     name = _WRITTEN[model]
     pinhole = [camera.fx, camera.fy, camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
-    return name, [*pinhole, *d[: _parameter_count(name) - 4]]
+    return name, [*pinhole, *d[: MODELS[name][2]]]
 
 
 def format_colmap(camera: ForeignCamera) -> str:
@@ -118,5 +114,7 @@ def format_colmap(camera: ForeignCamera) -> str:
 
 def pycolmap_from_camera(camera: ForeignCamera) -> pycolmap.Camera:
     """A ``pycolmap.Camera`` of a camera."""
+    import pycolmap
+
     name, parameters = colmap_parameters(camera)
     return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=parameters)

@@ -6,6 +6,7 @@ Nothing heavy is imported here: `--help` is quick.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Annotated, ClassVar, Literal
 
 from redetect.groundtruth.errors import GroundTruthError
@@ -57,6 +58,14 @@ class PoseSettings(_Bounded):
     # By how much the robot's height may differ between neighbouring frames (m).
     heave_m: Positive = 0.03
     wobble_deg: Positive = 2.0  # The same for roll and pitch (deg).
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.solver == "pycolmap" and find_spec("pycolmap") is None:
+            raise GroundTruthError(
+                "--solver pycolmap needs the package pycolmap, which is not installed; not every "
+                "platform has it: choose another solver"
+            )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,9 @@ from camera import Camera, read_camera, write_camera
 from camera.cli import main
 from camera.errors import ConversionError
 from camera.formats.colmap import (
+    MODELS as COLMAP_MODELS,
+)
+from camera.formats.colmap import (
     camera_from_pycolmap,
     format_colmap,
     parse_colmap,
@@ -77,6 +80,14 @@ def test_colmap_counts_from_the_corner(camera: ForeignCamera) -> None:
         np.asarray(theirs.img_from_cam(points)) - 0.5, camera.distort(RAYS), atol=1e-9
     )
     assert camera_from_pycolmap(theirs) == camera
+
+
+@pytest.mark.parametrize("name", list(COLMAP_MODELS))
+def test_colmaps_models_have_as_many_parameters(name: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    _, focals, coefficients = COLMAP_MODELS[name]
+    parameters = pycolmap.Camera(model=name).params_info.split(",")
+    assert len(parameters) == focals + 2 + coefficients
 
 
 @pytest.mark.lowest

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import pycolmap
 
 from camera import Camera
 from redetect.array_types import BoolArray, FloatArray
@@ -170,6 +169,8 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
 
 
 def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
+    import pycolmap  # not every platform has it
+
     used, index = np.unique(problem.seen.camera, return_inverse=True)
     lenses = [problem.network.cameras[camera] for camera in used]
     pixels = np.empty_like(problem.seen.pixels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from typing import get_args
 
 import numpy as np
@@ -41,6 +42,13 @@ SETTINGS = PoseSettings()
 
 def estimated(problem: PoseProblem, settings: PoseSettings = SETTINGS) -> PoseEstimate:
     return estimate_pose(dataclasses.replace(problem, settings=settings))
+
+
+def test_a_solver_whose_package_is_missing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(GroundTruthError, match="needs the package pycolmap"):
+        PoseSettings(solver="pycolmap")
+    assert PoseSettings().solver == "sqpnp"
 
 
 @pytest.mark.parametrize("solver", get_args(Solver))
