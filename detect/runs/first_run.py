@@ -1,7 +1,7 @@
-"""The last stages of the detection of discs where there are none: for their kernels.
+"""Stages of the detection of discs where there are none: for their kernels.
 
-A process that has to compile the kernels meets them in the order of a frame's path. Another calls
-this function at the same time, and keeps on the disk what the first would compile last.
+A process that has to compile the kernels meets them in the order of a frame's path. Others call
+these functions at the same time, and keep on the disk what the first would compile later.
 """
 
 from __future__ import annotations
@@ -23,12 +23,18 @@ from lut import VoteTable
 
 
 def place_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Place no disc of the first frame, and find its tilt by the outlines of none."""
+    """Place no disc of the first frame."""
     camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
     if camera and settings and isinstance(table, VoteTable):
         image = read_image(tasks[0].frame, camera, plan.working_folder)
         scene = scene_of(image, camera, table, settings, noise=0.0)
         place_discs(scene, NO_CANDIDATES, working_space()[0])
-        if plan.levelling == "run":
-            tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
-            smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)
+
+
+def level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
+    """Find the tilt of the first frame by the outline of no disc, and that of a run."""
+    camera, settings = plan.camera, plan.circles
+    if camera and settings and settings.refine and plan.levelling == "run":
+        image = read_image(tasks[0].frame, camera, plan.working_folder)
+        tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
+        smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)

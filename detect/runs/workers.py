@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
-from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -260,7 +260,7 @@ class _InProcess(Executor):
         if not self._shared:
             return
         self._shared = False  # only before the first kernel
-        from detect.runs.first_run import place_none
+        from detect.runs.first_run import level_none, place_none
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # Where no process can be started, this one compiles all of them.
@@ -269,12 +269,14 @@ class _InProcess(Executor):
                 started.enter_context(_ProcessPool(1, plan, show=False))
                 for plan in (discs, lines, discs)[: _cores()]
             ]
-            # Discs take longer than lines. So another process takes on what theirs comes to last.
-            done = [
+            # Discs take longer than lines. So others take on what comes later, and last, of these.
+            done: list[Future[Any]] = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 others[0].submit(work_on_chunk, lines, self._chunk),
+                others[0].submit(level_none, discs, self._chunk),
             ]
-            others[-1].submit(place_none, discs, self._chunk)
+            for more in others[1:]:
+                more.submit(place_none, discs, self._chunk)
             for future in done:
                 future.exception()  # what fails there fails here again, and is reported
             raise _CompiledElsewhereError

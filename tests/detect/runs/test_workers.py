@@ -118,18 +118,18 @@ def test_kernels_are_compiled_once_and_first(
     plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
     with local_workers(1, shared=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
-    rest = 1 if cores == 2 else 2
     assert began == [
         "0 work_on_chunk False True images",
         "1 work_on_chunk True False images",
-        f"{rest} place_none False True images",
+        "1 level_none False True images",
+        *(["2 place_none False True images"] if cores > 2 else []),
         "compiled images",
         "compiled images",
     ]
     only_lines = replace(plan, circles=None)
     with local_workers(1, shared=True).start(only_lines) as executor:
         executor.submit(work, only_lines, "more")
-    assert began[5:] == ["compiled more", "compiled more"]
+    assert began[-2:] == ["compiled more", "compiled more"]
 
 
 @pytest.mark.long
