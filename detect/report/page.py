@@ -181,7 +181,7 @@ def _summary_of(result: Comparison) -> list[Part]:
     """What `detect compare` says."""
     rows = tuple(summary_rows(result).items())
     table = Part(
-        "table", "Figures, by their names in the JSON", ("what", "value"), rows, left=(0, 1)
+        "details", "All figures, by their names in the JSON", ("what", "value"), rows, left=(0, 1)
     )
     return [Part("text", " ".join(result.sentences())), table]
 

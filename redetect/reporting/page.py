@@ -29,7 +29,7 @@ class Part(NamedTuple):
 
     `words` are the text or the caption. Rows of figures are names and values, those of a key
     colours and words. `left` are the columns of a table that have text, `bold` the rows to point
-    out.
+    out. Details are a table that is folded away.
     """
 
     kind: str
