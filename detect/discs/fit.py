@@ -247,35 +247,33 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         _multiply(rows, ends, _OUTSIDE if by_parts else 0, products)
         grouped = products if by_parts else _sum_of(products)
         _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
-        if by_parts and _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
-            return _NO_FIT
-        if not abs(levels.contrast[0]) > 0.0 and not by_parts:
+        if by_parts:
+            if _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
+                return _NO_FIT
+        elif not abs(levels.contrast[0]) > 0.0:
             return _NO_FIT
         _scale(grouped, levels)
         _add_up(grouped, edge, usual, settings.radius_sigma, normal)
         _solve(normal.copy(), _BLUR_1, movement)
-        moves = math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS])
-        is_short = max(moves[0], moves[1]) < _ARRIVED
-        if is_short and step > _EARLY:
+        edge = _moved(edge, movement, most_blur)
+        moved = max(math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS]))
+        if moved < _ARRIVED and step > _EARLY:
             break
-        if step < _STEPS - 1:
-            edge = _moved(edge, movement, most_blur)
-    last = _moved(edge, movement, most_blur)
     if by_parts:
         xx, xy, yy = _covariance_by_parts(products, levels, normal)
     else:
         xx, xy, yy = _covariance_of_whole(patch, rows, ends[SECTORS], products, normal)
-    near = math.hypot(last.x - begin.x, last.y - begin.y) <= _MOST_OFF or not by_parts
+    near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
         return _NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
     area = settings.radius**2
     return Fit(
         True,
-        floor_xy[0] + settings.radius * last.x,
-        floor_xy[1] + settings.radius * last.y,
-        settings.radius * last.radius,
-        last.blur.second if shape == CHORDS_ALONG_V else last.blur.first,
+        floor_xy[0] + settings.radius * edge.x,
+        floor_xy[1] + settings.radius * edge.y,
+        settings.radius * edge.radius,
+        edge.blur.second if shape == CHORDS_ALONG_V else edge.blur.first,
         most_blur,
         levels.contrast[0],
         levels.explained[0],
@@ -390,7 +388,7 @@ def _eliminate_levels(
             off = grouped[_GREY, _RADIUS, s] / (contrast * grouped[_RADIUS, _RADIUS, s])
             levels.off_px[s] = off / math.hypot(per_u, per_v)
         else:
-            freedom = pixels[s] - (_GREY - 1)
+            freedom = pixels[s] - (_GREY - 1)  # what is expected of both blurs counts as one more
             levels.contrast[s] = contrast if freedom >= 4.0 else 0.0
             levels.variance[s] = max(residual / max(freedom, 1.0), noise * noise)
             levels.weight[s] = 1.0 / levels.variance[s]

@@ -33,15 +33,10 @@ def fit_discs(
     fits = []
     for u, v in pixels:
         x, y = floor_xy[v, u].astype(float)
-        # A field of a structured array, as kernels are given it.
-        fits.append(_fit(scene, Start(x, y, radius_m, blur_px), settings))
+        fits.append(fit_disc(scene, Start(x, y, radius_m, blur_px), settings, working_space()[0]))
     return DiscFits(
         np.array([fit.arrived for fit in fits]),
         np.array([(fit.x, fit.y) for fit in fits]),
         np.array([((f.cov_xx, f.cov_xy), (f.cov_xy, f.cov_yy)) for f in fits]),
         fits,
     )
-
-
-def _fit(scene: Scene, start: Start, settings: FitSettings) -> Fit:
-    return Fit(*fit_disc(scene, start, settings, working_space()[0]))
