@@ -17,7 +17,8 @@ remains are the normal equations of centre, radius, and the blur along either ax
 movement blurs along one. Radius and logarithms of the blur are normally distributed beforehand.
 
 A sector counts less if the model does not explain it, and if it shows the edge elsewhere than the
-others do: something else's edge. These weights are Tukey's biweights, found anew in every step
+others do: something else's edge. In those that count, pixels count less that the model does not
+explain: a cable's, or a stain's. These weights are Tukey's biweights, found anew in every step
 (A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
 
 The errors of neighbouring pixels are not independent where the model does not fit. For the whole
@@ -100,6 +101,11 @@ _LEAST_SECTORS, _COUNTS = 5, 0.1
 _FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
 #: Before that, one this many deviations off has half the weight.
 _FAR_EARLY = 2.0
+#: A pixel that is this many deviations off what its sector shows has no weight; and which share
+#: this leaves of the variance of normally distributed errors.
+_FAR_PIXEL, _SHARE_LEFT = 4.0, 0.77
+#: What it counts nevertheless, for its residual to be known.
+_LEAST_TRUST = F32(1e-3)
 #: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
 #: the variance is larger than what that gives.
 _STRETCH, _INFLATION = 3, 1.6
@@ -159,9 +165,11 @@ class Fit(NamedTuple):
     cov_xx: float
     cov_xy: float
     cov_yy: float
+    radius_information: float
+    """One over the variance of the radius, as far as the grey values tell it."""
 
 
-_NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf)
+_NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
 
 
 class Edge(NamedTuple):
@@ -237,6 +245,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     )
     products, normal = np.zeros((_TERMS, _TERMS, SECTORS)), np.zeros((_TERMS, _TERMS, 1))
     movement = np.zeros(_TERMS)
+    patch.trust[: ends[SECTORS]] = 1.0
     for step in range(_STEPS):
         disc = Disc(edge.x, edge.y, edge.radius)
         if shape == EDGE:
@@ -252,6 +261,8 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
                 return _NO_FIT
         elif not abs(levels.contrast[0]) > 0.0:
             return _NO_FIT
+        if by_parts:
+            _trust(patch, rows, ends, grouped, levels, scene.noise)
         _scale(grouped, levels)
         _add_up(grouped, edge, usual, settings.radius_sigma, normal)
         _solve(normal.copy(), _BLUR_1, movement)
@@ -259,15 +270,23 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         moved = max(math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS]))
         if moved < _ARRIVED and step > _EARLY:
             break
+    reduced = normal.copy()
+    eliminate(reduced, _BLUR_1)
+    eliminate(reduced, _BLUR_2)
+    information = _radius_information(reduced) - 1.0 / settings.radius_sigma**2
+    eliminate(reduced, _RADIUS)
+    noise = _inverse(reduced, 0)
     if by_parts:
-        xx, xy, yy = _covariance_by_parts(products, levels, normal)
+        xx, xy, yy = _covariance_by_parts(products, levels, normal, noise)
     else:
-        xx, xy, yy = _covariance_of_whole(patch, rows, ends[SECTORS], products, normal)
+        area = _correlated_area_of(patch, rows, ends[SECTORS], products)
+        xx, xy, yy = area * noise[0], area * noise[1], area * noise[2]
+    information *= (noise[0] + noise[2]) / (xx + yy)
     near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
         return _NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
-    area = settings.radius**2
+    unit = settings.radius**2
     return Fit(
         True,
         floor_xy[0] + settings.radius * edge.x,
@@ -277,7 +296,8 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         most_blur,
         levels.contrast[0],
         levels.explained[0],
-        area * xx, area * xy, area * yy,
+        unit * xx, unit * xy, unit * yy,
+        max(information, 0.0) / unit,
     )  # fmt: skip
 
 
@@ -307,7 +327,7 @@ def _write_rows(
     x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
     for i in range(n):
         x, y = patch.x[i] - x0, patch.y[i] - y0
-        weight, grey = patch.weight[i], patch.grey[i]
+        weight, grey = patch.weight[i] * patch.trust[i], patch.grey[i]
         rows[_SADDLE, i] = weight * (x * x - y * y)
         rows[_SADDLE_XY, i] = weight * x * y
         rows[_SLOPE_Y, i] = weight * y
@@ -382,7 +402,7 @@ def _eliminate_levels(
         residual = max(grouped[_GREY, _GREY, s], 0.0)
         levels.explained[s] = 1.0 - residual / max(without[s], 1e-9)
         if by_parts:
-            levels.variance[s] = residual / (pixels[s] - 3.0)
+            levels.variance[s] = residual / (_SHARE_LEFT * (pixels[s] - 3.0))
             per_u = per_pixel[0] * _COSINES[s] + per_pixel[1] * _SINES[s]
             per_v = per_pixel[2] * _COSINES[s] + per_pixel[3] * _SINES[s]
             off = grouped[_GREY, _RADIUS, s] / (contrast * grouped[_RADIUS, _RADIUS, s])
@@ -427,6 +447,31 @@ def _weigh(levels: Levels, early: bool, noise: float) -> int:
             count += weight > _COUNTS
             levels.weight[s] = weight / usual
     return count
+
+
+@kernel(forceinline=True, fastmath=FASTMATH)
+def _trust(
+    patch: Any, rows: NDArray[np.float32], ends: NDArray[np.int64], grouped: FloatArray,
+    levels: Levels, noise: float,
+) -> None:  # fmt: skip
+    """Weigh the pixels of the sectors that count by what the fit leaves of each."""
+    usual = max(_median_of(levels.variance, levels.weight > 0.0), noise * noise)
+    per_limit = F32(1.0 / (_FAR_PIXEL**2 * usual))
+    for s in range(SECTORS):
+        if not levels.weight[s] > 0.0:
+            patch.trust[ends[s] : ends[s + 1]] = 1.0
+            continue
+        contrast = levels.contrast[s]
+        slope = grouped[_GREY, _SLOPE, s] - contrast * grouped[_CONTRAST, _SLOPE, s]
+        slope /= grouped[_SLOPE, _SLOPE, s]
+        outside = grouped[_GREY, _OUTSIDE, s] - contrast * grouped[_CONTRAST, _OUTSIDE, s]
+        outside -= slope * grouped[_SLOPE, _OUTSIDE, s]
+        outside /= grouped[_OUTSIDE, _OUTSIDE, s]
+        a, b, c = F32(outside), F32(slope), F32(contrast)
+        for i in range(np.uint64(ends[s]), np.uint64(ends[s + 1])):
+            rest = rows[_GREY, i] - a * rows[_OUTSIDE, i] - b * rows[_SLOPE, i]
+            rest = (rest - c * rows[_CONTRAST, i]) / patch.trust[i]
+            patch.trust[i] = max(F32(1.0) - rest * rest * per_limit, _LEAST_TRUST)
 
 
 @kernel()
@@ -514,17 +559,22 @@ def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
 
 
 @kernel(inline="always")
-def _covariance_of_whole(
-    patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray, normal: FloatArray
-) -> tuple[float, float, float]:
-    """Covariance (xx, xy, yy) of the centre, by residuals that are as correlated as they are."""
+def _radius_information(normal: FloatArray) -> float:
+    """One over the variance of the radius, by normal equations of it and the centre."""
+    xx, xy, yy = normal[_X, _X, 0], normal[_Y, _X, 0], normal[_Y, _Y, 0]
+    x, y = normal[_X, _RADIUS, 0], normal[_Y, _RADIUS, 0]
+    by_centre = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+    information: float = normal[_RADIUS, _RADIUS, 0] - by_centre
+    return information
+
+
+@kernel(inline="always")
+def _correlated_area_of(
+    patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray
+) -> float:
     unknowns = np.zeros(_TERMS)
     _solve(_sum_of(products), 0, unknowns)
-    area = _correlated_area(patch, rows, n, unknowns)
-    for k in range(_BLUR_1, _X):
-        eliminate(normal, k)
-    xx, xy, yy = _inverse(normal, 0)
-    return area * xx, area * xy, area * yy
+    return _correlated_area(patch, rows, n, unknowns)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
@@ -557,9 +607,9 @@ def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: Fl
 
 @kernel(inline="always")
 def _covariance_by_parts(
-    products: FloatArray, levels: Levels, normal: FloatArray
+    products: FloatArray, levels: Levels, normal: FloatArray, noise: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Covariance (xx, xy, yy) of the centre, by leaving out neighbouring sectors."""
+    """Covariance (xx, xy, yy) of the centre: the noise's, and by leaving out sectors in turn."""
     left_out = np.empty((_TERMS, _TERMS, SECTORS))
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
@@ -569,7 +619,6 @@ def _covariance_by_parts(
                     left_out[a, b, s] -= products[a, b, (s + k) % SECTORS]
     for k in range(_BLUR_1, _X):
         eliminate(left_out, k)
-        eliminate(normal, k)
     centres = np.empty((SECTORS, 2))
     mean_x = mean_y = 0.0
     count = 0
@@ -583,9 +632,8 @@ def _covariance_by_parts(
     for s in range(SECTORS):
         x, y = centres[s, 0] - mean_x, centres[s, 1] - mean_y
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-    noise_xx, noise_xy, noise_yy = _inverse(normal, 0)
     scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
-    return scale * xx + noise_xx, scale * xy + noise_xy, scale * yy + noise_yy
+    return scale * xx + noise[0], scale * xy + noise[1], scale * yy + noise[2]
 
 
 #: Memory that is new for every image has to be fetched first.

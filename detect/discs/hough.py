@@ -35,7 +35,7 @@ _BACKGROUND = 0.3
 #: Least score of a candidate; of those below a clear one, how many an image may have, and how many
 #: are compared with their neighbours; and how many peaks there may be in all.
 _LEAST_SCORE, _CLEAR_SCORE = 1.7, 3.0
-_MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 80, 400, 4000
+_MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 200, 600, 4000
 #: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
 _APART = 0.6
 #: Sobel's kernel multiplies a step per pixel by this.

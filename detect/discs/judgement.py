@@ -48,7 +48,7 @@ _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
-_LEAST_STEPS = 0.4
+_LEAST_STEPS = 0.3
 #: Least log-odds of a glance.
 _LEAST_GLANCE = 0.0
 #: Least share of the rim that is on a circle.

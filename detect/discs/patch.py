@@ -34,6 +34,8 @@ PATCH = np.dtype(
         ("pixel", np.uint32, CAPACITY),
         # 0 of pixels that only fill up a sector, 1 of all others.
         ("weight", *_VALUES),
+        # Square root of the weight by which each counts in a fit by parts.
+        ("trust", *_VALUES),
         # Grey value, relative to that of the candidate.
         ("grey", *_VALUES),
         # Place on the floor relative to the candidate, in nominal radii, and how far that moves by

@@ -4,7 +4,8 @@ A disc that is wholly in view is fitted as a whole. One that something hides, st
 part is fitted by its edge, sector by sector (`detect.discs.fit`), as is a whole one that the fit
 does not explain well: the more certain place counts. Where too few sectors agree on one disc, the
 points of the rim give the place (`detect.discs.rim`). A rim in part may be that of more than one
-circle: the squared distance of another one that is nearly as likely is in the covariance.
+circle: the squared distance of another one that is nearly as likely is in the covariance. Of a
+part, radius and place trade off: what the other discs of the image say of the radius is used.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ FloatArray = NDArray[np.float64]
 #: Pixels of a whole disc, and of its edge.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
 EDGE_ALONE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
-#: Standard deviation of the radius, relative: about the nominal one, and about that which discs of
-#: the image seem to have. Of a short arc, place and radius trade off.
-RADIUS_SIGMA, _APPARENT_SIGMA = 0.08, 0.02
+#: Standard deviation of a radius, relative: of a disc whose place does not depend on it; of all
+#: discs, about the nominal one; of one about the others, usually and at most.
+RADIUS_SIGMA, _CALIBRATED_SIGMA = 0.08, 0.02
+_USUAL_SCATTER, _MOST_SCATTER = 0.01, 0.03
+#: Steps of the robust mean of radii; it starts at their median if there are so many.
+_SIZE_STEPS, _LEAST_OTHERS = 4, 3
 #: Share of the variance that a fit explains where nothing but a disc and noise is there.
 _WELL_EXPLAINED = 0.97
 #: From this share of the variance on that it explains, the fit of the whole disc gives the place:
@@ -44,8 +48,6 @@ _AT_BOUND, _MOST_REFITS = 0.98, 2
 _BLUR_PX = 1.0
 #: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
-#: Least number of whole discs that give the apparent radius.
-_LEAST_WHOLE = 3
 
 
 class Place(NamedTuple):
@@ -58,9 +60,16 @@ class Place(NamedTuple):
     cov_yy: float
 
 
+class Size(NamedTuple):
+    """What is known of a disc's radius, metres."""
+
+    radius: float
+    sigma: float
+
+
 @kernel()
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
-    """Place discs by fits: those that are wholly in view, then the others, of the same size.
+    """Place discs by fits: those that are wholly in view, then the others, of about their size.
 
     Parameters
     ----------
@@ -79,27 +88,53 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
     """
     count = len(discs.step)
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
-    radii, clear = np.empty(count), 0
     whole = [_fit_whole(scene, discs, k, work) for k in range(count)]
+    radii = np.zeros((count, 2))
     for k, fit in enumerate(whole):
         if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
-            radii[clear] = fit.radius
-            clear += 1
-    by_parts = FitSettings(
-        True, apparent_radius(scene.radius, radii[:clear]), _APPARENT_SIGMA, EDGE_ALONE
-    )
+            radii[k] = _radius_seen(fit, Size(scene.radius, RADIUS_SIGMA * scene.radius))
+    # Those that are hidden in part say something of the size too, and are then fitted once more.
+    parts, radii_of_whole = list(whole), radii.copy()
     for k, fit in enumerate(whole):
-        if _explains(fit, discs, k):
+        if not _explains(fit, discs, k):
+            size = size_of_disc(scene.radius, radii_of_whole, k)
+            rim = _rim_of(scene, discs, k, size.radius)
+            start = Start(rim.x, rim.y, rim.radius, _BLUR_PX)
+            parts[k] = fit_disc(scene, start, _by_parts(size), work)
+            radii[k] = _radius_seen(parts[k], size)
+    for k, fit in enumerate(whole):
+        size = size_of_disc(scene.radius, radii, k)
+        if not _explains(fit, discs, k):
+            place = _place_by_rim(scene, discs, k, parts[k], size, work)
+        else:
             place = _place_of(fit)
             if fit.explained < _EXPLAINS_ALL:
-                start = Start(fit.x, fit.y, fit.radius, fit.blur)
-                place = _more_certain(_place_of(fit_disc(scene, start, by_parts, work)), place)
-        else:
-            place = _place_by_rim(scene, discs, k, by_parts, work)
+                again = fit_disc(scene, _start_at(fit), _by_parts(size), work)
+                place = _more_certain(_place_of(again), place)
         floor_xy[k, 0], floor_xy[k, 1] = place.x, place.y
         covariance[k, 0, 0], covariance[k, 1, 1] = place.cov_xx, place.cov_yy
         covariance[k, 0, 1] = covariance[k, 1, 0] = place.cov_xy
     return floor_xy, covariance
+
+
+@kernel(inline="always")
+def _by_parts(size: Size) -> FitSettings:
+    return FitSettings(True, size.radius, size.sigma / size.radius, EDGE_ALONE)
+
+
+@kernel(inline="always")
+def _start_at(fit: Fit) -> Start:
+    return Start(fit.x, fit.y, fit.radius, fit.blur)
+
+
+@kernel(inline="always")
+def _radius_seen(fit: Fit, expected: Size) -> tuple[float, float]:
+    """Radius of a fitted disc, metres, and one over its variance, less what was expected of it."""
+    information = fit.radius_information
+    if not information > 0.0:
+        return 0.0, 0.0
+    pull = 1.0 / (expected.sigma**2 * information)
+    return fit.radius + pull * (fit.radius - expected.radius), information
 
 
 @kernel(inline="always")
@@ -150,11 +185,16 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 
 @kernel(inline="always")
 def _place_by_rim(
-    scene: Scene, discs: Judgement, k: int, by_parts: FitSettings, work: Any
+    scene: Scene, discs: Judgement, k: int, before: Fit, size: Size, work: Any
 ) -> Place:
     """Place a disc by its sectors, or where they differ by the points of its rim."""
-    rim = _rim_of(scene, discs, k, by_parts.radius)
-    fit = fit_disc(scene, Start(rim.x, rim.y, rim.radius, _BLUR_PX), by_parts, work)
+    start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], size.radius, _BLUR_PX)
+    if before.arrived:
+        start = _start_at(before)
+    fit = fit_disc(scene, start, _by_parts(size), work)
+    if not fit.arrived:
+        fit = before
+    rim = _rim_of(scene, discs, k, size.radius)
     if fit.arrived:
         place = _place_of(fit)
     else:
@@ -171,12 +211,41 @@ def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
 
 
 @kernel()
-def apparent_radius(nominal: float, radii: NDArray[np.float64]) -> float:
-    """The radius that discs of an image seem to have, by those that are wholly in view.
+def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
+    """How large a disc is, by what is seen of the others of its image.
 
-    All are larger or smaller where the camera hangs lower or higher than calibrated. The radius of
-    a part of a disc trades with its place, so it has to be known otherwise.
+    All seem larger or smaller where the camera hangs lower or higher than calibrated, and each by
+    itself does a little. The radius of a part of a disc trades with its place, so it has to be
+    known otherwise: as the robust mean of the others, with the scatter about that.
+
+    Parameters
+    ----------
+    nominal : float
+        Radius of discs, metres.
+    radii : (N, 2) float64
+        Radius of each disc, metres, and one over its variance; 0 where nothing is known.
+    k : int
+        The disc.
     """
-    if len(radii) < _LEAST_WHOLE:
-        return nominal
-    return median(radii)
+    radius, variance, count = np.empty(len(radii)), np.empty(len(radii)), 0
+    for i in range(len(radii)):
+        if i != k and radii[i, 1] > 0.0:
+            radius[count] = radii[i, 0] / nominal
+            variance[count] = 1.0 / (radii[i, 1] * nominal**2)
+            count += 1
+    mean = median(radius[:count].copy()) if count >= _LEAST_OTHERS else 1.0
+    usual, scatter = _USUAL_SCATTER**2, _USUAL_SCATTER**2
+    certainty = 0.0
+    for _ in range(_SIZE_STEPS):
+        # The nominal radius counts as a disc, and the usual scatter as that of two.
+        certainty = 1.0 / _CALIBRATED_SIGMA**2
+        total, squares = certainty, 2.0 * usual
+        for i in range(count):
+            off = (radius[i] - mean) ** 2
+            weight = 1.0 / (variance[i] + scatter)
+            weight /= 1.0 + 0.25 * off * weight
+            certainty += weight
+            total += weight * radius[i]
+            squares += min(max(off - variance[i], 0.0), _MOST_SCATTER**2)
+        mean, scatter = total / certainty, squares / (2.0 + count)
+    return Size(nominal * mean, nominal * math.sqrt(1.0 / certainty + scatter))
