@@ -9,7 +9,7 @@ import tyro
 
 from redetect.storage.command_line import exit_code_of
 
-#: Module and class of each study: a dataclass of its flags, which carries it out when called.
+#: Module and class of each study.
 STUDIES = {
     "accuracy": "accuracy.AccuracyStudy",
     "association": "association.Association",
@@ -17,6 +17,7 @@ STUDIES = {
     "camera-photographs": "calibration.CameraPhotographs",
     "camera-rendered": "calibration.CameraRendered",
     "disturbed": "disturbed.Disturbed",
+    "documents": "figures.Documents",
     "fusion": "sessions.FusionStudy",
     "joining": "association.Joining",
     "joining-pairs": "association.JoiningPairs",
@@ -26,6 +27,7 @@ STUDIES = {
     "markers": "markers.Markers",
     "photographs": "detection.Photographs",
     "pictures": "pictures.Pictures",
+    "programs": "figures.Programs",
     "real-run": "real_run.RealRun",
     "rendered": "detection.Rendered",
     "tilt": "detection.Tilt",
@@ -46,8 +48,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 0 if asked else 2
     module, _, study = STUDIES[name].partition(".")
     options = getattr(import_module(f"tools.evaluation.{module}"), study)
-    command = tyro.cli(options, prog=f"python -m tools.evaluation {name}", args=flags)
-    return exit_code_of(command)
+    program = f"python -m tools.evaluation {name}"
+    study = tyro.cli(options, prog=program, args=flags)
+    at = flags.index("--figures") if "--figures" in flags else len(flags)
+    command = [*program.split(), *flags[:at], *flags[at + 2 :]]
+    return exit_code_of(lambda: study.carried_out(command))
 
 
 if __name__ == "__main__":

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -26,6 +27,7 @@ from camera.uncertainty import (
 )
 from redetect.array_types import FloatArray, IntArray
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
+from tools.evaluation.figures import Study
 from tools.evaluation.tables import Table
 
 BOARDS = {
@@ -209,7 +211,7 @@ _TYPES = ("checkerboard", "charuco", "asymmetric-circles")
 
 
 @dataclass(frozen=True)
-class CameraRendered:
+class CameraRendered(Study):
     """Calibrate from rendered pictures of a known camera: noise floor, and how near the truth."""
 
     camera: Positional[Path]  # The true camera.
@@ -219,7 +221,7 @@ class CameraRendered:
     noise: float = 2.0  # Standard deviation of a pixel's noise; ink and paper differ by 160.
     seed: int = 7  # Everything random follows from it.
 
-    def __call__(self) -> int:
+    def measured(self) -> Mapping[str, Any]:
         camera = read_camera(self.camera)
         print("Points' own error, held out, projection (worst, median, predicted) in px")
         table = Table(
@@ -242,11 +244,11 @@ class CameraRendered:
                 result.holdout_px[result.lens], turned.max(), fixed, np.median(turned),
                 sigma.max(), np.median(sigma),
             )  # fmt: skip
-        return 0
+        return table.figures
 
 
 @dataclass(frozen=True)
-class CameraPhotographs:
+class CameraPhotographs(Study):
     """Hold-out error on photographs of disc boards, against OpenCV's models.
 
     The points are the centroids of the discs, found from where the truth has them; both
@@ -258,7 +260,7 @@ class CameraPhotographs:
     free_aspect: bool = True  # Both scales free, as OpenCV has them; else equal.
     polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
 
-    def __call__(self) -> int:
+    def measured(self) -> Mapping[str, Any]:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
         errors = dict.fromkeys(("ours", "rational", "radial"), "8.4f")
         table = Table(
@@ -271,4 +273,4 @@ class CameraPhotographs:
             )
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
-        return 0
+        return table.figures

@@ -7,7 +7,7 @@ its noise and JPEG follow. Each family of disturbances is measured at several sh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +22,8 @@ from detect.settings import CircleSettings
 from redetect.array_types import ByteArray, FloatArray
 from redetect.storage import write_whole
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
-from tools.evaluation.tables import markdown_table
+from tools.evaluation.figures import Study
+from tools.evaluation.tables import Table
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -235,30 +236,6 @@ def _count(
     tally.elsewhere += int((~taken).sum())
 
 
-def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
-    """Two tables in Markdown: what is found of disturbed discs, and what look-alikes give."""
-    shares = sorted({share for _, share, _ in results if share > 0.0})
-    by_kind: dict[str, dict[float, Tally]] = {}
-    for kind, share, tally in results:
-        by_kind.setdefault(kind, {})[share] = tally
-    lines = markdown_table(
-        ["family", *(f"{100 * share:.0f} %" for share in shares)],
-        ([kind, *(_cell(by_kind[kind][s]) for s in shares)] for kind in (*DISTURBANCES, BORDER)),
-    )
-    blurred = ((kind, _cell(by_kind[kind][0.0])) for kind in BLURRED)
-    lines += ["", *markdown_table(("family", "found, error, normalised"), blurred)]
-    others = ((kind, f"{by_kind[kind][0.0].recall:.3f}") for kind in LOOK_ALIKES)
-    lines += ["", *markdown_table(("look-alike", "rows for each"), others)]
-    elsewhere = sum(tally.elsewhere for _, _, tally in results)
-    scenes = sum(tally.shown for _, _, tally in results) / _PER_SCENE
-    lines += ["", f"Rows elsewhere: {elsewhere} in some {scenes:.0f} images."]
-    return "\n".join(lines)
-
-
-def _cell(tally: Tally) -> str:
-    return f"{tally.recall:.3f}, {tally.rms_px:.2f} px, {tally.normalised_error:.2f}"
-
-
 def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> ByteArray:
     """One disc of every family and one of every look-alike, side by side with their names."""
     stage = Stage(camera, radius_m, np.random.default_rng(seed))
@@ -287,7 +264,7 @@ def _panel(image: ByteArray, outline: FloatArray, name: str) -> ByteArray:
 
 
 @dataclass(frozen=True)
-class Disturbed:
+class Disturbed(Study):
     """Discs partly hidden, stained, badly lit or blurred, and look-alikes, rendered."""
 
     camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
@@ -297,7 +274,7 @@ class Disturbed:
     seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
     picture: Path | None = None  # Draw one disc of every family, and detect nothing.
 
-    def __call__(self) -> int:
+    def measured(self) -> Mapping[str, Any]:
         camera = read_camera(self.camera)
         settings = CircleSettings(polarity=self.polarity, tilt_sigma_deg=0.0)
         if self.picture is not None:
@@ -305,7 +282,13 @@ class Disturbed:
             _, png = cv2.imencode(".png", drawn)
             with write_whole(self.picture, overwrite=True) as stream:
                 stream.write(png.tobytes())
-            return 0
+            return {}
+        table = Table(
+            {"family": "<18", "share %": ".0f", "shown": "d", "found": ".3f", "rms px": ".2f",
+             "normalised": ".2f", "elsewhere": "d"}, keys=2
+        )  # fmt: skip
         results = measure(camera, settings, discs=self.discs, shares=self.shares, seed=self.seed)
-        print(table_of(list(results)))
-        return 0
+        for kind, share, t in results:
+            table.row(kind, 100.0 * share, t.shown, t.recall, t.rms_px, t.normalised_error,
+                      t.elsewhere)  # fmt: skip
+        return table.figures

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import chi2
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.clock import ClockSegment, read_clock
 from redetect.groundtruth.lasers.acquisition import load_session
@@ -39,6 +36,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
+from tools.evaluation.figures import Study, StudyError, run_program
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
@@ -48,16 +46,6 @@ _LASER_COLUMNS = {
     "max_deg": ".2f", "nees": "6.3f", "lost_s": ".2f", "disturbed": ".3f", "scanner_mm": ".2f",
     "scanner_deg": ".3f", "scanner_nees": ".2f", "set_ms": ".3f", "speed": ".0f",
 }  # fmt: skip
-
-
-def run_groundtruth(*arguments: object) -> None:
-    """Run a command of `groundtruth` quietly, and fail if it does."""
-    out = io.StringIO()
-    words = [*map(str, arguments), "--force"]
-    with redirect_stdout(out):
-        code = groundtruth(words)
-    if code != 0:
-        raise GroundTruthError(f"groundtruth {' '.join(words)} ended with {code}: {out.getvalue()}")
 
 
 def table_of_sessions(
@@ -72,7 +60,7 @@ def table_of_sessions(
         try:
             with tempfile.TemporaryDirectory() as folder:
                 row = measure(Path(folder), seed)
-        except GroundTruthError as error:
+        except (GroundTruthError, StudyError) as error:
             print(f"{seed:4d} left out: {error}")
             continue
         rows.append([row[key] for key in columns])
@@ -83,7 +71,7 @@ def table_of_sessions(
 
 
 @dataclass(frozen=True)
-class LaserSessions:
+class LaserSessions(Study):
     """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
 
     seeds: int = 20  # Seeds first, first + 1, ...
@@ -97,13 +85,13 @@ class LaserSessions:
     visit_s: float = 60.0
     average: int = 6  # Sets of scans per pose.
 
-    def __call__(self) -> int:
+    def measured(self) -> Mapping[str, Any]:
         seeds = range(self.first, self.first + self.seeds)
         table, rows = table_of_sessions(_LASER_COLUMNS, seeds, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
-        return 0
+        return table.figures
 
     def _measured(self, session: Path, seed: int) -> dict[str, float]:
         """Errors of one session."""
@@ -119,7 +107,7 @@ class LaserSessions:
         write_session(settings, session, seed=seed)
         exact, aligned = session / "scanners.truth.json", session / "aligned.json"
         if self.scanners == "aligned":
-            run_groundtruth("lasers", session, "-o", aligned)
+            run_program("groundtruth", "lasers", session, "-o", aligned)
         calibration = exact if self.scanners == "true" else aligned
         scanners, robot, tables, sets = load_session(session, calibration)
         rows = slice(0, 50)
@@ -204,7 +192,7 @@ _FUSION_COLUMNS = {
 
 
 @dataclass(frozen=True)
-class FusionStudy:
+class FusionStudy(Study):
     """Simulate sessions, run lasers, laser, sync and fuse, and compare each with the exact truth.
 
     Segments of the clock, the lasers' poses, fused poses where the laser sees the robot, bridged
@@ -219,7 +207,7 @@ class FusionStudy:
     beside the robot."""
     visits: int = 3
 
-    def __call__(self) -> int:
+    def measured(self) -> Mapping[str, Any]:
         settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
 
         def measured(session: Path, seed: int) -> dict[str, float]:
@@ -232,19 +220,21 @@ class FusionStudy:
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
         print(f"95 % band of the mean NEES at one instant: {band[0]:.2f} to {band[1]:.2f}")
-        return 0
+        return {**table.figures, "band": band}
 
 
 def errors_of_session(session: Path) -> dict[str, float]:
     """Run the commands on one session and measure their results."""
     at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
     clock = session / "clock.json"
-    run_groundtruth("lasers", session)
-    run_groundtruth("laser", session)
-    run_groundtruth("sync", at["odometry"], at["laser"], "-o", clock)
     streams = ["--laser", at["laser"], "--camera", at["camera"]]
-    run_groundtruth("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
-
+    for words in (
+        ("lasers", session),
+        ("laser", session),
+        ("sync", at["odometry"], at["laser"], "-o", clock),
+        ("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"]),
+    ):
+        run_program("groundtruth", *words)
     truth = read_planar_poses(session / "truth.csv")
     laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
     seen = _seen_by(laser, fused.times_s)

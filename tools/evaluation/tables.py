@@ -9,11 +9,14 @@ from typing import Any
 
 
 class Table:
-    """A table that is printed row by row.
-    `columns` maps headings to formats (`7.2f`, `<22`); a column is as wide as either says.
+    """A table that is printed row by row, and whose figures are kept.
+    `columns` maps headings to formats (`7.2f`, `<22`); a column is as wide as either says. The
+    first `keys` columns name a row: `figures` has a level for each, then values by heading.
     """
 
-    def __init__(self, columns: Mapping[str, str]) -> None:
+    def __init__(self, columns: Mapping[str, str], keys: int = 1) -> None:
+        self.figures: dict[str, Any] = {}
+        self._keys, self._headings = keys, list(columns)
         self._formats = list(columns.values())
         widths = [re.match(r"<?(\d*)", form) for form in self._formats]
         self._widths = [
@@ -24,7 +27,12 @@ class Table:
 
     def row(self, *values: object) -> None:
         """Print a row; its values are in the order of the columns."""
-        self._print(format(value, form) for value, form in zip(values, self._formats, strict=True))
+        cells = [format(value, form) for value, form in zip(values, self._formats, strict=True)]
+        self._print(cells)
+        place = self.figures
+        for cell in cells[: self._keys]:
+            place = place.setdefault(cell.strip(), {})
+        place.update(zip(self._headings[self._keys :], values[self._keys :]))
 
     def _print(self, cells: Iterable[str]) -> None:
         aligned = (
