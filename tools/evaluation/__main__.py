@@ -5,9 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-import tyro
-
-from redetect.storage.command_line import exit_code_of
+from tools.evaluation.figures import study_main
 
 #: Module and class of each study.
 STUDIES = {
@@ -48,11 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0 if asked else 2
     module, _, study = STUDIES[name].partition(".")
     options = getattr(import_module(f"tools.evaluation.{module}"), study)
-    program = f"python -m tools.evaluation {name}"
-    study = tyro.cli(options, prog=program, args=flags)
-    at = flags.index("--figures") if "--figures" in flags else len(flags)
-    command = [*program.split(), *flags[:at], *flags[at + 2 :]]
-    return exit_code_of(lambda: study.carried_out(command))
+    return study_main(options, f"python -m tools.evaluation {name}", flags)
 
 
 if __name__ == "__main__":

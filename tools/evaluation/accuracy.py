@@ -7,10 +7,8 @@ detector), and detected. Errors are held against the covariances that the detect
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +19,7 @@ from lut import cached_vote_table
 from lut.outlines import floor_positions, pixels_within, size_down
 from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
 
@@ -99,7 +97,7 @@ class AccuracyStudy(Study):
     discs: int = 400  # Discs per blur.
     seed: int = 1  # Of places and noise.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         table = Table(
             {"blur px": ".1f", "distance m": "<10", "discs": "d", "rms u px": "9.4f",

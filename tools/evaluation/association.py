@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -24,7 +23,7 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import first_poses, joined, read_recording
 from redetect.slam.settings import AssociateSettings
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study, print_figures
 from tools.evaluation.tables import Table
 
 
@@ -44,7 +43,7 @@ class Association(Study):
     sigma_scale: float = 1.4  # Factor on the discs' standard deviations in all gates.
     seed: int = 1  # Of the noise.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         table = Table(
             {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
              "precision": ".4f", "recall": ".4f", "rows right": ".4f", "landmarks": "d",
@@ -82,7 +81,7 @@ class WakingUp(Study):
     path: Path  # `path.csv` of the same run in that map.
     every: int = 50  # Frames from one waking to the next.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         recording, discs = read_recording(self.run), read_map(self.map).discs.xy
         poses = read_path(self.path).poses
         off, turned, taken, squared = [], [], [], []
@@ -97,12 +96,11 @@ class WakingUp(Study):
             turned.append(abs(np.degrees(difference[2])))
             taken.append(woken.frames)
             squared.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
-        print(f"{len(off)} of {len(starts)} times it knew where it was")
         table = Table({"": "<6", "off m": ".2f", "turned deg": ".1f", "after frames": ".0f"})
         for name, of in (("median", np.median), ("most", np.max)):
             table.row(name, *(of(values) if values else np.nan for values in (off, turned, taken)))
-        print(f"error^2 / sigma^2 {np.mean(squared):.2f}")
         known = {"known": len(off), "times": len(starts), "normalised": np.mean(squared)}
+        print_figures(known)
         return {**known, **table.figures}
 
 
@@ -116,7 +114,7 @@ class Joining(Study):
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
     at: tuple[int, ...] = ()  # The frames with which new runs begin; by default half way.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         whole = read_recording(self.run)
         starts = [0, *(self.at or (len(whole) // 2,))]
         parts = [whole.part(a, b) for a, b in zip(starts, [*starts[1:], len(whole)])]
@@ -125,7 +123,6 @@ class Joining(Study):
         found = associate_run(recording)
         seconds = time.thread_time() - began
         score = score_run(recording, found)["circles"]["map"]
-        print(f"{score}, {seconds:.1f} s")
         apart, one = (
             map_run(replace(run, circles=replace(run.circles, ids=labels)))
             for run, labels in (
@@ -133,8 +130,11 @@ class Joining(Study):
                 (whole, associate_run(whole).circle_labels),
             )
         )
-        factors = {"factor": apart.table.factor, "factor of the whole": one.table.factor}
-        print(factors)
+        figures = {
+            **vars(score), "factor": apart.table.factor, "factor of the whole": one.table.factor,
+            "seconds": seconds,
+        }  # fmt: skip
+        print_figures(figures)
         table = Table({"run": "d", "frames": "d", "median m": ".3f", "median deg": ".2f",
                        "most m": ".3f", "most deg": ".2f"})  # fmt: skip
         for k, (first, start) in enumerate(zip(first_poses(parts), starts)):
@@ -143,7 +143,7 @@ class Joining(Study):
             distance, turn = np.hypot(*off[:, :2].T), np.degrees(np.abs(wrap_angle(off[:, 2])))
             table.row(k + 1, len(parts[k]), np.median(distance), np.median(turn), distance.max(),
                       turn.max())  # fmt: skip
-        return {**vars(score), **factors, "path off the whole's": table.figures}
+        return {**figures, "path off the whole's": table.figures}
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class JoiningPairs(Study):
     frames: int = 300  # In a piece.
     least: int = 5  # Discs that pieces have in common if they show one place.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         whole = read_recording(self.run)
         starts = range(0, len(whole) - self.frames + 1, self.frames)
         pieces = [whole.part(start, start + self.frames) for start in starts]
@@ -175,6 +175,6 @@ class JoiningPairs(Study):
         table = Table({"discs in common": "<", "pairs": "d", "joined": "d"})
         table.row(f"{self.least} or more", counts[True], joined_pairs[True])
         table.row("fewer", counts[False], joined_pairs[False])
-        precision = {"mean": np.mean(off), "least": min(off)}
-        print(f"precision {precision}, wrong merges {wrong}")
-        return {**table.figures, "precision": precision, "wrong merges": wrong}
+        figures = {"precision": np.mean(off), "least precision": min(off), "wrong merges": wrong}
+        print_figures(figures)
+        return {**table.figures, **figures}

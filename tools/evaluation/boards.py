@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -17,7 +15,7 @@ from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 
 #: Standard deviations of a board's turns about its axes.
 _TILTS_RAD = np.array([0.45, 0.45, 0.3])
@@ -205,7 +203,7 @@ class TutorialPhotographs(Study):
     count: int = 14  # Photographs of the board in the hand.
     seed: int = 3  # Of the board's places, and the noise.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         import cv2
 
         camera = read_camera(self.camera)

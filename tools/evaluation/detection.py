@@ -7,31 +7,33 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 from tyro.conf import Positional
 
-from detect.comparison.compare import compare_with_file
-from detect.comparison.result import DiscComparison
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.runs.plan import FramePlan, Job, Known
 from detect.runs.stream import detect_run
 from detect.settings import CircleSettings, Polarity
 from detect.sources.opening import open_run
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import FrameTilt, read_frames, read_tilts, squared_mahalanobis
-from tools.evaluation.figures import Study, StudyError
+from redetect.landmarks.arrays import circle_arrays
+from tools.evaluation.figures import Figures, Study, StudyError, compared, print_figures
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
 #: Rows this near a disc of a photograph have found it; the scorer has the same limit.
 _MATCH_M = 0.05
-_NUMBER = re.compile(r"[\d.]+$")
+#: A line of that scorer, and what its numbers are.
+_LINE = re.compile(
+    r"(\S+) +images +(\d+) discs +(\d+) recall +([\d.]+) +FP/img +([\d.]+) +err mm med +([\d.]+)"
+)
+_NAMES = ("images", "discs", "recall", "false", "median_mm")
 
 
 def _detect(
@@ -68,7 +70,7 @@ class Photographs(Study):
 
     data: Positional[Path] = Path("../shared/data/discs")  # Folder with `evaluate.py` and `dev`.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         normalised: list[float] = []
         with tempfile.TemporaryDirectory() as folder:
             files = []
@@ -77,23 +79,15 @@ class Photographs(Study):
                 _detect(truth.parent, {"circles": files[-1]}, circles=CircleSettings())
                 (frame,) = read_frames(files[-1])
                 true = [(d["px"], d["py"]) for d in json.loads(truth.read_text())["discs"]]
-                for row in frame.circles:
-                    off = np.array(true) - (row.px, row.py)
-                    nearest = off[np.argmin(np.hypot(*off.T))]
-                    if np.hypot(*nearest) < _MATCH_M:
-                        covariance = [[row.cxx, row.cxy], [row.cxy, row.cyy]]
-                        normalised.append(float(squared_mahalanobis(nearest, covariance)) / 2.0)
+                rows = circle_arrays(frame.circles)
+                distance, nearest = cKDTree(true).query(rows.xy)
+                off = rows.xy - np.array(true)[nearest]
+                squared = squared_mahalanobis(off, rows.covariance)
+                normalised += (squared[distance < _MATCH_M] / 2.0).tolist()
             text = _scored(self.data / "evaluate.py", "--circles", *files)
         print(f"normalised error^2 / dof {np.mean(normalised):.2f}")
-        names = "images", "discs", "recall", "false", "median_mm", "p95_mm"
-        lines = (line.split() for line in text.splitlines() if " images " in line)
-        groups = {words[1]: [float(word) for word in words[3:] if _NUMBER.match(word)]
-                  for words in lines}  # fmt: skip
-        return {
-            "found": len(normalised),
-            "normalised": np.mean(normalised),
-            **{group: dict(zip(names, numbers)) for group, numbers in groups.items()},
-        }
+        groups = {g: dict(zip(_NAMES, map(float, values))) for g, *values in _LINE.findall(text)}
+        return {"found": len(normalised), "normalised": np.mean(normalised), **groups}
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,7 @@ class Buildings(Study):
     data: Positional[Path] = Path("../shared/data/york")  # Folder with `evaluate.py` and `dev`.
     preset: Preset = "default"  # Of the line detector.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
             files = []
             for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
@@ -126,7 +120,7 @@ class Rendered(Study):
     preset: Preset = "default"  # Of the line detector.
     polarity: Polarity = "light"  # Stated to the detector of discs.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             discs, lines, levelled = (
@@ -152,43 +146,25 @@ class Tilt(Study):
     tilt_prior_deg: float = LINE_PRESETS["default"].tilt_prior_deg
     """What is known of the tilt beforehand: its standard deviation about level, degrees."""
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
             lines = replace(LINE_PRESETS["default"], tilt_prior_deg=self.tilt_prior_deg)
             tilts = _detect_lines(self.run, lines, Path(folder) / "detected.lines")
             errors = _tilt_errors(self.run, tilts)
             settings = CircleSettings(polarity="light", far_limit=0.5)
-            table = Table(
-                {
-                    "tilt": "<7",
-                    "median m": ".4f",
-                    "3-3.5 m": ".4f",
-                    "3.5-4 m": ".4f",
-                    "normalised": ".2f",
-                }
-            )
+            medians = dict.fromkeys(("median m", "3-3.5 m", "3.5-4 m"), ".4f")
+            table = Table({"tilt": "<7", **medians, "normalised": ".2f"})
             for label, known in (("without", Known()), ("with", Known(tilts=tilts))):
                 discs = Path(folder) / f"{label}.circles"
                 _detect(self.run, {"circles": discs}, known, circles=settings)
-                result = compare_with_file(
-                    "circles",
-                    Path(self.run) / "map.circles",
-                    read_frames(discs),
-                    CompareOptions(gate_m=0.3),
-                )
-                assert isinstance(result, DiscComparison)
-                if result.error_median_m is None:
-                    print(f"discs {label} the tilt: none is near one of {result.reference_name}")
-                    continue
-                far = {b.from_m: b.error_median_m or np.nan for b in result.bins}
-                table.row(
-                    label, result.error_median_m, far[3.0], far[3.5],
-                    result.normalised_error.per_dof or np.nan,
-                )  # fmt: skip
-        return {**errors, **table.figures}
+                result = compared(self.run, discs, "--gate-m", 0.3)
+                far = {b["from_m"]: b["error_median_m"] for b in result["bins"]}
+                known_m = result["error_median_m"], far.get(3.0), far.get(3.5)
+                table.row(label, *known_m, result["normalised_error"]["per_dof"])
+        return {"tilt": errors, **table.figures}
 
 
-def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> dict[str, float]:
+def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> Figures:
     """Tilts against the truth of a rendered or simulated run, on frames with five lines."""
     truth = json.loads((run / "truth.json").read_text())
     errors, normalised = [], []
@@ -200,7 +176,7 @@ def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> dict[str, float]:
             errors.append(np.degrees(error))
             normalised.append(squared_mahalanobis(error, covariance) / 2.0)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    table = Table({"": "<4", "frames": "d", "pitch rms deg": ".3f", "roll rms deg": ".3f",
-                   "normalised": ".2f"})  # fmt: skip
-    table.row("tilt", len(errors), *rms, np.mean(normalised))
-    return dict(table.figures["tilt"])
+    figures = {"frames": len(errors), "pitch rms deg": rms[0], "roll rms deg": rms[1],
+               "normalised": np.mean(normalised)}  # fmt: skip
+    print_figures(figures)
+    return figures

@@ -7,7 +7,7 @@ its noise and JPEG follow. Each family of disturbances is measured at several sh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,10 +20,12 @@ from camera import Camera, read_camera
 from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.settings import CircleSettings
 from redetect.array_types import ByteArray, FloatArray
-from redetect.storage import write_whole
+from redetect.landmarks import squared_mahalanobis
+from redetect.storage import write_bytes
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
+from tools.simulator.files import encoded
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -228,11 +230,10 @@ def _count(
             continue
         nearest = int(np.argmin(distance))
         tally.found += 1
-        tally.error_px.append(
-            camera.project_floor(found.floor_xy[nearest]) - camera.project_floor(place)
-        )
-        error, covariance = off[nearest], found.covariance[nearest]
-        tally.normalised.append(float(error @ np.linalg.solve(covariance, error)) / 2.0)
+        seen, true = camera.project_floor(np.stack([found.floor_xy[nearest], place]))
+        tally.error_px.append(seen - true)
+        squared = squared_mahalanobis(off[nearest], found.covariance[nearest])
+        tally.normalised.append(float(squared) / 2.0)
     tally.elsewhere += int((~taken).sum())
 
 
@@ -274,14 +275,12 @@ class Disturbed(Study):
     seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
     picture: Path | None = None  # Draw one disc of every family, and detect nothing.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         settings = CircleSettings(polarity=self.polarity, tilt_sigma_deg=0.0)
         if self.picture is not None:
             drawn = picture_of(camera, settings.radius_m, self.shares[-1], self.seed)
-            _, png = cv2.imencode(".png", drawn)
-            with write_whole(self.picture, overwrite=True) as stream:
-                stream.write(png.tobytes())
+            write_bytes(self.picture, encoded(drawn, ".png"), overwrite=True)
             return {}
         table = Table(
             {"family": "<18", "share %": ".0f", "shown": "d", "found": ".3f", "rms px": ".2f",

@@ -49,8 +49,7 @@ tilt-tilted = $(call simulated,tilted --frames 80 --seed 8 --discs 32 --lookalik
     --style.step-m 0.25 --style.tilt-deg 0.5 --style.constant-tilt-deg 2.3 0 --jobs 2)
 tilt-room = $(call simulated,room --frames 40 --seed 3 --discs 60 --lookalikes 15 --style.constant-tilt-deg 2.3 0 --jobs 2)
 tilt-down = $(call simulated,down --camera docs/figures/down.cam --frames 24 --seed 11 --discs 16 --lookalikes 8 \
-    --style.step-m 0.5 --style.tilt-deg 0.4) 'tools.evaluation tilt @/down --tilt-prior-deg 0.4 --figures @/prior.json' \
-    'detect lines @/down -o @/down.lines' 'detect compare @/down --lines --detected @/down.lines --json @/lines.json'
+    --style.step-m 0.5 --style.tilt-deg 0.4) 'tools.evaluation tilt @/down --tilt-prior-deg 0.4 --figures @/prior.json'
 soft = programs 'tools.simulator run @/soft --frames 24 --seed 6 --style.tilt-deg 0.5 --sensor.blur-px 6' \
     'detect lines @/soft -o @/wide.lines' 'detect compare @/soft --lines --detected @/wide.lines --json @/wide.json' \
     'detect lines @/soft -o @/narrow.lines --blurred-widths' \

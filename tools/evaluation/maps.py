@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, read_recording
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 from tools.simulator.driving import step_covariance
 
@@ -86,7 +86,7 @@ class MapStudy(Study):
     runs: Positional[tuple[Path, ...]]  # Run folders.
     seed: int = 1  # Of the odometry that takes the place of the wrong one.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         table = Table(
             {"run": "<8", "variant": "<20", "p": "5d", "n": "4d", "m": "6d", "chi-sq.": "9.1f",
              "expected": "d", "factor": "6.3f", "path before / m": ".2f", "after / m": ".2f",
@@ -126,7 +126,7 @@ class MapSpeed(Study):
     run: Positional[Path]  # Run folder or .circles file.
     repeats: int = 3  # Rounds, in each of which every solver has its turn.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         graph = graph_of_recording(read_recording(self.run))
         start = first_sight(graph)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 
 from tools.benchmark.material import decode, jpeg_picture
 from tools.benchmark.timing import measure_in_turn
-from tools.evaluation.figures import WRONG, Study
+from tools.evaluation.figures import WRONG, Figures, Study
 from tools.evaluation.markers_statistics import (
     FOUND,
     MISIDENTIFIED,
@@ -29,7 +29,7 @@ from tools.evaluation.markers_statistics import (
 )
 from tools.evaluation.tables import Table
 from tools.simulator.markers.samples import SampleFrame, SampleSettings, sample_frame
-from tools.simulator.markers.things import photograph_files
+from tools.simulator.markers.things import photograph_files, photograph_of
 from tools.simulator.parallel import in_order
 
 #: Dictionaries of the search for false markers: all kinds, small and large.
@@ -107,14 +107,11 @@ def search_photographs(
 
 
 def _search(state: tuple[str, tuple[str, ...]], path: Path) -> list[Offence]:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise ValueError(f"{path}: cannot be read as an image")
-    name, dictionaries = state
+    (name, dictionaries), image = state, photograph_of(path)
     return [
         Offence(name, "false", f"{path.name} {dictionary} id {i}")
         for dictionary in dictionaries
-        for i in detector_of(name)(np.asarray(image, dtype=np.uint8), None, dictionary).ids
+        for i in detector_of(name)(image, None, dictionary).ids
     ]
 
 
@@ -188,7 +185,7 @@ class Markers(Study):
     seed: int = 1  # Of all frames.
     jobs: int = 1  # Processes.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         wrong: list[Offence] = []
         figures: dict[str, Any] = {}
         measured = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)

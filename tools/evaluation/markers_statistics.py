@@ -234,15 +234,10 @@ class Bin(NamedTuple):
     """By peer: our median error and the peer's over the markers that both found, pixels."""
 
     @property
-    def ahead_in_error(self) -> bool | None:
-        """Whether our median error is below every peer's; None where there are too few markers."""
-        known = [medians for medians in self.shared.values() if np.isfinite(medians[1])]
-        return all(ours < peer for ours, peer in known) if known else None
-
-    @property
-    def ahead_in_rate(self) -> bool:
-        """Whether we find at least as many markers as every peer."""
-        return all(f.rate <= self.own[OURS].rate for f in self.own.values())
+    def ahead(self) -> bool:
+        """Whether we find at least as many as every peer, at smaller medians as far as known."""
+        fewer = any(f.rate > self.own[OURS].rate for f in self.own.values())
+        return not fewer and not any(ours >= peer for ours, peer in self.shared.values())
 
 
 def binned(table: Table) -> list[Bin]:
@@ -314,6 +309,6 @@ def print_bins(bins: list[Bin]) -> dict[str, Any]:
     for b in (b for b in bins if b.markers):
         for name, own in b.own.items():
             table.row(b.label, name, b.markers, *own, *b.shared.get(name, (np.nan, np.nan)))
-    behind = [b.label for b in bins if b.ahead_in_error is False or not b.ahead_in_rate]
+    behind = [b.label for b in bins if not b.ahead]
     print(f"BEHIND a peer in error or rate: {', '.join(behind) or 'nowhere'}")
     return table.figures

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.maps import read_truth
 from tools.evaluation.tables import picture
 
@@ -307,7 +307,7 @@ class Pictures(Study):
     rows: Path | None = None  # A simulated run, associated and mapped.
     session: Path | None = None  # A simulated session, evaluated.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         self.output.mkdir(parents=True, exist_ok=True)
         run, markers = Path("images/e"), Path("images/m/a")
         self._save("discs", (8, 9.4), lambda f: draw_discs(f, run, 4), 72)

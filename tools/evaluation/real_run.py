@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tyro.conf import Positional
 
-from tools.evaluation.figures import Study, run_program
+from tools.evaluation.figures import Figures, Study, compared, run_program
 from tools.evaluation.tables import Table
 
 #: How the rows of each line of the table are made; the camera's true spread of tilt and the lens
@@ -37,7 +35,7 @@ class RealRun(Study):
     run: Positional[Path] = Path("../shared/data/dlr/e")
     """Run folder with images, calibration and `map.circles`."""
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         """Rows; the share of shipped identifiers found again; the median difference on the floor,
         levelled alike; chi-squared over its expectation of the least-squares map, as calibrated and
         with the camera's mounting as unknown.
@@ -50,16 +48,14 @@ class RealRun(Study):
         for way, command, flags in WAYS:
             with tempfile.TemporaryDirectory() as name:
                 folder = Path(name)
-                rows, compared = folder / "detected.circles", folder / "compared.json"
+                rows = folder / "detected.circles"
                 if command:
                     output = rows if command == "circles" else folder
                     run_program("detect", command, self.run, *flags, "--ids-from", shipped,
                                 "--output", output)  # fmt: skip
                 else:
                     rows.write_bytes(shipped.read_bytes())
-                run_program("detect", "compare", self.run, "--detected", rows, "--only-identified",
-                            "--json", compared)  # fmt: skip
-                found, factors = json.loads(compared.read_text()), []
+                found, factors = compared(self.run, rows, "--only-identified"), []
                 for flag in ((), ("--calibrate",)):
                     mapped = folder / f"map{len(flag)}"
                     run_program("slam", "map", rows, "--camera", camera, "-o", mapped, *flag)

@@ -7,7 +7,6 @@ Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from tyro.conf import Positional
 
 from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
 from redetect.storage import write_whole
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.rim_data import Looks, gather
 
 FloatArray = NDArray[np.floating]
@@ -238,7 +237,7 @@ class TrainRimNetwork(Study):
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
     force: bool = False  # Replace that file.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         glances, looks = gather(self.data, self.every, self.scenes, self.seed)
         for kind, of in (("glances", glances), ("looks", looks)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.models import disc_in_robot
-from tools.evaluation.figures import Study
+from tools.evaluation.figures import Figures, Study, print_figures
 from tools.evaluation.tables import Table
 
 #: An error of the image smaller than this is not believed, pixels along u.
@@ -87,12 +86,7 @@ def tilt_of_discs(
 
 
 def compare_tilts(
-    camera: Camera,
-    rows: Path,
-    tilts: Path,
-    map_path: Path,
-    path_path: Path,
-    raised_m: float = 0.0,
+    camera: Camera, rows: Path, tilts: Path, map_path: Path, path_path: Path, raised_m: float = 0.0
 ) -> TiltComparison:
     """Hold the tilts of a `.tilt` file against those of the discs of a map."""
     discs = read_map(map_path).discs
@@ -144,20 +138,18 @@ def figures_of(result: TiltComparison) -> dict[str, Any]:
     by_lines, by_discs = np.degrees(result.by_lines), np.degrees(result.by_discs)
     for name, values in (("verticals", by_lines), ("discs", by_discs), ("difference", off)):
         table.row(name, *np.median(values, axis=0), *values.mean(axis=0), *values.std(axis=0))
-    far = int(np.sum(result.squared > _FAR_SIGMAS**2))
-    of_expected = {
-        "mean": result.squared.mean() / 2.0,
-        "median": np.median(result.squared) / (2.0 * np.log(2.0)),
+    # Of the differences in both covariances, per axis, as shares of the expected.
+    squares = {
+        "frames": len(off),
+        "mean square": result.squared.mean() / 2.0,
+        "median square": np.median(result.squared) / (2.0 * np.log(2.0)),
+        f"beyond {_FAR_SIGMAS:g} sigma": np.sum(result.squared > _FAR_SIGMAS**2),
     }
-    print(
-        f"{len(off)} frames; difference^2 in both covariances, per axis: mean "
-        f"{of_expected['mean']:.2f}, median {of_expected['median']:.2f} of the expected; {far} "
-        f"frames beyond {_FAR_SIGMAS:g} sigma"
-    )
+    print_figures(squares)
     for k in np.argsort(-result.squared)[:_WORST]:
         sigmas = np.sqrt(result.squared[k])
         print(f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, {sigmas:.1f} sigma")
-    return {"frames": len(off), "far": far, "squared": of_expected, **table.figures}
+    return {**squares, **table.figures}
 
 
 @dataclass(frozen=True)
@@ -172,7 +164,7 @@ class TiltOfDiscs(Study):
     path: Path  # Its `path.csv`.
     raised_m: float = 0.0  # How much higher the camera is than calibrated.
 
-    def measured(self) -> Mapping[str, Any]:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         files = self.rows, self.tilts, self.map, self.path
         return figures_of(compare_tilts(camera, *files, self.raised_m))

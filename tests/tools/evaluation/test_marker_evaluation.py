@@ -106,17 +106,15 @@ def test_bins_compare_like_with_like(capsys: pytest.CaptureFixture[str]) -> None
     assert bins[0].own["aruco"].rate == 0.5
     assert bins[0].own[OURS].median_px == pytest.approx(0.1)
     assert bins[0].shared["aruco"] == pytest.approx((0.1, 0.3))
-    assert bins[0].ahead_in_error
-    assert bins[0].ahead_in_rate
+    assert bins[0].ahead
     by_width = {b.label: b for b in bins}
     assert by_width["width / px 28-40"].own["aruco"].rate == 0.0
-    assert by_width["width / px 28-40"].ahead_in_error is None
+    assert by_width["width / px 28-40"].ahead
     assert by_width["width / px 130-200"].markers == 10
     behind = binned(
         table_of(_scored(widths, {OURS: 0.4, "aruco": 0.3}, {OURS: large, "aruco": every}))
     )
-    assert behind[0].ahead_in_error is False
-    assert not behind[0].ahead_in_rate
+    assert not behind[0].ahead
     figures = print_bins(behind)
     assert figures["all"]["aruco"]["found"] == 1.0
     assert "BEHIND a peer in error or rate: all" in capsys.readouterr().out
