@@ -66,7 +66,7 @@ def study_main(kind: type[Study], program: str, arguments: Sequence[str]) -> int
 def print_figures(figures: Figures) -> None:
     """Print figures, a line for each: numbers, and lists of numbers."""
     for name, value in figures.items():
-        print(f"{name:<28}", *(f"{number:.5g}" for number in np.atleast_1d(value)))
+        print(f"{name:<28}", *(f"{number:.6g}" for number in np.atleast_1d(value)))
 
 
 def run_program(program: str, *arguments: object) -> None:

@@ -40,9 +40,9 @@ class Soak(Study):
                 result = soak(run, folder / "results", self.frames, self.jobs)
         figures = asdict(result)
         print_figures(figures)
-        unmet = result.unmet()
-        print(*unmet, sep="\n", file=sys.stderr)
-        return {**figures, WRONG: len(unmet)}
+        for sentence in result.unmet():
+            print(sentence, file=sys.stderr)
+        return {**figures, WRONG: len(result.unmet())}
 
 
 def main(arguments: list[str] | None = None) -> int:
