@@ -90,7 +90,12 @@ def test_a_table_keeps_what_it_prints(capsys: pytest.CaptureFixture[str]) -> Non
     table = Table({"kind": "<6", "share": ".0f", "found": ".2f"}, keys=2)
     table.row("disc", 20.0, 0.123456)
     table.row("disc", 40.0, 0.5)
-    assert capsys.readouterr().out.splitlines()[1] == "disc       20   0.12"
+    assert capsys.readouterr().out.splitlines() == [
+        "| kind   | share | found |",
+        "| ------ | ----- | ----- |",
+        "| disc   |    20 |  0.12 |",
+        "| disc   |    40 |  0.50 |",
+    ]
     assert table.figures == {"disc": {"20": {"found": 0.123456}, "40": {"found": 0.5}}}
 
 

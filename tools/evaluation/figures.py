@@ -134,7 +134,7 @@ def documents(root: Path) -> dict[Path, str]:
 
 
 def _formatted(value: float | None, form: str) -> str:
-    """A figure as pages show it; none is a dash."""
+    """A figure as pages show it; none is a dash. The + raises where there is no such figure."""
     return "\N{EN DASH}" if value is None else format(+value, form).replace("-", "\N{MINUS SIGN}")
 
 
