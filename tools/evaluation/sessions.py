@@ -58,10 +58,7 @@ class _Sessions(Study):
     def table_of(
         self, columns: Mapping[str, str], measure: Callable[[Path, int], dict[str, float]]
     ) -> tuple[Table, FloatArray]:
-        """Measure a session, in a folder of its own, for each seed, and print a row of it.
-
-        Returns the rows (N, columns), too.
-        """
+        """Measure a session in a folder of its own for each seed: table, and rows (N, columns)."""
         table, rows = Table({"seed": "<5", **columns}), []
         for seed in range(self.first, self.first + self.seeds):
             try:
